@@ -1,0 +1,42 @@
+"""Stereo SLAM with interchangeable estimators: see `slam.StereoSlam` and `slam.open_sequence`.
+
+What SLAM is, whatever detects and whatever estimates. Importing this package loads NumPy only; everything else is
+loaded when it is used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from slam.rig import StereoRig as StereoRig
+    from slam.sequences import open_sequence as open_sequence
+    from slam.system import StereoSlam as StereoSlam
+    from slam.trajectory import Trajectory as Trajectory
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "EstimatorModels": "slam.models",
+    "Estimate": "slam.data",
+    "FrameResult": "slam.data",
+    "Observations": "slam.data",
+    "PinholeCamera": "slam.camera",
+    "SlamError": "slam.errors",
+    "StereoFeatures": "slam.data",
+    "StereoFrame": "slam.data",
+    "StereoRig": "slam.rig",
+    "StereoSlam": "slam.system",
+    "Trajectory": "slam.trajectory",
+    "open_sequence": "slam.sequences",
+}
+
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first asked for."""
+    if name in _PUBLIC:
+        return getattr(import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'slam' has no attribute {name!r}")

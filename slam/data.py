@@ -1,0 +1,259 @@
+"""The data that flows through the system: frozen dataclasses of arrays, one row per feature or landmark.
+
+Frames are in the names: ``T_world_left`` takes left-camera coordinates to world coordinates. Pixels are (x right,
+y down), the centre of the first pixel is (0, 0), in the rig's own images. Lengths are metres, angles radians,
+times seconds. Pose covariances are (6, 6), order [rotation, translation], of a perturbation on the right,
+``T exp(ξ)``, that is in left-camera axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import MeasurementError
+from slam.se3 import Array
+
+IdArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """One pair of images, taken at the same time.
+
+    Attributes:
+        index: number of the frame in its sequence.
+        stamp: time [s].
+        left, right: images (H, W) or (H, W, 3|4), uint8 or uint16; `right` is None where it is missing.
+    """
+
+    index: int
+    stamp: float
+    left: np.ndarray
+    right: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class StereoFeatures:
+    """Features of one stereo frame, a row each.
+
+    Attributes:
+        stamp: time [s].
+        uv_left: left pixels (N, 2).
+        uv_right: right pixels (N, 2), NaN where there is no stereo match.
+        scale: size of the feature (N,) [px].
+        angle: orientation (N,) [rad], 0 where upright.
+        response: strength (N,).
+        laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
+        descriptors: unit vectors (N, D) float32.
+        threshold: the detector's D_threshold in force (paper A, III.A); NaN where there is none.
+    """
+
+    stamp: float
+    uv_left: Array
+    uv_right: Array
+    scale: Array
+    angle: Array
+    response: Array
+    laplacian: NDArray[np.int8]
+    descriptors: NDArray[np.float32]
+    threshold: float = float("nan")
+
+    def __post_init__(self) -> None:
+        n = len(self.uv_left)
+        for name in ("uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
+            if len(getattr(self, name)) != n:
+                raise MeasurementError(f"features: {name} has {len(getattr(self, name))} rows, uv_left has {n}")
+
+    def __len__(self) -> int:
+        return len(self.uv_left)
+
+    @property
+    def has_stereo(self) -> BoolArray:
+        """Which features have a right pixel (N,)."""
+        return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+    @classmethod
+    def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:
+        """No features."""
+        z = np.zeros(0)
+        return cls(
+            stamp, np.zeros((0, 2)), np.zeros((0, 2)), z, z, z, np.zeros(0, np.int8),
+            np.zeros((0, dimensions), np.float32), threshold,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Landmarks seen in one frame, a row each.
+
+    Attributes:
+        ids: landmark ids (M,), unique.
+        uv_left: left pixels (M, 2), finite.
+        uv_right: right pixels (M, 2), NaN where there is no stereo match.
+
+    Raises:
+        MeasurementError: shapes differ, an id stands twice, or a left pixel is not finite.
+    """
+
+    ids: IdArray
+    uv_left: Array
+    uv_right: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if self.uv_left.shape != (n, 2) or self.uv_right.shape != (n, 2):
+            raise MeasurementError(
+                f"observations: {n} ids, but uv_left is {self.uv_left.shape} and uv_right {self.uv_right.shape}"
+            )
+        if len(np.unique(self.ids)) != n:
+            raise MeasurementError("observations: a landmark id stands twice")
+        if not np.isfinite(self.uv_left).all():
+            raise MeasurementError("observations: a left pixel is not finite")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def has_stereo(self) -> BoolArray:
+        """Which observations have a right pixel (M,)."""
+        return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+    def select(self, rows: NDArray) -> Observations:
+        """The observations of these rows (a mask or indices)."""
+        return Observations(self.ids[rows], self.uv_left[rows], self.uv_right[rows])
+
+    @classmethod
+    def empty(cls) -> Observations:
+        """No observations."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a back end expects to see, before the measurement.
+
+    Attributes:
+        stamp: time [s].
+        T_world_left: predicted pose (4, 4).
+        covariance: its covariance (6, 6).
+        ids: landmarks in the angle of view (M,) (paper A, IV and Fig. 3).
+        uv_left: their predicted left pixels (M, 2).
+        uv_right: their predicted right pixels (M, 2); may lie outside the image.
+        innovation: covariances of the left pixels' innovations (M, 2, 2) [px²], measurement noise included.
+    """
+
+    stamp: float
+    T_world_left: Array
+    covariance: Array
+    ids: IdArray
+    uv_left: Array
+    uv_right: Array
+    innovation: Array
+
+
+class UpdateStatus(str, Enum):
+    """How an update ended."""
+
+    OK = "ok"  #: measurements were used
+    EMPTY = "empty"  #: nothing was measured (or nothing passed the gate): the prediction stands
+    FAILED = "failed"  #: the estimator could not solve; the prediction stands; the reason is in the report
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did with its observations.
+
+    Attributes:
+        status: how it ended.
+        reason: one line where the status is not OK, else empty.
+        used: ids of the landmarks whose observations were used (K,).
+        rejected: ids of those that failed the back end's gate (R,).
+        nis: normalised innovation squared νᵀ S⁻¹ ν of all used observations together (NaN if none).
+        dof: its degrees of freedom.
+    """
+
+    status: UpdateStatus
+    reason: str
+    used: IdArray
+    rejected: IdArray
+    nis: float
+    dof: int
+
+    @classmethod
+    def nothing(cls, status: UpdateStatus, reason: str, rejected: IdArray | None = None) -> UpdateReport:
+        """A report of an update that used no observation."""
+        none = np.zeros(0, np.int64)
+        return cls(status, reason, none, none if rejected is None else rejected, float("nan"), 0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The back end's belief at one time.
+
+    Attributes:
+        stamp: time [s].
+        T_world_left: pose (4, 4).
+        covariance: its covariance (6, 6).
+        ids: landmark ids (N,), ascending.
+        positions: landmark positions in world coordinates (N, 3) [m].
+        covariances: their marginal covariances (N, 3, 3) [m²].
+    """
+
+    stamp: float
+    T_world_left: Array
+    covariance: Array
+    ids: IdArray
+    positions: Array
+    covariances: Array
+
+
+class FrameStatus(str, Enum):
+    """How a frame ended."""
+
+    STARTED = "started"  #: first frame, or the first one with anything to see: the map begins
+    TRACKED = "tracked"  #: the pose was measured against the map
+    PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
+    FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one step of the system did.
+
+    Attributes:
+        index: number of the step.
+        status: how it ended.
+        reason: one line where the status is not tracked, else empty.
+        estimate: pose and map after the step; without the landmarks, which `StereoSlam.estimate` gives.
+        report: the back end's report.
+        features: of the frame.
+        predicted: number of landmarks in the angle of view.
+        matched: ids of landmarks associated with a feature (after the geometric check) (K,).
+        matched_features: rows of those features (K,).
+        added: ids of landmarks that joined the map (A,).
+        added_features: rows of their features (A,).
+        erased: ids of landmarks that left the map.
+        map_size: number of landmarks in the map.
+        milliseconds: wall time per stage.
+    """
+
+    index: int
+    status: FrameStatus
+    reason: str
+    estimate: Estimate
+    report: UpdateReport
+    features: StereoFeatures
+    predicted: int
+    matched: IdArray
+    matched_features: NDArray[np.intp]
+    added: IdArray
+    added_features: NDArray[np.intp]
+    erased: IdArray
+    map_size: int
+    milliseconds: Mapping[str, float] = field(default_factory=dict)

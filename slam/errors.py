@@ -1,0 +1,34 @@
+"""The exceptions of this package: one root, one clear line each."""
+
+from __future__ import annotations
+
+
+class SlamError(Exception):
+    """Root of every exception that this package raises on purpose.
+
+    The message is one line that says what is wrong and where. Commands print it and exit with status 2.
+    """
+
+
+class ConfigurationError(SlamError):
+    """A setting has an unknown key, a wrong type, or a value outside its range."""
+
+
+class UnknownNameError(SlamError):
+    """A back end, front end, sequence or format of this name is not known."""
+
+
+class CalibrationError(SlamError):
+    """A camera calibration is missing, unreadable, not finite, or physically impossible."""
+
+
+class SequenceError(SlamError):
+    """A recorded sequence, or one frame of it, is missing, unreadable or inconsistent."""
+
+
+class TrajectoryError(SlamError):
+    """A trajectory cannot be read, written or compared."""
+
+
+class MeasurementError(SlamError):
+    """Measurements handed to an estimator break the contract (shape, ids, NaN, time running backwards)."""

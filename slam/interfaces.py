@@ -1,0 +1,93 @@
+"""What the system asks of a front end and of a back end. Each method is documented once, here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+from slam.data import Estimate, IdArray, Observations, Prediction, StereoFeatures, StereoFrame, UpdateReport
+from slam.se3 import Array
+from slam.trajectory import Trajectory
+
+
+@runtime_checkable
+class Frontend(Protocol):
+    """Turns a pair of images into features. Created as ``Frontend(rig, **options)``."""
+
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        """Features of one stereo frame, in pixels of the rig's own images.
+
+        An image without features, or a missing right image, is no error: fewer (or no) rows come back.
+
+        Raises:
+            SequenceError: the images are not of the rig's size or of an unusable type.
+        """
+        ...
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """Estimates the camera's path and the landmarks' positions. Created as ``Backend(rig, **options)``.
+
+    The order of calls in a step is predict, update, then add and remove as needed; `estimate` and `trajectory` may be
+    asked at any time after the first `predict`. The world frame is the left camera's frame at the first `predict`
+    unless the options give an initial pose.
+    """
+
+    def predict(self, stamp: float) -> Prediction:
+        """Advance the belief to `stamp` [s] by the motion model; no measurement yet.
+
+        Returns the predicted pose and the landmarks in the angle of view. The first call sets the start.
+
+        Raises:
+            MeasurementError: `stamp` is not finite or not later than the last one.
+        """
+        ...
+
+    def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
+        """Correct the belief with landmarks seen at the predicted time. Zero rows are legal.
+
+        `guess` is the pose T_world_left (4, 4) on which the observations agree, where the caller knows it. It is no
+        measurement: it only says where to linearise first, for steps in which the prediction is far off.
+
+        A step that cannot be solved is a status with a reason, never an exception.
+
+        Raises:
+            MeasurementError: an id is not in the map.
+        """
+        ...
+
+    def add(self, observations: Observations) -> None:
+        """Add new landmarks at their first sight; depth comes from the stereo pair (paper A, Eqs. 8 and 10).
+
+        Raises:
+            MeasurementError: an id is in the map already, or a row has no right pixel or no positive depth.
+        """
+        ...
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        """Take landmarks out of the map.
+
+        Raises:
+            MeasurementError: an id is not in the map.
+        """
+        ...
+
+    def estimate(self, landmarks: bool = True) -> Estimate:
+        """The belief after the last call: pose, landmarks, covariances.
+
+        With ``landmarks=False`` the landmark rows stay empty: the pose and its covariance alone, cheap in every frame.
+        """
+        ...
+
+    def positions(self, ids: IdArray) -> Array:
+        """Current positions (M, 3) [m] of landmarks in world coordinates, in the order of `ids`; no covariance.
+
+        Raises:
+            MeasurementError: an id is not in the map.
+        """
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """The left camera's pose at every stamp predicted so far; a smoother's is revised, a filter's is not."""
+        ...
