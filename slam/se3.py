@@ -8,10 +8,13 @@ docstring says (..., 3).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+#: An array of real numbers; computed in float64.
+Array = NDArray[np.floating[Any]]
 
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision
 

@@ -1,0 +1,119 @@
+"""Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, and the synthetic worlds.
+
+`open_sequence` finds the format out by itself. Layouts, options and faults are described in ``docs/sequences.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.sequences.base import RecordedSequence, Sequence
+
+__all__ = ["RecordedSequence", "Sequence", "formats", "open_sequence"]
+
+_SYNTHETIC = "synthetic:"
+_KINDS = ("driving", "handheld")
+
+#: Formats on disk, in the order in which they are tried: module and description.
+_FORMATS = {
+    "euroc": ("slam.sequences.euroc", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
+    "kitti-raw": ("slam.sequences.kitti_raw", "KITTI raw drives: image_00/data, image_01/data"),
+    "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
+    "folders": ("slam.sequences.folders", "two folders or videos (left, right) with an OpenCV or Kalibr calibration"),
+}
+_COMMON_OPTIONS = frozenset({"kind"})
+
+
+def formats() -> dict[str, str]:
+    """Names of the formats with a line on each."""
+    known = {name: description for name, (_, description) in _FORMATS.items()}
+    return {**known, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
+
+
+def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
+    """Open a stereo sequence; nothing but the first pair of images is decoded yet.
+
+    Args:
+        path: a folder, with options behind it as ``FOLDER?key=value&key=value``, or ``synthetic:NAME?key=value``.
+            ``kind=driving`` or ``kind=handheld`` goes with every format on disk.
+        format: one of `formats`; found out from the folder where it is None.
+
+    Raises:
+        SequenceError: the folder is missing, empty or of no known format, or the sequence cannot be read.
+        CalibrationError: its calibration is missing, unreadable or impossible.
+        UnknownNameError: the format or the synthetic world is not known.
+        ConfigurationError: an option is unknown or its value impossible.
+    """
+    text = str(path)
+    if format == "synthetic" or text.startswith(_SYNTHETIC):
+        return _open_world(text)
+    folder, options = _split(text)
+    _require_folder(folder)
+    name = _detect(folder, options) if format is None else _known(format)
+    module = import_module(_FORMATS[name][0])
+    _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
+    open_folder: Callable[[Path, dict[str, str]], RecordedSequence] = module.open_folder
+    return open_folder(folder, options)
+
+
+def _open_world(text: str) -> Sequence:
+    """A synthetic world by its text, ``synthetic:`` in front."""
+    from slam.worlds import open_world
+
+    return open_world(text)
+
+
+def _split(text: str) -> tuple[Path, dict[str, str]]:
+    """The path, ``~`` expanded, and the options behind the question mark."""
+    whole = Path(text).expanduser()
+    if "?" not in text or whole.exists():
+        return whole.absolute(), {}
+    name, _, query = text.rpartition("?")
+    return Path(name).expanduser().absolute(), dict(parse_qsl(query, keep_blank_values=True))
+
+
+def _require_folder(folder: Path) -> None:
+    if not folder.exists():
+        raise SequenceError(f"{folder}: there is no such folder")
+    if not folder.is_dir():
+        raise SequenceError(f"{folder}: a file where the sequence's folder should be")
+    if not any(folder.iterdir()):
+        raise SequenceError(f"{folder}: the folder is empty")
+
+
+def _detect(folder: Path, options: dict[str, str]) -> str:
+    """The first format that the folder looks like; told where left and right are, it needs not look."""
+    if "left" in options or "right" in options:
+        return "folders"
+    name = _format_of(folder)
+    if name is None:
+        below = [p for pattern in ("*", "*/*") for p in sorted(folder.glob(pattern)) if p.is_dir() and _format_of(p)]
+        names = ", ".join(str(p.relative_to(folder)) for p in below[:3]) + (", …" if len(below) > 3 else "")
+        hint = f"; below it are {names}" if below else ""
+        raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
+    return name
+
+
+def _format_of(folder: Path) -> str | None:
+    """The first format that a folder looks like; None for no sequence."""
+    return next((name for name, (module, _) in _FORMATS.items() if import_module(module).matches(folder)), None)
+
+
+def _known(format: str) -> str:
+    if format not in _FORMATS:
+        raise UnknownNameError(f"unknown format {format!r}; known: {', '.join(formats())}")
+    return format
+
+
+def _check_options(name: str, options: dict[str, str], own: frozenset[str]) -> None:
+    """Refuse unknown options, and kinds of motion that do not exist."""
+    known = own | _COMMON_OPTIONS
+    unknown = sorted(set(options) - known)
+    if unknown:
+        raise ConfigurationError(f"unknown option {unknown[0]!r} of format {name}; known: {', '.join(sorted(known))}")
+    if options.get("kind", _KINDS[0]) not in _KINDS:
+        raise ConfigurationError(f"unknown kind of motion {options['kind']!r}; known: {', '.join(_KINDS)}")

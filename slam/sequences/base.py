@@ -1,0 +1,135 @@
+"""What a sequence is, and the one class behind all recorded ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from slam.data import StereoFrame
+from slam.errors import SequenceError
+from slam.rig import StereoRig
+from slam.se3 import Array
+from slam.sequences.faults import FaultLog
+from slam.trajectory import Trajectory
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """A stereo recording of any length: iterating it decodes one frame at a time, in constant memory.
+
+    Recorded sequences keep this protocol, and so do the synthetic worlds.
+    """
+
+    @property
+    def name(self) -> str:
+        """Short name, for reports and file names."""
+        ...
+
+    @property
+    def format(self) -> str:
+        """Name of the format, see `slam.sequences.formats`."""
+        ...
+
+    @property
+    def rig(self) -> StereoRig:
+        """The two cameras that took the images."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """Kind of motion, ``"driving"`` or ``"handheld"``: which `slam.models.KINDS` suits."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The left camera's true path ``T_world_left`` at the stamps that the format has; None where it has none."""
+        ...
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was found wrong so far, one line each; what iterating finds is added."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of listed frames; iterating yields fewer where left images turn out to be unreadable."""
+        ...
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        """All frames in order of time."""
+        ...
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
+        """Frames `start` up to, but without, `stop`; frames outside are not decoded.
+
+        Raises:
+            SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
+        """
+        ...
+
+
+class FrameSource(Protocol):
+    """Where a recorded sequence's images come from."""
+
+    @property
+    def stamps(self) -> Array:
+        """Times of the frames (N,) [s], strictly increasing."""
+        ...
+
+    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+        """Decode frames `start` to `stop`; unreadable images are reported to `faults` and skipped."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordedSequence:
+    """A sequence on disk. It keeps the `Sequence` protocol; properties are described there.
+
+    Attributes:
+        source: where the images come from.
+        gps: a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only;
+            None where there is none. It is no pose and in no camera's axes: compare positions after alignment.
+    """
+
+    name: str
+    format: str
+    kind: str
+    rig: StereoRig
+    source: FrameSource
+    ground_truth: Trajectory | None = None
+    gps: Array | None = None
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def stamps(self) -> Array:
+        """Times of the listed frames (N,) [s]."""
+        return self.source.stamps
+
+    def __len__(self) -> int:
+        return len(self.source.stamps)
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        return self.frames()
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
+        """Frames `start` up to, but without, `stop`; see `Sequence.frames`."""
+        start, stop = frame_range(start, stop, len(self))
+        return self._read(start, stop)
+
+    def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
+        """Decode lazily and sum up repeated faults at the end, also where the caller stops early."""
+        with FaultLog(self.warnings) as faults:
+            yield from self.source.read(start, stop, faults)
+
+
+def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
+    """A checked range of frames: `stop` None or beyond the end means the end.
+
+    Raises:
+        SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
+    """
+    end = length if stop is None else min(stop, length)
+    if start < 0 or start >= length or end <= start:
+        asked = f"{start}:{'' if stop is None else stop}"
+        raise SequenceError(f"frames {asked} asked for, but the sequence has frames 0:{length}")
+    return start, end

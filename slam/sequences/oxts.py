@@ -1,0 +1,95 @@
+"""OXTS records of KITTI raw: latitude, longitude, altitude and angles to poses, by the Mercator projection."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from slam.errors import SequenceError
+from slam.se3 import Array, pose
+from slam.sequences.faults import FaultLog
+from slam.sequences.pairing import increasing
+from slam.sequences.tables import date_time, read_rows, shorten
+from slam.trajectory import Trajectory
+
+_EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
+
+
+def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], faults: FaultLog) -> Trajectory:
+    """Poses ``T_world_imu`` of the records ``data/NUMBER.txt``; the world's origin is the first record's position.
+
+    Stamps come from ``timestamps.txt`` [s since `origin`, ns since 1970]; where it or `origin` is missing, a record
+    has the stamp of the frame of its number.
+
+    Raises:
+        SequenceError: there are no records, or none is readable and has a stamp.
+    """
+    files = sorted((folder / "data").glob("*.txt")) if (folder / "data").is_dir() else []
+    files = [f for f in files if f.stem.isdecimal()]
+    if not files:
+        raise SequenceError(f"{folder / 'data'}: no OXTS records")
+    stamps = _stamps(folder / "timestamps.txt", origin, frame_stamps, faults)
+    rows = []
+    for file in files:
+        record = _record(file, faults)
+        if record is not None and int(file.stem) in stamps:
+            rows.append([stamps[int(file.stem)], *record])
+    if not rows:
+        raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
+    table = np.array(rows)
+    table = table[increasing(table[:, 0])]
+    return Trajectory(table[:, 0], imu_poses(table[:, 1:7]))
+
+
+def imu_poses(records: Array) -> Array:
+    """Poses (N, 4, 4) of records (N, 6): latitude, longitude [deg], altitude [m], roll, pitch, yaw [rad].
+
+    World axes are east, north, up, its origin the first position. The Mercator projection is scaled by the cosine of
+    the first latitude, so that lengths near it are metres; ``R = Rz(yaw) Ry(pitch) Rx(roll)``.
+    """
+    latitude, longitude, altitude, roll, pitch, yaw = records.T
+    scale = _EARTH_RADIUS * np.cos(np.radians(latitude[0]))
+    east = scale * np.radians(longitude)
+    north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
+    position = np.stack([east, north, altitude], axis=1)
+    R = _axis_rotation(2, yaw) @ _axis_rotation(1, pitch) @ _axis_rotation(0, roll)
+    return pose(R, position - position[0])
+
+
+def _axis_rotation(axis: int, angle: Array) -> Array:
+    """Rotations (N, 3, 3) about a coordinate axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    R[:, i, i] = R[:, j, j] = np.cos(angle)
+    R[:, j, i] = np.sin(angle)
+    R[:, i, j] = -R[:, j, i]
+    return R
+
+
+def _record(file: Path, faults: FaultLog) -> list[float] | None:
+    """The first six numbers of one record; None and a line where it is unreadable."""
+    try:
+        return read_rows(file, _six_numbers, faults)[0]
+    except SequenceError as error:
+        faults.report("OXTS records left out", f"{error}; record left out")
+        return None
+
+
+def _six_numbers(text: str) -> list[float]:
+    """The first six numbers of a row."""
+    try:
+        row = [float(word) for word in text.split()[:6]]
+    except ValueError:
+        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
+    if len(row) < 6 or not np.isfinite(row).all() or abs(row[0]) >= 90:
+        raise ValueError(f"{shorten(text)} is not latitude, longitude, altitude, roll, pitch, yaw")
+    return row
+
+
+def _stamps(path: Path, origin: int | None, frame_stamps: dict[int, float], faults: FaultLog) -> dict[int, float]:
+    """Stamps [s] by record number."""
+    if origin is None or not path.exists():
+        return frame_stamps
+    rows = read_rows(path, date_time, faults)
+    return {number: (row - origin) * 1e-9 for number, row in enumerate(rows) if row is not None}

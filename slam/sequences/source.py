@@ -1,0 +1,281 @@
+"""Pairs of image files: listing the two cameras' folders, pairing them, and decoding them one by one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.data import StereoFrame
+from slam.errors import SequenceError
+from slam.se3 import Array
+from slam.sequences.faults import FaultLog
+from slam.sequences.images import IMAGE_SUFFIXES, read_image
+from slam.sequences.pairing import IntArray, increasing, pair, trim
+
+Size = tuple[int, int]
+
+#: Stamps of one pair may differ by so much: hardware-triggered cameras agree far better [ns].
+TOLERANCE = 5_000_000
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The images of one camera, in order of time.
+
+    Attributes:
+        folder: where they are.
+        keys: what pairs them with the other camera's (N,), strictly increasing: stamps [ns] or frame numbers.
+        names: their file names, N of them.
+    """
+
+    folder: Path
+    keys: IntArray
+    names: list[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def select(self, rows: IntArray | slice) -> Listing:
+        """The listing of these rows."""
+        index = np.arange(len(self))[rows]
+        return Listing(self.folder, self.keys[index], [self.names[i] for i in index])
+
+
+@dataclass(frozen=True)
+class ImagePairs:
+    """A frame source: two folders of image files, already paired.
+
+    Attributes:
+        stamps: times (N,) [s], strictly increasing.
+        left_folder, left: where the left images are, and their file names (N).
+        right_folder, right: the same for the right ones; None where there is no right image.
+        size: width and height that every image must have; None while it is not known yet.
+    """
+
+    stamps: Array
+    left_folder: Path
+    left: list[str]
+    right_folder: Path
+    right: list[str | None]
+    size: Size | None = None
+
+    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+        """Decode frames `start` to `stop`.
+
+        A frame whose left image is unreadable or of another size is skipped; one whose right image is, is given
+        without it.
+        """
+        for index in range(start, stop):
+            try:
+                left = self._read_one(self.left_folder / self.left[index])
+            except SequenceError as error:
+                faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {error}")
+                continue
+            yield StereoFrame(index, float(self.stamps[index]), left, self._read_right(index, faults))
+
+    def _read_right(self, index: int, faults: FaultLog) -> np.ndarray | None:
+        name = self.right[index]
+        if name is None:
+            return None
+        try:
+            return self._read_one(self.right_folder / name)
+        except SequenceError as error:
+            line = f"frame {index} is given without its right image: {error}"
+            faults.report("right images unreadable, frames given without them", line)
+            return None
+
+    def _read_one(self, path: Path) -> np.ndarray:
+        image = read_image(path)
+        size = (image.shape[1], image.shape[0])
+        if self.size is not None and size != self.size:
+            raise SequenceError(f"{path}: image is {_text(size)}, not {_text(self.size)}")
+        return image
+
+    def first_size(self) -> Size:
+        """Width and height of the first pair of images that can be read.
+
+        Raises:
+            SequenceError: no pair can be read, or the two images of the first one differ in size.
+        """
+        reason = "no frame has two images"
+        for left_name, right_name in zip(self.left, self.right):
+            if right_name is None:
+                continue
+            left_path, right_path = self.left_folder / left_name, self.right_folder / right_name
+            try:
+                left, right = read_image(left_path), read_image(right_path)
+            except SequenceError as error:
+                reason = str(error)
+                continue
+            if left.shape != right.shape:
+                sizes = f"{left_path} is {_text(left.shape[::-1])}, {right_path} is {_text(right.shape[::-1])}"
+                raise SequenceError(f"left and right images differ in size: {sizes}")
+            return left.shape[1], left.shape[0]
+        raise SequenceError(f"{self.left_folder}: no pair of images can be read: {reason}")
+
+
+def require_size(size: Size, expected: Size, calibration: Path) -> None:
+    """Raise where images are not of the calibration's size.
+
+    Raises:
+        SequenceError: they are not.
+    """
+    if size != expected:
+        raise SequenceError(f"images are {_text(size)}, but {calibration} is for {_text(expected)}")
+
+
+def image_names(folder: Path) -> list[str]:
+    """Names of the image files in a folder, sorted.
+
+    Raises:
+        SequenceError: there is no such folder, or it is a file.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            names = [e.name for e in entries if not e.name.startswith(".")]
+    except NotADirectoryError:
+        raise SequenceError(f"{folder}: a file where a folder of images should be") from None
+    except OSError as error:
+        raise SequenceError(f"{folder}: {error.strerror or error}") from error
+    return sorted(n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES)  # noqa: PTH122
+
+
+def numbered(folder: Path, faults: FaultLog) -> Listing:
+    """The images of a folder whose names are numbers (``000017.png``); gaps are reported, other files ignored.
+
+    Raises:
+        SequenceError: see `image_names`; or no image has a number for a name.
+    """
+    by_number: dict[int, str] = {}
+    for name in image_names(folder):
+        stem = name.rpartition(".")[0]
+        if stem.isdecimal():
+            by_number.setdefault(int(stem), name)
+    if not by_number:
+        raise SequenceError(f"{folder}: no images with numbers for names")
+    keys = np.array(sorted(by_number), np.int64)
+    gaps = int(keys[-1] - keys[0]) + 1 - len(keys)
+    if gaps:
+        after = by_number[int(keys[int(np.argmax(np.diff(keys) > 1))])]
+        faults.report("images", f"{folder}: {gaps} images are missing between the first and the last (after {after})")
+    return Listing(folder, keys, [by_number[k] for k in keys.tolist()])
+
+
+def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
+    """The rows of a listing whose keys increase; rows that stand twice or run backwards are reported.
+
+    Raises:
+        SequenceError: most rows are out of order.
+    """
+    rows = increasing(listing.keys)
+    dropped = np.setdiff1d(np.arange(len(listing)), rows)
+    if len(dropped):
+        first = f"(first: {listing.names[dropped[0]]})"
+        line = f"{what}: {len(dropped)} of {len(listing)} stamps stand twice or run backwards {first}"
+        if 2 * len(dropped) > len(listing):
+            raise SequenceError(line)
+        faults.report("stamps", f"{line}; left out")
+    return listing.select(rows)
+
+
+def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
+    """The listed images that exist; another ending (``.jpg`` for ``.png``) is accepted. The rest is reported.
+
+    Raises:
+        SequenceError: none exists; or see `image_names`.
+    """
+    there = image_names(listing.folder)
+    known = set(there)
+    by_stem = {name.rpartition(".")[0]: name for name in there}
+    names = [n if n in known else by_stem.get(n.rpartition(".")[0], "") for n in listing.names]
+    missing = [wanted for wanted, found in zip(listing.names, names) if not found]
+    if len(missing) == len(names):
+        raise SequenceError(f"{listing.folder}: none of the {len(names)} images listed in {what} is there")
+    if missing:
+        line = f"{what}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
+        faults.report("listed images", line)
+    found_rows = np.flatnonzero([bool(n) for n in names])
+    return Listing(listing.folder, listing.keys, names).select(found_rows)
+
+
+def hardware_tolerance(listing: Listing) -> int:
+    """How far two stamps of a pair may be apart [ns]: less than half a frame, and never more than `TOLERANCE`."""
+    if len(listing) < 2:
+        return TOLERANCE
+    return int(min(TOLERANCE, np.median(np.diff(listing.keys)) / 2))
+
+
+def stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
+    """Rows and stamps of the frames that have a time; `times` (T,) is by frame number, NaN where it has none.
+
+    Raises:
+        SequenceError: no frame, or hardly one, has a time of its own.
+    """
+    inside = numbers < len(times)
+    stamps = np.where(inside, times[np.minimum(numbers, len(times) - 1)], np.nan)
+    good = np.flatnonzero(np.isfinite(stamps))
+    keep = good[increasing(stamps[good])] if len(good) else good
+    untimed, unordered = len(numbers) - len(good), len(good) - len(keep)
+    if 2 * len(keep) < len(numbers):
+        raise SequenceError(
+            f"{path}: of {len(numbers)} images {untimed} have no time and {unordered} one that does not increase"
+        )
+    surplus = len(times) - int(numbers[-1]) - 1
+    if surplus > 0:
+        faults.report("stamps", f"{path}: the last {surplus} rows have no image")
+    if untimed:
+        faults.report("stamps", f"{path}: {untimed} images have no time; left out")
+    if unordered:
+        faults.report("stamps", f"{path}: {unordered} times stand twice or run backwards; images left out")
+    return keep, stamps[keep]
+
+
+def pair_listings(
+    left: Listing, right: Listing, tolerance: int, unit: str, faults: FaultLog
+) -> tuple[Listing, list[str | None]]:
+    """Left images and, for each, the name of the right image nearest in key, None where none is within `tolerance`.
+
+    Left images before the first pair and after the last are left out, and so are right images without a partner;
+    what is left out or stands alone is reported.
+
+    Raises:
+        SequenceError: no left image has a partner.
+    """
+    partner = pair(left.keys, right.keys, tolerance)
+    rows = trim(partner)
+    if rows.stop == 0:
+        raise SequenceError(_no_pair(left, right, tolerance, unit))
+    head, tail = rows.start, len(left) - rows.stop
+    if head or tail:
+        line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
+        faults.report("pairs", line)
+    alone = int((partner[rows] < 0).sum())
+    if alone:
+        first = left.names[int(np.flatnonzero(partner[rows] < 0)[0]) + rows.start]
+        line = f"{left.folder}: {alone} images have no partner in {right.folder} (first: {first})"
+        faults.report("pairs", f"{line}; given without a right image")
+    unused = len(right) - int((partner >= 0).sum())
+    if unused:
+        faults.report("pairs", f"{right.folder}: {unused} images have no partner in {left.folder}; left out")
+    names = [right.names[i] if i >= 0 else None for i in partner[rows]]
+    return left.select(rows), names
+
+
+def _no_pair(left: Listing, right: Listing, tolerance: int, unit: str) -> str:
+    """Why nothing pairs, with how far the nearest two images are apart."""
+    after = np.searchsorted(right.keys, left.keys).clip(0, len(right) - 1)
+    before = (after - 1).clip(0)
+    gaps = np.minimum(np.abs(right.keys[after] - left.keys), np.abs(right.keys[before] - left.keys))
+    return (
+        f"no image of {left.folder} has a partner in {right.folder}: the nearest two are {gaps.min()} {unit} apart, "
+        f"{tolerance} {unit} are allowed"
+    )
+
+
+def _text(size: tuple[int, ...]) -> str:
+    """A size as text, width first."""
+    return "x".join(str(s) for s in size)

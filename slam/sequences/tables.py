@@ -1,0 +1,96 @@
+"""Lists of stamps and file names: text tables read row by row, faults named by file and row."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from slam.errors import SequenceError
+from slam.sequences.faults import FaultLog
+
+T = TypeVar("T")
+
+_DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
+
+
+def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T | None]:
+    """The rows of a text file; blank lines and ``#`` comments do not count.
+
+    A row that `parse` refuses with a ValueError is reported to `faults` and stands as None, so that row numbers keep
+    their meaning.
+
+    Raises:
+        SequenceError: the file cannot be read or holds no row, or more than half of its rows are refused (the
+            message names the first of them).
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise SequenceError(f"{path}: {error.strerror or error}") from error
+    rows: list[T | None] = []
+    refused: list[str] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.strip()
+        if not content or content.startswith("#"):
+            continue
+        try:
+            rows.append(parse(content))
+        except ValueError as error:
+            rows.append(None)
+            refused.append(f"{path}, row {number}: {error}")
+    if not rows:
+        raise SequenceError(f"{path}: the file has no rows")
+    if 2 * len(refused) > len(rows):
+        raise SequenceError(refused[0])
+    for line in refused:
+        faults.report(f"{path}: rows left out", f"{line}; row left out")
+    return rows
+
+
+def seconds(text: str) -> float:
+    """A finite number of seconds."""
+    try:
+        value = float(text.split()[0])
+    except ValueError:
+        raise ValueError(f"{shorten(text)} is not a time in seconds") from None
+    if not np.isfinite(value):
+        raise ValueError(f"{shorten(text)} is not a finite time")
+    return value
+
+
+def nanoseconds(text: str) -> int:
+    """A whole number of nanoseconds."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise ValueError(f"{shorten(text)} is not a time in whole nanoseconds") from None
+    if not 0 <= value < 2**63:
+        raise ValueError(f"{shorten(text)} is no possible time in nanoseconds")
+    return value
+
+
+def date_time(text: str) -> int:
+    """Nanoseconds since 1970 of ``2011-09-26 13:10:51.174740992``."""
+    try:
+        if not _DATE_TIME.fullmatch(text):
+            raise ValueError
+        return int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
+    except ValueError:
+        raise ValueError(f"{shorten(text)} is not a date and time") from None
+
+
+def stamp_and_name(text: str) -> tuple[int, str]:
+    """A row of EuRoC's ``data.csv``: nanoseconds and file name; the name defaults to the stamp."""
+    first, _, rest = text.partition(",")
+    stamp = nanoseconds(first.strip())
+    name = rest.split(",")[0].strip()
+    return stamp, name or f"{first.strip()}.png"
+
+
+def shorten(text: str, length: int = 40) -> str:
+    """The text in quotes, cut where it is long."""
+    return repr(text if len(text) <= length else text[:length] + "…")

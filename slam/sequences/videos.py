@@ -1,0 +1,123 @@
+"""Two video files as a frame source: frame number i of one goes with frame number i of the other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.data import StereoFrame
+from slam.errors import SequenceError
+from slam.se3 import Array
+from slam.sequences.faults import FaultLog
+from slam.sequences.images import quiet_opencv
+from slam.sequences.source import Size
+
+#: Endings of video files, in lower case.
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
+
+
+@dataclass(frozen=True)
+class VideoPairs:
+    """A frame source: two videos.
+
+    Attributes:
+        stamps: times (N,) [s]: frame number by frame rate.
+        left, right: the files.
+        size: width and height of the frames.
+    """
+
+    stamps: Array
+    left: Path
+    right: Path
+    size: Size
+
+    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+        """Decode frames `start` to `stop`, in grey; a video that ends too early ends the sequence with a line.
+
+        A video cannot be entered in the middle without errors, so what is skipped is passed over, though not
+        converted.
+        """
+        with open_video(self.left) as left, open_video(self.right) as right:
+            for _ in range(start):
+                left.grab(), right.grab()
+            for index in range(start, stop):
+                images = [_next_grey(video) for video in (left, right)]
+                for path, image in zip((self.left, self.right), images):
+                    if image is None:
+                        faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
+                if images[0] is None or images[1] is None:
+                    return
+                yield StereoFrame(index, float(self.stamps[index]), images[0], images[1])
+
+
+def open_videos(left: Path, right: Path, rate: float | None, faults: FaultLog) -> VideoPairs:
+    """The frame source of two videos; `rate` [1/s] overrides what the left one says of itself.
+
+    Raises:
+        SequenceError: a file is no readable video, the frame sizes differ, or the frame rate is not known.
+    """
+    (count_left, rate_left, size_left), (count_right, _, size_right) = _describe(left), _describe(right)
+    if size_left != size_right:
+        raise SequenceError(
+            f"left and right images differ in size: {left} is {size_left[0]}x{size_left[1]}, "
+            f"{right} is {size_right[0]}x{size_right[1]}"
+        )
+    if count_left != count_right:
+        line = f"{left} has {count_left} frames, {right} has {count_right}: the surplus is left out"
+        faults.report("videos", line)
+    rate = rate or rate_left
+    if not (np.isfinite(rate) and rate > 0):
+        raise SequenceError(f"{left}: the frame rate is not known, add fps=…")
+    return VideoPairs(np.arange(min(count_left, count_right)) / rate, left, right, size_left)
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[Any]:
+    """A ``cv2.VideoCapture``, released in the end.
+
+    Raises:
+        SequenceError: the file is no readable video.
+    """
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
+    with quiet_opencv():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise SequenceError(f"{path}: not a readable video" if path.exists() else f"{path}: no such file")
+        yield capture
+    finally:
+        capture.release()
+
+
+def _describe(path: Path) -> tuple[int, float, Size]:
+    """Number of frames, frame rate [1/s] and frame size of a video; frames are counted where the file does not say."""
+    import cv2
+
+    with open_video(path) as video:
+        count, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), float(video.get(cv2.CAP_PROP_FPS))
+        first = _next_grey(video)
+        if first is None:
+            raise SequenceError(f"{path}: no frame of the video can be decoded")
+        if count <= 0:
+            count = 1
+            while video.grab():
+                count += 1
+    return count, rate, (first.shape[1], first.shape[0])
+
+
+def _next_grey(video: Any) -> np.ndarray | None:
+    """The next frame in grey (H, W) uint8; None at the end or where it cannot be decoded."""
+    import cv2
+
+    good, image = video.read()
+    if not good or image is None:
+        return None
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
