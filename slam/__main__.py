@@ -1,0 +1,5 @@
+"""``python -m slam``: the command ``slam``."""
+
+from slam.cli import main
+
+main()

@@ -1,0 +1,59 @@
+"""All settings of a run in one frozen, validated tree; read from and written to plain JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from slam.association import AssociationConfig
+from slam.map_management import MapConfig
+from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
+
+
+@dataclass(frozen=True)
+class SystemConfig:
+    """Everything that can be set.
+
+    Attributes:
+        models: noise, priors and motion model of all back ends.
+        association: search windows, descriptor distances, geometric check.
+        map: which features become landmarks and which landmarks are dropped.
+        frontend: options of the front end by name.
+        backend: options of the back end by name.
+    """
+
+    models: EstimatorModels = field(default_factory=EstimatorModels)
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    frontend: dict[str, Any] = field(default_factory=dict)
+    backend: dict[str, Any] = field(default_factory=dict)
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    @classmethod
+    def for_kind(cls, kind: str) -> SystemConfig:
+        """The default settings for a kind of motion, ``"handheld"`` or ``"driving"``.
+
+        Raises:
+            ConfigurationError: the kind is not known.
+        """
+        return cls(models=models_for(kind))
+
+    def to_json(self) -> dict[str, Any]:
+        """The tree as plain types; arrays as lists."""
+        tree = asdict(self)
+        T = tree["models"]["T_world_left"]
+        tree["models"]["T_world_left"] = None if T is None else T.tolist()
+        return tree
+
+    def with_settings(self, settings: list[str]) -> SystemConfig:
+        """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
+
+        Values are JSON (``true``, ``3.5``, ``[1, 2]``) or plain words.
+
+        Raises:
+            ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.
+        """
+        from slam.settings import apply_settings
+
+        return apply_settings(self, settings)

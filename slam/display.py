@@ -1,0 +1,111 @@
+"""What a run shows on the terminal: progress with frame rate and status, and tables at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+from rich.table import Table
+
+from slam.data import FrameResult
+
+_console = Console()
+
+
+class Progress:
+    """A progress bar over frames; a context manager.
+
+    Args:
+        total: number of frames.
+        title: shown before the bar.
+        quiet: show nothing.
+
+    Attributes:
+        last: the latest result; None before the first.
+    """
+
+    def __init__(self, total: int, title: str, quiet: bool = False) -> None:
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]} {task.fields[status]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self.last: FrameResult | None = None
+        self._task = self._bar.add_task(title, total=total, rate="", status="")
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def frame(self, result: FrameResult) -> None:
+        """Show one more frame; the bar appears with the first."""
+        self.last = result
+        self._bar.start()
+        task = self._bar.tasks[0]
+        rate = f"{task.speed:.1f} Hz" if task.speed else ""
+        status = f"{result.status.value}, {len(result.report.used)} of {result.map_size} landmarks"
+        self._bar.update(self._task, advance=1, rate=rate, status=status)
+
+
+def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
+    """A table of finished runs, a column each."""
+    table = Table(title=summaries[0]["sequence"])
+    table.add_column("")
+    for summary in summaries:
+        table.add_column(summary["backend"], justify="right")
+    for label, values in _summary_rows(summaries):
+        table.add_row(escape(label), *values)
+    _console.print(table)
+    _console.print(f"Files: {out}")
+
+
+def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]]:
+    """Label and one text per run."""
+    rows: list[tuple[str, list[str]]] = [
+        ("frames", [str(s["frames"]) for s in summaries]),
+        ("status", [", ".join(f"{n} {k}" for k, n in s["status"].items()) for s in summaries]),
+        ("landmarks", [str(s.get("landmarks", 0)) for s in summaries]),
+        ("path length [m]", [f"{s.get('path_length_m', 0.0):.2f}" for s in summaries]),
+    ]
+    for when in ("online", "final"):
+        keys = {key: None for s in summaries for key in s.get("accuracy", {}).get(when, {})}
+        for key in keys:
+            rows.append((f"{when} {key}", [_figure(s["accuracy"][when].get(key)) for s in summaries]))
+    rows.append(("median per frame [ms]", [_figure(s.get("milliseconds", {}).get("median_total")) for s in summaries]))
+    rows.append(("frames per second", [_figure(s.get("frames_per_second")) for s in summaries]))
+    return rows
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (int, float)) else "–"
+
+
+def print_listing() -> None:
+    """Back ends, front ends, built-in sequences and formats."""
+    from slam import registry, worlds
+    from slam.sequences import formats
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_row("back ends", ", ".join(registry.names("backends")))
+    table.add_row("front ends", ", ".join(registry.names("frontends")))
+    table.add_row("formats", ", ".join(formats()))
+    _console.print(table)
+    worlds_table = Table(title="built-in sequences", show_lines=False)
+    worlds_table.add_column("name")
+    worlds_table.add_column("what")
+    for name in worlds.names():
+        worlds_table.add_row(f"synthetic:{name}", worlds.describe(name))
+    _console.print(worlds_table)

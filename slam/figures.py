@@ -1,0 +1,189 @@
+"""Pictures of runs, made from the files that they leave: maps with covariance ellipsoids, paths, errors over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slam.metrics import align, associate
+from slam.se3 import Array
+from slam.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
+_COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f")
+_SIGMAS = 2.0  # size of ellipses and ellipsoids
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What a run's folder says.
+
+    Attributes:
+        name: shown in the pictures.
+        online, final: paths.
+        positions: landmarks (N, 3) [m].
+        covariances: (N, 3, 3) [m²].
+        seen_last: which landmarks were measured in the last frame (N,).
+        deviations: of the online position in world axes (F, 3) [m].
+        status: of each frame (F,).
+    """
+
+    name: str
+    online: Trajectory
+    final: Trajectory
+    positions: Array
+    covariances: Array
+    seen_last: np.ndarray
+    deviations: Array
+    status: list[str]
+
+    @classmethod
+    def read(cls, folder: Path, name: str) -> RunData:
+        """Read the files of a finished run."""
+        landmarks = np.genfromtxt(folder / "landmarks.csv", delimiter=",", skip_header=1, ndmin=2).reshape(-1, 12)
+        frames = np.genfromtxt(folder / "frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+        upper = landmarks[:, 4:10]
+        covariances = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return cls(
+            name,
+            Trajectory.read_tum(folder / "trajectory.txt"),
+            Trajectory.read_tum(folder / "trajectory_final.txt"),
+            landmarks[:, 1:4],
+            covariances,
+            landmarks[:, 11] == landmarks[:, 11].max(initial=0),
+            np.stack([frames["sd_x"], frames["sd_y"], frames["sd_z"]], axis=1),
+            [str(s) for s in np.atleast_1d(frames["status"])],
+        )
+
+
+def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
+    """Top view (right, forward) of each run: landmarks red if seen in the last frame, else green (paper A, Fig. 6)."""
+    from matplotlib.collections import EllipseCollection
+
+    figure, axes = _figure(len(runs), (6.4, 6.0))
+    for axis, run in zip(axes, runs):
+        plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
+        values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
+        angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+        for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
+            ellipses = EllipseCollection(
+                width[rows, 1], width[rows, 0], angle[rows], units="xy", offsets=run.positions[rows][:, [0, 2]],
+                offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
+            )  # fmt: skip
+            axis.add_collection(ellipses)
+            axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
+        _draw_truth(axis, run.online, truth, (0, 2))
+        axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=1.5, label="path")
+        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
+        _limit_to_most(axis, run)
+    axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
+    _save(figure, path)
+
+
+def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
+    """The map in 3D with covariance ellipsoids and the path (paper A, Fig. 5)."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(6.4 * len(runs), 5.4), layout="constrained")
+    u, v = np.mgrid[0 : 2 * np.pi : 9j, 0 : np.pi : 6j]
+    sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    for i, run in enumerate(runs):
+        axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
+        near = _near_rows(run)[:most]
+        for row in near:
+            values, vectors = np.linalg.eigh(run.covariances[row])
+            shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]
+            colour = _SEEN if run.seen_last[row] else _UNSEEN
+            axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
+        p = run.online.positions
+        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5)
+        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        axis.set_aspect("equal")
+        axis.view_init(elev=25, azim=-65)
+    _save(figure, path)
+
+
+def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
+    """Position error over time of each run, component by component, inside the ±3σ that the run claims."""
+    figure, axes = _figure(3, (9.0, 2.3), rows=True)
+    for colour, run in zip(_COLOURS, runs):
+        own, true = associate(run.online, truth, 0.02, interpolated=True)
+        start = own.poses[0] @ np.linalg.inv(true.poses[0])
+        expected = true.positions @ start[:3, :3].T + start[:3, 3]
+        error = 100 * (own.positions - expected)
+        rows = np.searchsorted(run.online.stamps, own.stamps)
+        band = 300 * run.deviations[rows]
+        for axis, component, label in zip(axes, range(3), ("right", "down", "forward")):
+            t = own.stamps - own.stamps[0]
+            axis.fill_between(t, -band[:, component], band[:, component], color=colour, alpha=0.15, lw=0)
+            axis.plot(t, error[:, component], color=colour, lw=1.2, label=run.name)
+            axis.set_ylabel(f"{label} [cm]")
+            axis.axhline(0, color="0.6", lw=0.5)
+    axes[0].set_title("Error of the position, online (band: ±3σ as claimed)")
+    axes[0].legend(loc="upper left", fontsize=8, frameon=False)
+    axes[-1].set_xlabel("time [s]")
+    _save(figure, path)
+
+
+def draw_features(image: np.ndarray, tracked: Array, added: Array, path: Path) -> None:
+    """One left image with measured landmarks (yellow) and new ones (green); pixels (N, 2)."""
+    import cv2
+
+    picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    scale = max(1, round(960 / picture.shape[1]))
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for pixels, colour in ((tracked, (0, 220, 255)), (added, (80, 200, 80))):
+        for u, v in pixels:
+            centre = (round(scale * (u + 0.5)), round(scale * (v + 0.5)))
+            cv2.circle(picture, centre, 3 * scale, colour, 1, cv2.LINE_AA)
+    cv2.imwrite(str(path), picture)
+
+
+def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:
+    """The true path, aligned to the estimated one."""
+    if truth is None:
+        return
+    own, true = associate(online, truth, 0.02, interpolated=True)
+    aligned = align(true, own).apply_trajectory(true)
+    axis.plot(*aligned.positions[:, list(components)].T, "--", color=_TRUTH, lw=1.2, label="true path")
+
+
+def _near_rows(run: RunData) -> np.ndarray:
+    """Landmarks that are well known and near the path, most recent last: others would spoil the picture's scale."""
+    size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
+    extent = max(float(np.ptp(run.online.positions, axis=0).max()), 1.0)
+    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    return np.flatnonzero((size < 0.2 * extent) & (distance < 2.0 * extent + 3.0))
+
+
+def _limit_to_most(axis: Axes, run: RunData) -> None:
+    """Axis limits that hold the path and the well-known landmarks."""
+    points = np.concatenate([run.online.positions, run.positions[_near_rows(run)]])[:, [0, 2]]
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.05 * float((high - low).max()) + 0.1
+    axis.set_xlim(low[0] - margin, high[0] + margin)
+    axis.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _figure(count: int, size: tuple[float, float], rows: bool = False) -> tuple[Any, list[Any]]:
+    import matplotlib.pyplot as plt
+
+    shape = (count, 1) if rows else (1, count)
+    figure, axes = plt.subplots(
+        *shape, figsize=(size[0] * shape[1], size[1] * shape[0]), squeeze=False, layout="constrained", sharex=rows
+    )
+    return figure, list(axes.ravel())
+
+
+def _save(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)

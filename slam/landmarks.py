@@ -1,0 +1,86 @@
+"""The map's bookkeeping: what a landmark looks like and how well it is seen. Where it is, the back end alone knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, IdArray, StereoFeatures
+
+
+@dataclass(frozen=True)
+class LandmarkRows:
+    """Landmarks in the map, a row each, ids ascending.
+
+    Attributes:
+        ids: landmark ids (N,).
+        descriptors: as last seen (N, D) float32.
+        laplacian: signs of the Laplacian (N,) int8.
+        seen: number of frames in which it was measured (N,).
+        in_view: number of frames in which it was predicted in the angle of view (N,).
+        missed: number of such frames since it was last measured (N,).
+        first_seen, last_seen: frame indices (N,).
+    """
+
+    ids: IdArray
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    seen: IdArray
+    in_view: IdArray
+    missed: IdArray
+    first_seen: IdArray
+    last_seen: IdArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def empty(cls, dimensions: int) -> LandmarkRows:
+        """No landmarks, for descriptors of `dimensions` numbers."""
+        none = np.zeros(0, np.int64)
+        return cls(none, np.zeros((0, dimensions), np.float32), np.zeros(0, np.int8), none, none, none, none, none)
+
+    def rows(self, ids: IdArray) -> NDArray[np.intp]:
+        """Row numbers of ids that are in the map."""
+        return np.searchsorted(self.ids, ids)
+
+    def after_frame(
+        self, frame: int, in_view: IdArray, measured: IdArray, features: StereoFeatures, feature_rows: NDArray[np.intp]
+    ) -> LandmarkRows:
+        """Count what one frame showed: which ids were in view, which were measured, by which features."""
+        view, hit = self.rows(in_view), self.rows(measured)
+        seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
+        views[view] += 1
+        missed[view] += 1
+        views[np.setdiff1d(hit, view)] += 1  # recognised although predicted out of view
+        seen[hit] += 1
+        missed[hit] = 0
+        last_seen[hit] = frame
+        descriptors = self.descriptors.copy()
+        descriptors[hit] = features.descriptors[feature_rows]
+        return replace(self, seen=seen, in_view=views, missed=missed, last_seen=last_seen, descriptors=descriptors)
+
+    def with_new(
+        self, frame: int, ids: IdArray, features: StereoFeatures, feature_rows: NDArray[np.intp]
+    ) -> LandmarkRows:
+        """The rows with new landmarks appended; their ids must be larger than all others."""
+        once = np.ones(len(ids), np.int64)
+        new = LandmarkRows(
+            ids,
+            features.descriptors[feature_rows],
+            features.laplacian[feature_rows],
+            once,
+            once,
+            once * 0,
+            once * frame,
+            once * frame,
+        )
+        return LandmarkRows(
+            *(np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(LandmarkRows))
+        )
+
+    def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkRows:
+        """Some of the rows, in order."""
+        return LandmarkRows(*(getattr(self, f.name)[keep] for f in fields(LandmarkRows)))

@@ -1,0 +1,139 @@
+"""Which features become landmarks and which landmarks are dropped (paper A, IV)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.association import crowded
+from slam.data import BoolArray, StereoFeatures
+from slam.errors import ConfigurationError
+from slam.landmarks import LandmarkRows
+from slam.models import FORBID_UNKNOWN
+from slam.rig import StereoRig
+from slam.se3 import Array
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Settings of the map management.
+
+    Attributes:
+        target_in_view: number of measured landmarks to keep up in each frame; fewer, and new ones are added.
+        grid: cells (columns, rows) over the image; new landmarks go first where the cell has fewest.
+        separation: least distance of a new landmark from the landmarks in view [px].
+        max_depth_error: largest relative standard deviation of a new landmark's depth.
+        erase_missed: a landmark is erased after so many frames in view without being measured ("not continuously
+            detected"), and
+        erase_share: where it was measured in less than this share of the frames in view (judged from
+            `erase_missed` frames on).
+        max_landmarks: size of the map; beyond it, those out of view longest are erased.
+    """
+
+    target_in_view: int = 150
+    grid: tuple[int, int] = (8, 4)
+    separation: float = 8.0
+    max_depth_error: float = 0.2
+    erase_missed: int = 5
+    erase_share: float = 0.3
+    max_landmarks: int = 1000
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        if self.target_in_view < 3 or self.max_landmarks < self.target_in_view:
+            raise ConfigurationError("map: 3 <= target_in_view <= max_landmarks is required")
+        if min(self.grid) < 1 or self.separation < 0:
+            raise ConfigurationError("map: grid cells must be at least 1 and separation not negative")
+        if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1 and self.erase_missed >= 1):
+            raise ConfigurationError("map: max_depth_error, erase_share or erase_missed is out of range")
+
+
+def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV)."""
+    lost = landmarks.missed >= config.erase_missed
+    judged = landmarks.in_view > config.erase_missed
+    rare = judged & (landmarks.seen < config.erase_share * landmarks.in_view)
+    return lost | rare
+
+
+def surplus_landmarks(landmarks: LandmarkRows, keep: BoolArray, config: MapConfig) -> BoolArray:
+    """Which of the kept landmarks (N,) to erase so that `max_landmarks` remain: those seen longest ago."""
+    surplus = int(keep.sum()) - config.max_landmarks
+    out = np.zeros(len(landmarks), bool)
+    if surplus > 0:
+        rows = np.flatnonzero(keep)
+        oldest = rows[np.argsort(landmarks.last_seen[rows], kind="stable")[:surplus]]
+        out[oldest] = True
+    return out
+
+
+def new_landmarks(
+    features: StereoFeatures,
+    free: BoolArray,
+    occupied: Array,
+    rig: StereoRig,
+    pixel_sigma: float,
+    config: MapConfig,
+) -> NDArray[np.intp]:
+    """Rows of the features that become landmarks.
+
+    Args:
+        features: of the frame.
+        free: which of them are no landmark (N,).
+        occupied: pixels of the landmarks in view (M, 2), measured ones first of all.
+        rig: the cameras, for the depth's uncertainty.
+        pixel_sigma: noise of uL, vL, uR [px].
+        config: settings.
+    """
+    wanted = config.target_in_view - len(occupied)
+    if wanted <= 0 or not len(features):
+        return np.zeros(0, np.intp)
+    rows = np.flatnonzero(free & features.has_stereo)
+    rows = rows[~crowded(features.uv_left[rows], occupied, config.separation)]
+    rows = rows[_depth_is_good(features, rows, rig, pixel_sigma, config.max_depth_error)]
+    rows = rows[np.argsort(-features.response[rows], kind="stable")]
+    return _spread(features.uv_left, rows, occupied, wanted, rig, config)
+
+
+def _depth_is_good(
+    features: StereoFeatures, rows: NDArray[np.intp], rig: StereoRig, pixel_sigma: float, limit: float
+) -> BoolArray:
+    """Which rows have a positive depth whose relative standard deviation is below the limit."""
+    points = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+    variance = rig.triangulation_covariance(points, pixel_sigma)[:, 2, 2]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(variance) < limit * points[:, 2])
+
+
+def _spread(
+    uv: Array, rows: NDArray[np.intp], occupied: Array, wanted: int, rig: StereoRig, config: MapConfig
+) -> NDArray[np.intp]:
+    """Pick rows (best first) so that the grid fills evenly and no two lie closer than the separation."""
+    columns, lines = config.grid
+    size = np.array([rig.width / columns, rig.height / lines])
+
+    def cell(pixels: Array) -> NDArray[np.intp]:
+        c = np.clip((pixels / size).astype(int), 0, (columns - 1, lines - 1))
+        return c[:, 1] * columns + c[:, 0]
+
+    load = np.bincount(cell(occupied), minlength=columns * lines)
+    # Each feature's rank in its cell plus what the cell holds already: features of empty cells come first.
+    cells = cell(uv[rows])
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], np.arange(columns * lines))
+    rank = np.empty(len(rows), int)
+    rank[order] = np.arange(len(rows)) - starts[cells[order]]
+    queue = rows[np.argsort(rank + load[cells], kind="stable")]
+    chosen: list[int] = []
+    taken = np.full((wanted, 2), np.inf)
+    for row in queue:
+        if len(chosen) == wanted:
+            break
+        gap = taken[: len(chosen)] - uv[row]
+        if not (np.einsum("ij,ij->i", gap, gap) < config.separation**2).any():
+            taken[len(chosen)] = uv[row]
+            chosen.append(int(row))
+    return np.array(chosen, np.intp)

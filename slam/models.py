@@ -1,0 +1,110 @@
+"""The one place for what every estimator assumes: motion model, pixel noise, priors, gate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from slam.errors import ConfigurationError
+from slam.se3 import Array
+
+
+def _require_positive(config: object) -> None:
+    """Raise where a float field of a configuration dataclass is not positive and finite."""
+    for f in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, f.name)
+        if isinstance(value, (int, float)) and not (np.isfinite(value) and value > 0):
+            raise ConfigurationError(f"{f.name} must be positive and finite, got {value}")
+
+
+#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
+FORBID_UNKNOWN = {"extra": "forbid"}
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """Constant velocity, disturbed by impulse accelerations (paper B, section 2).
+
+    The velocity changes of two steps are independent, so their variance grows with time: over Δt the velocity noise
+    w of paper B has standard deviation ``density · √Δt``, whatever the frame rate.
+
+    Attributes:
+        acceleration: density of the linear velocity noise [m/s / √s].
+        angular_acceleration: density of the angular velocity noise [rad/s / √s].
+    """
+
+    acceleration: float = 1.0
+    angular_acceleration: float = 1.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        _require_positive(self)
+
+    def velocity_variance(self, dt: float) -> tuple[float, float]:
+        """Variances of w_v [m²/s²] and w_ω [rad²/s²] over `dt` [s]."""
+        return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
+
+
+@dataclass(frozen=True)
+class EstimatorModels:
+    """Noise, priors and gate shared by all back ends.
+
+    Attributes:
+        motion: the motion model.
+        pixel_sigma: standard deviation of uL, vL and uR [px].
+        gate_probability: an observation is rejected where its innovation lies outside this quantile of χ².
+        initial_position_sigma, initial_rotation_sigma: of the first pose [m], [rad]; tiny where it defines the world.
+        initial_velocity_sigma, initial_angular_velocity_sigma: of the first velocities [m/s], [rad/s].
+        T_world_left: first pose (4, 4); None for the identity.
+    """
+
+    motion: MotionModel = field(default_factory=MotionModel)
+    pixel_sigma: float = 1.0
+    gate_probability: float = 0.999
+    initial_position_sigma: float = 1e-4
+    initial_rotation_sigma: float = 1e-5
+    initial_velocity_sigma: float = 1.0
+    initial_angular_velocity_sigma: float = 1.0
+    T_world_left: Sequence[Sequence[float]] | None = None
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        _require_positive(self)
+        if self.gate_probability >= 1:
+            raise ConfigurationError(f"gate_probability must lie between 0 and 1, got {self.gate_probability}")
+
+    @property
+    def initial_pose(self) -> Array:
+        """The first pose (4, 4)."""
+        return np.eye(4) if self.T_world_left is None else np.array(self.T_world_left, float)
+
+
+#: What is assumed of a kind of motion; every sequence of a kind runs with the same.
+KINDS = {
+    "handheld": EstimatorModels(
+        MotionModel(acceleration=1.0, angular_acceleration=1.0),
+        initial_velocity_sigma=1.0,
+        initial_angular_velocity_sigma=1.0,
+    ),
+    "driving": EstimatorModels(
+        MotionModel(acceleration=1.0, angular_acceleration=0.3),
+        initial_velocity_sigma=15.0,
+        initial_angular_velocity_sigma=0.3,
+    ),
+}
+
+
+def models_for(kind: str) -> EstimatorModels:
+    """The models of a kind of motion, ``"handheld"`` or ``"driving"``.
+
+    Raises:
+        ConfigurationError: the kind is not known.
+    """
+    try:
+        return KINDS[kind]
+    except KeyError:
+        raise ConfigurationError(f"unknown kind of motion {kind!r}; known: {', '.join(KINDS)}") from None

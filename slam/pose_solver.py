@@ -1,0 +1,167 @@
+"""The camera's pose from landmarks of known position: robust consensus and least squares on reprojection errors.
+
+It tells which matches agree with one rigid motion before any estimator sees them, and gives a smoother its first guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray
+from slam.rig import StereoRig
+from slam.se3 import Array, exp, hat, inverse
+
+_MINIMAL = 3  # stereo points that fix a pose
+_REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
+_CLEAR_MAJORITY = 0.7  # of the matches that agree with the guess: no other pose can have as many
+_POLISHING_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class PoseConsensus:
+    """A pose and the matches that agree with it.
+
+    Attributes:
+        T_world_left: pose (4, 4).
+        inliers: which matches agree (M,).
+    """
+
+    T_world_left: Array
+    inliers: BoolArray
+
+
+def measurement_rows(uv_left: Array, uv_right: Array) -> Array:
+    """Stereo measurements (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel."""
+    return np.concatenate([uv_left, uv_right[:, :1]], axis=1)
+
+
+def find_consensus(
+    rig: StereoRig, points: Array, measured: Array, guess: Array, threshold: float, hypotheses: int, seed: int
+) -> PoseConsensus:
+    """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
+
+    The guess is tried first, and is enough where a clear majority agrees with it. Other hypotheses are rigid fits of
+    three triangulated points, refined on their reprojection errors.
+
+    Args:
+        rig: the cameras.
+        points: landmark positions (M, 3) in world coordinates [m].
+        measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
+        guess: expected pose T_world_left (4, 4).
+        threshold: largest reprojection error of an inlier, on each of uL, vL, uR [px].
+        hypotheses: how many minimal sets are tried.
+        seed: of the random choice.
+    """
+    first = _polish(rig, points, measured, inverse(guess), threshold)
+    if first.inliers.sum() >= _CLEAR_MAJORITY * len(points):
+        return first
+    stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    if len(stereo) < _MINIMAL:
+        return first
+    poses = _minimal_poses(rig, points, measured, stereo, hypotheses, seed)
+    if not len(poses):
+        return first
+    support = _agreement(rig, points, measured, poses, threshold).sum(axis=1)
+    best = _polish(rig, points, measured, poses[int(np.argmax(support))], threshold)
+    return best if best.inliers.sum() > first.inliers.sum() else first
+
+
+def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> PoseConsensus:
+    """Least squares on the matches that agree with a pose, repeated while their number grows."""
+    inliers = _agreement(rig, points, measured, T_left_world[None], threshold)[0]
+    for _ in range(_POLISHING_ROUNDS):
+        if inliers.sum() < _MINIMAL:
+            break
+        better = refine_pose(rig, points[inliers], measured[inliers], T_left_world)
+        again = _agreement(rig, points, measured, better[None], threshold)[0]
+        if again.sum() < inliers.sum():
+            break
+        T_left_world, grown = better, again.sum() > inliers.sum()
+        inliers = again
+        if not grown:
+            break
+    return PoseConsensus(inverse(T_left_world), inliers)
+
+
+def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = 10) -> Array:
+    """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
+    T = T_left_world
+    for _ in range(steps):
+        residual, J = _reprojection(rig, points, measured, T[None])
+        delta = _gauss_newton_step(residual, J)[0]
+        T = exp(delta) @ T
+        if np.abs(delta).max() < 1e-8:
+            break
+    return T
+
+
+def _minimal_poses(
+    rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, seed: int
+) -> Array:
+    """Poses T_left_world (H, 4, 4) from random triples of stereo matches."""
+    rng = np.random.default_rng(seed)
+    triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :_MINIMAL]]
+    uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
+    local = rig.triangulate(measured[:, :2], uv_right)
+    good = np.isfinite(local[triples]).all(axis=(1, 2))
+    triples = triples[good]
+    if not len(triples):
+        return np.zeros((0, 4, 4))
+    poses = rigid_fit(points[triples], local[triples])
+    for _ in range(_REFINEMENTS):
+        residual, J = _reprojection(rig, points[triples], measured[triples], poses)
+        poses = exp(_gauss_newton_step(residual, J)) @ poses
+    return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def rigid_fit(source: Array, target: Array) -> Array:
+    """Least-squares rigid motions (H, 4, 4) taking points (H, K, 3) to points (H, K, 3) (Kabsch, Umeyama 1991)."""
+    mean_s, mean_t = source.mean(axis=1), target.mean(axis=1)
+    covariance = np.swapaxes(target - mean_t[:, None], 1, 2) @ (source - mean_s[:, None])
+    U, _, Vt = np.linalg.svd(covariance)
+    sign = np.ones((len(source), 3))
+    sign[:, 2] = np.linalg.det(U @ Vt)
+    R = (U * sign[:, None, :]) @ Vt
+    T = np.tile(np.eye(4), (len(source), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = mean_t - (R @ mean_s[..., None])[..., 0]
+    return T
+
+
+def _reprojection(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> tuple[Array, Array]:
+    """Residuals (H, K, 3) and Jacobians (H, K, 3, 6) by a perturbation on the left of T_left_world.
+
+    `points` and `measured` are (K, 3), or (H, K, 3) with a set for each pose. Unusable entries are zero in both.
+    """
+    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
+    shape = local.shape[:2]
+    z, J_point = rig.project_stereo(local.reshape(-1, 3))
+    residual = measured - z.reshape(*shape, 3)
+    motion = np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (*shape, 3, 3))], axis=-1)
+    J = J_point.reshape(*shape, 3, 3) @ motion
+    unusable = ~np.isfinite(residual)
+    residual = np.where(unusable, 0.0, residual)
+    J = np.where(unusable[..., None], 0.0, J)
+    return residual, J
+
+
+def _gauss_newton_step(residual: Array, J: Array) -> Array:
+    """Steps (H, 6); lightly damped so that a degenerate set yields a bad pose, not an error."""
+    count = len(J)
+    J = J.reshape(count, -1, 6)
+    normal = np.swapaxes(J, 1, 2) @ J
+    normal += np.eye(6) * (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12)
+    return np.linalg.solve(normal, np.swapaxes(J, 1, 2) @ residual.reshape(count, -1, 1))[..., 0]
+
+
+def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:
+    """Which matches (H, M) reproject within `threshold` [px] under each pose."""
+    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
+    left, right = rig.project(local.reshape(-1, 3))
+    z = np.concatenate([left, right[:, :1]], axis=1).reshape(*local.shape[:2], 3)
+    error = np.abs(measured - z)
+    error[..., 2] = np.where(np.isfinite(measured[:, 2]), error[..., 2], 0.0)
+    return np.asarray((error < threshold).all(axis=-1))  # NaN (behind the camera) compares false

@@ -1,0 +1,46 @@
+"""A camera before a cloud of points with descriptors, for tests of association and of the whole system."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam import se3
+from slam.data import StereoFeatures
+from slam.rig import StereoRig
+
+RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
+
+
+class Cloud:
+    """Points with unit descriptors; what a camera sees of them."""
+
+    def __init__(self, count: int = 120, seed: int = 0, dimensions: int = 32) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.points = np.column_stack(
+            [self.rng.uniform(-2, 2, count), self.rng.uniform(-1.5, 1.5, count), self.rng.uniform(2, 6, count)]
+        )
+        d = self.rng.normal(size=(count, dimensions))
+        self.descriptors = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+        self.laplacian = np.where(self.rng.random(count) < 0.5, -1, 1).astype(np.int8)
+
+    def features(self, T_world_left: np.ndarray, stamp: float, noise: float = 0.0) -> tuple[StereoFeatures, np.ndarray]:
+        """Features in an order of their own, and which point each is (N,)."""
+        local = se3.transform(se3.inverse(T_world_left), self.points)
+        left, right = RIG.project(local)
+        ids = self.rng.permutation(np.flatnonzero(RIG.left.in_image(left)))
+        uv = left[ids] + noise * self.rng.normal(size=(len(ids), 2))
+        uv_right = right[ids] + noise * self.rng.normal(size=(len(ids), 2))
+        uv_right[:, 1] = uv[:, 1]
+        n = len(ids)
+        return StereoFeatures(
+            stamp, uv, uv_right, np.full(n, 12.0), np.zeros(n), 1.0 + self.rng.random(n), self.laplacian[ids],
+            self.descriptors[ids],
+        ), ids  # fmt: skip
+
+
+def path(frames: int) -> list[np.ndarray]:
+    """A smooth hand-held path (frames, 4, 4) from the origin."""
+    t = np.arange(frames) / 30
+    swing = np.stack([0.1 * np.sin(t), 0.2 * np.sin(0.7 * t), 0.05 * np.sin(1.3 * t)], axis=1)
+    shift = np.stack([0.3 * np.sin(0.8 * t), 0.1 * np.sin(1.1 * t), 0.3 * t], axis=1)
+    return [se3.exp(np.concatenate([a, b])) for a, b in zip(swing, shift)]

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+COMMAND = [sys.executable, "-m", "slam"]
+
+
+def slam(*arguments, **more):
+    return subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=300, **more)
+
+
+def fails_with_one_line(done, *words):
+    assert done.returncode == 2, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    for word in words:
+        assert str(word) in lines[0]
+
+
+@pytest.fixture
+def euroc(tmp_path):
+    """A tiny EuRoC folder of noise images."""
+    import cv2
+
+    rng = np.random.default_rng(0)
+    folder = tmp_path / "euroc"
+    for camera, x in (("cam0", 0.0), ("cam1", 0.11)):
+        data = folder / "mav0" / camera / "data"
+        data.mkdir(parents=True)
+        rows = "#timestamp [ns],filename\n"
+        for k in range(3):
+            name = f"{1_000_000_000 + 50_000_000 * k}.png"
+            cv2.imwrite(str(data / name), rng.integers(0, 255, (120, 160), dtype=np.uint8))
+            rows += f"{name[:-4]},{name}\n"
+        (folder / "mav0" / camera / "data.csv").write_text(rows)
+        (folder / "mav0" / camera / "sensor.yaml").write_text(
+            f"sensor_type: camera\nT_BS:\n  rows: 4\n  cols: 4\n  data: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
+            "resolution: [160, 120]\ncamera_model: pinhole\nintrinsics: [150, 150, 80, 60]\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+        )
+    return folder
+
+
+def test_a_good_folder_runs(euroc, tmp_path):
+    done = slam("run", euroc, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "3" in done.stdout
+
+
+def test_missing_folder(tmp_path):
+    fails_with_one_line(slam("run", tmp_path / "nowhere", "--out", tmp_path / "out"), "nowhere")
+
+
+def test_empty_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    fails_with_one_line(slam("run", tmp_path / "empty", "--out", tmp_path / "out"), "empty")
+
+
+def test_a_file_where_a_folder_should_be(tmp_path):
+    (tmp_path / "file").write_text("x")
+    fails_with_one_line(slam("run", tmp_path / "file", "--out", tmp_path / "out"), "file")
+
+
+def test_one_camera(euroc, tmp_path):
+    (euroc / "mav0" / "cam1").rename(tmp_path / "elsewhere")
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "cam1")
+
+
+def test_cameras_swapped(euroc, tmp_path):
+    sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("0.11", "-0.11"))
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "left")
+
+
+def test_nan_in_the_calibration(euroc, tmp_path):
+    sensor = euroc / "mav0" / "cam0" / "sensor.yaml"
+    sensor.write_text(sensor.read_text().replace("intrinsics: [150,", "intrinsics: [.nan,"))
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "sensor.yaml")
+
+
+def test_images_of_unequal_size(euroc, tmp_path):
+    import cv2
+
+    for image in (euroc / "mav0" / "cam1" / "data").iterdir():
+        cv2.imwrite(str(image), np.zeros((100, 160), np.uint8))
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "160x100")
+
+
+def test_a_truncated_image_is_said_and_the_rest_goes_on(euroc, tmp_path):
+    image = sorted((euroc / "mav0" / "cam0" / "data").iterdir())[1]
+    image.write_bytes(image.read_bytes()[:-200])
+    done = slam("run", euroc, "--out", tmp_path / "out", "--quiet")
+    assert done.returncode == 0
+    assert image.name in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert (tmp_path / "out" / "trajectory.txt").read_text().count("\n") == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--backend", "foo"], ["foo", "ekf", "smoother"]),
+        (["--frontend", "foo"], ["foo", "surf"]),
+        (["--set", "map.colour=1"], ["colour"]),
+        (["--set", "backend.colour=1"], ["colour"]),
+        (["--set", "frontend.colour=1"], ["colour"]),
+        (["--kind", "flying"], ["flying", "handheld"]),
+        (["--format", "foo"], ["foo", "euroc"]),
+        (["--frames", "x"], ["A:B"]),
+        (["--frames", "7:9"], ["7:9"]),
+    ],
+)
+def test_unknown_names_and_keys(euroc, tmp_path, arguments, words):
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out", *arguments), *words)
+
+
+def test_unknown_world(tmp_path):
+    fails_with_one_line(slam("run", "synthetic:moon", "--out", tmp_path / "out"), "moon", "aisle")
+
+
+def test_out_is_a_file(euroc, tmp_path):
+    (tmp_path / "out").write_text("")
+    fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "out")
+
+
+def test_usage_errors_are_status_2():
+    assert slam("run").returncode == 2
+    assert slam("fly").returncode == 2
+
+
+def test_list_names_everything():
+    done = slam("list", env={**os.environ, "COLUMNS": "200"})
+    assert done.returncode == 0, done.stderr
+    for word in ("ekf", "smoother", "surf", "synthetic:aisle", "euroc", "kitti"):
+        assert word in done.stdout

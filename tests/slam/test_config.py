@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from slam.config import SystemConfig
+from slam.errors import ConfigurationError
+from slam.settings import from_json
+
+
+def test_settings_reach_their_place():
+    config = SystemConfig.for_kind("driving").with_settings(
+        [
+            "map.max_landmarks=300",
+            "backend.measurement=left",
+            "association.d_match=[0.3, 0.2]",
+            "models.motion.acceleration=2",
+        ]
+    )
+    assert config.map.max_landmarks == 300
+    assert config.backend == {"measurement": "left"}
+    assert config.association.d_match == (0.3, 0.2)
+    assert config.models.motion.acceleration == 2.0
+    assert SystemConfig.for_kind("driving").map.max_landmarks != 300
+
+
+@pytest.mark.parametrize("kind", ["driving", "handheld"])
+def test_json_and_back(kind):
+    config = SystemConfig.for_kind(kind).with_settings(["backend.iterations=3"])
+    assert from_json(json.loads(json.dumps(config.to_json()))) == config
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("map.max=3", "unknown key 'max'; known: target_in_view"),
+        ("maps.max_landmarks=3", "unknown section 'maps'; known: models"),
+        ("max_landmarks=3", "unknown key"),
+        ("map.max_landmarks", "not of the form"),
+        ("models.pixel_sigma=abc", "models.pixel_sigma"),
+        ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
+        ("models.pixel_sigma=NaN", "pixel_sigma must be positive and finite"),
+        ("map.grid=[1]", "map.grid"),
+    ],
+)
+def test_bad_settings(setting, message):
+    with pytest.raises(ConfigurationError, match=message.replace("[", r"\[")):
+        SystemConfig.for_kind("handheld").with_settings([setting])
+
+
+def test_unknown_kind():
+    with pytest.raises(ConfigurationError, match="known: handheld, driving"):
+        SystemConfig.for_kind("flying")
+
+
+def test_unknown_key_in_a_file():
+    tree = SystemConfig().to_json()
+    tree["map"]["colour"] = 1
+    with pytest.raises(ConfigurationError, match=r"map\.colour"):
+        from_json(tree)
