@@ -48,7 +48,7 @@ class AssociationConfig:
     wide_d_match: float = 0.4
     wide_ratio: float = 0.9
     minimum_consistent: int = 8
-    consistency_sigmas: float = 4.0
+    consistency_sigmas: float = 5.0
     hypotheses: int = 100
     tight_window: float = 12.0
     refined_window: float = 3.0

@@ -9,6 +9,9 @@ from slam.association import AssociationConfig
 from slam.map_management import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
 
+#: Map management of a kind of motion: a car does not come back soon to what lies behind it.
+MAPS = {"handheld": MapConfig(), "driving": MapConfig(max_landmarks=300)}
+
 
 @dataclass(frozen=True)
 class SystemConfig:
@@ -37,7 +40,7 @@ class SystemConfig:
         Raises:
             ConfigurationError: the kind is not known.
         """
-        return cls(models=models_for(kind))
+        return cls(models=models_for(kind), map=MAPS[kind])
 
     def to_json(self) -> dict[str, Any]:
         """The tree as plain types; arrays as lists."""

@@ -29,6 +29,8 @@ class MapConfig:
             detected"), and
         erase_share: where it was measured in less than this share of the frames in view (judged from
             `erase_missed` frames on).
+        restart_after: where no landmark was recognised for more frames than these, new ones are added all the same, and
+            the map goes on from the predicted pose.
         max_landmarks: size of the map; beyond it, those out of view longest are erased.
     """
 
@@ -38,6 +40,7 @@ class MapConfig:
     max_depth_error: float = 0.2
     erase_missed: int = 5
     erase_share: float = 0.3
+    restart_after: int = 3
     max_landmarks: int = 1000
 
     __pydantic_config__ = FORBID_UNKNOWN
@@ -47,8 +50,10 @@ class MapConfig:
             raise ConfigurationError("map: 3 <= target_in_view <= max_landmarks is required")
         if min(self.grid) < 1 or self.separation < 0:
             raise ConfigurationError("map: grid cells must be at least 1 and separation not negative")
-        if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1 and self.erase_missed >= 1):
-            raise ConfigurationError("map: max_depth_error, erase_share or erase_missed is out of range")
+        if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1):
+            raise ConfigurationError("map: max_depth_error or erase_share is out of range")
+        if self.erase_missed < 1 or self.restart_after < 0:
+            raise ConfigurationError("map: erase_missed >= 1 and restart_after >= 0 are required")
 
 
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:

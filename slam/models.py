@@ -87,11 +87,13 @@ class EstimatorModels:
 KINDS = {
     "handheld": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=1.0),
+        pixel_sigma=0.7,
         initial_velocity_sigma=1.0,
         initial_angular_velocity_sigma=1.0,
     ),
     "driving": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=0.3),
+        pixel_sigma=0.7,
         initial_velocity_sigma=15.0,
         initial_angular_velocity_sigma=0.3,
     ),

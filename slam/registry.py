@@ -18,6 +18,7 @@ from slam.errors import UnknownNameError
 #: What this distribution brings, so that a plain checkout works without being installed.
 BUILT_IN = {
     "backends": {
+        "batch": "backends.batch:BatchBackend",
         "ekf": "backends.ekf:EkfBackend",
         "smoother": "backends.smoother:SmootherBackend",
     },

@@ -77,6 +77,7 @@ class StereoSlam:
         self._recogniser = Recogniser(rig, c.association, c.models.pixel_sigma)
         self._index = -1
         self._next_id = 0
+        self._unrecognised = 0  # frames since a landmark was last recognised
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
@@ -105,10 +106,7 @@ class StereoSlam:
         clock.lap("associate")
         report = self.backend.update(_observations(features, found), found.T_world_left)
         clock.lap("update")
-        measured = np.isin(found.ids, report.used)
-        landmarks = landmarks.after_frame(
-            self._index, prediction.ids, found.ids[measured], features, found.rows[measured]
-        )
+        landmarks = self._count(landmarks, prediction, features, found, report)
         landmarks, erased = self._erase(landmarks)
         landmarks, added = self._add(landmarks, features, found)
         self.landmarks = landmarks
@@ -146,6 +144,21 @@ class StereoSlam:
         positions = self.backend.positions(landmarks.ids)
         return self._recogniser.recognise(prediction, landmarks, positions, features, seed=self._index)
 
+    def _count(
+        self,
+        landmarks: LandmarkRows,
+        prediction: Prediction,
+        features: StereoFeatures,
+        found: Recognition,
+        report: UpdateReport,
+    ) -> LandmarkRows:
+        """Count what was seen and missed; a frame in which nothing is recognised says nothing of single landmarks."""
+        tracked = len(report.used) >= _MINIMUM_TRACKED
+        self._unrecognised = 0 if tracked else self._unrecognised + 1
+        expected = prediction.ids if tracked else prediction.ids[:0]
+        measured = np.isin(found.ids, report.used)
+        return landmarks.after_frame(self._index, expected, found.ids[measured], features, found.rows[measured])
+
     def _erase(self, landmarks: LandmarkRows) -> tuple[LandmarkRows, IdArray]:
         """Drop bad landmarks, and the oldest beyond the map's size."""
         bad = bad_landmarks(landmarks, self.config.map)
@@ -159,7 +172,9 @@ class StereoSlam:
     def _add(
         self, landmarks: LandmarkRows, features: StereoFeatures, found: Recognition
     ) -> tuple[LandmarkRows, Recognition]:
-        """Make landmarks of features that are none yet."""
+        """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew."""
+        if len(landmarks) and 0 < self._unrecognised <= self.config.map.restart_after:
+            return landmarks, Recognition.nothing()
         free = np.ones(len(features), bool)
         free[found.rows] = False
         occupied = features.uv_left[found.rows]

@@ -12,17 +12,17 @@ from slam.settings import from_json
 def test_settings_reach_their_place():
     config = SystemConfig.for_kind("driving").with_settings(
         [
-            "map.max_landmarks=300",
+            "map.max_landmarks=301",
             "backend.measurement=left",
             "association.d_match=[0.3, 0.2]",
             "models.motion.acceleration=2",
         ]
     )
-    assert config.map.max_landmarks == 300
+    assert config.map.max_landmarks == 301
     assert config.backend == {"measurement": "left"}
     assert config.association.d_match == (0.3, 0.2)
     assert config.models.motion.acceleration == 2.0
-    assert SystemConfig.for_kind("driving").map.max_landmarks != 300
+    assert SystemConfig.for_kind("driving").map.max_landmarks != 301
 
 
 @pytest.mark.parametrize("kind", ["driving", "handheld"])

@@ -137,3 +137,12 @@ def test_names_and_settings_are_checked():
         StereoSlam(RIG, None, "ekf", config=replace(CONFIG, backend={"colour": 1}))
     with pytest.raises(ConfigurationError, match="known"):
         StereoSlam(RIG, None, "ekf", kind="flying")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_long_blackout_keeps_the_map(backend):
+    system, results, truth = run(backend, frames=45, change=nothing_at(*range(12, 32)))
+    before, after = results[11][0], results[32][0]
+    assert after.map_size >= before.map_size
+    assert np.isin(after.matched, before.matched).mean() > 0.5  # recognised, not made anew
+    assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.012
