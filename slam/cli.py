@@ -86,6 +86,28 @@ def run_command(
         print_summary([summary], out)
 
 
+@app.command("render")
+def render_command(
+    sequence: SequenceArgument,
+    out: OutOption,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
+    truth_images: Annotated[bool, typer.Option(help="Depth and object images as well.")] = True,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+) -> None:
+    """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
+    from slam.display import counting
+    from slam.runner import parse_frames
+    from slam.sequences import open_sequence
+    from slam.worlds.export import write_euroc
+
+    opened = open_sequence(sequence)
+    start, stop = parse_frames(frames)
+    with counting(_frame_count(opened, start, stop), f"{opened.name} · render", quiet) as progress:
+        root = write_euroc(opened, out, start, stop, progress, truth_images)
+    if not quiet:
+        print(f"Files: {root}")
+
+
 @app.command("list")
 def list_command() -> None:
     """List back ends, front ends, built-in sequences and formats."""

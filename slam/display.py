@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -60,6 +62,22 @@ class Progress:
         self._bar.update(self._task, advance=1, rate=rate, status=status)
 
 
+@contextmanager
+def counting(total: int, title: str, quiet: bool = False) -> Iterator[Callable[[int], None]]:
+    """A progress bar that is told how many frames are done."""
+    bar = RichProgress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=quiet,
+    )
+    task = bar.add_task(title, total=total)
+    with bar:
+        yield lambda done: bar.update(task, completed=done)
+
+
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     """A table of finished runs, a column each."""
     table = Table(title=summaries[0]["sequence"])
@@ -107,5 +125,6 @@ def print_listing() -> None:
     worlds_table.add_column("name")
     worlds_table.add_column("what")
     for name in worlds.names():
-        worlds_table.add_row(f"synthetic:{name}", worlds.describe(name))
+        worlds_table.add_row(f"synthetic:{name}", escape(worlds.describe(name)))
     _console.print(worlds_table)
+    _console.print(escape(worlds.describe_common()))

@@ -161,9 +161,10 @@ def _finish(
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
             **consistency(record.trajectory, np.array(record.covariances), sequence),
         }
+        summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
         summary["milliseconds"] = _timings(record)
         summary["frames_per_second"] = len(record.stamps) / seconds if seconds > 0 else None
-    summary["seed"] = 0
+    summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
     summary["configuration"] = options.config.to_json()
     summary["versions"] = versions()
     files.write_json("summary.json", summary)

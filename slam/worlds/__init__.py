@@ -1,0 +1,92 @@
+"""Worlds with known truth: recordings made on demand, as images or as observations.
+
+>>> from slam.worlds import open_world
+>>> sequence = open_world("aisle?frames=200&seed=3")
+>>> features = sequence.observations(0)  # no image is made
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+from slam.errors import UnknownNameError
+from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
+from slam.worlds.sequence import WorldSequence
+from slam.worlds.world import World
+
+__all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
+
+_NAMES = ("aisle", "box", "boxes", "desk", "field", "startup", "street")
+
+#: Options that change the world itself; the others only change how it is recorded.
+_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {"seed"}
+
+
+def names() -> list[str]:
+    """The built-in worlds."""
+    return list(_NAMES)
+
+
+def open_world(text: str) -> WorldSequence:
+    """The recording that a text such as ``"aisle?frames=200&seed=3"`` describes.
+
+    Raises:
+        UnknownNameError: there is no such world.
+        ConfigurationError: an option is unknown, has a wrong type, or lies outside its range.
+    """
+    text = text.removeprefix("synthetic:")
+    name, _, query = text.partition("?")
+    values = parse_query(name, query, options(name))
+    key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
+    return WorldSequence(text, _build(name, key), values)
+
+
+def options(name: str) -> dict[str, Option]:
+    """All options of a world by name; raises UnknownNameError."""
+    scene = _scene(name)
+    return option_table(scene.OPTIONS, scene.DEFAULTS)
+
+
+def describe(name: str) -> str:
+    """A world in a line, and a line for each option that it has alone, or with another default than other worlds.
+
+    Raises:
+        UnknownNameError: there is no such world.
+    """
+    scene = _scene(name)
+    table = options(name)
+    own = [o.name for o in scene.OPTIONS]
+    changed = [o for o in scene.DEFAULTS if o not in own]
+    return "\n".join([f"{name}: {scene.TEXT}", *(_line(table[key]) for key in (*own, *changed))])
+
+
+def _scene(name: str) -> ModuleType:
+    """The module of a world."""
+    if name not in _NAMES:
+        raise UnknownNameError(f"unknown world {name!r}; known: {', '.join(_NAMES)}")
+    return import_module(f"slam.worlds.scenes.{name}")
+
+
+@lru_cache(maxsize=8)
+def _build(name: str, key: tuple[tuple[str, Any], ...]) -> World:
+    """A world, kept for the next recording of it: Monte-Carlo runs differ in `seed` alone."""
+    world: World = _scene(name).build(dict(key))
+    return world
+
+
+def describe_common() -> str:
+    """The options that all worlds share, a line each, under headings."""
+    groups = {"recording": RECORDING, "observations": OBSERVATION, "images": IMAGING, "faults": FAULTS}
+    lines = []
+    for heading, table in groups.items():
+        lines += [f"{heading}:", *(_line(o) for o in table)]
+    return "\n".join(lines)
+
+
+def _line(o: Option) -> str:
+    """An option in a line."""
+    default = o.default if o.default != "" else "none"
+    return f"  {o.name}={default}  {o.text} ({o.range})"

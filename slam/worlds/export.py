@@ -1,0 +1,179 @@
+"""Writing a world as an EuRoC folder with its truth, so that other programs can run on it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.camera import PinholeCamera
+from slam.errors import SequenceError
+from slam.euler import angles
+from slam.se3 import Array, inverse, transform
+from slam.sequences.base import frame_range
+from slam.trajectory import Trajectory
+from slam.worlds.sequence import WorldSequence
+
+#: Steps per metre of the depth images, by kind of motion: 16 bits then reach 32 m or 256 m.
+DEPTH_STEPS = {"handheld": 2000, "driving": 256}
+
+OBJECT_COLUMNS = (
+    "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
+    "motion_x", "motion_y", "motion_z", "motion_roll", "motion_pitch", "motion_yaw",
+)  # fmt: skip
+
+
+def write_euroc(
+    sequence: object, folder: str | Path, start: int = 0, stop: int | None = None,
+    progress: Callable[[int], None] | None = None, truth_images: bool = True,
+) -> Path:  # fmt: skip
+    """Render frames `start` up to, but without, `stop` of a world into ``folder/mav0``; returns that folder.
+
+    ``cam0`` and ``cam1`` hold the images, their lists and calibrations; the body is the left camera.
+    ``state_groundtruth_estimate0/data.csv`` holds its path. Beside them, for the left image of each frame, are
+    ``depth0/data`` (16-bit PNG, steps per metre in its ``sensor.yaml``, 0 where nothing is or it is too far) and
+    ``objects0/data`` (16-bit PNG, object of each pixel, 0 for the still world), and for all frames ``objects.csv``
+    (object poses; motion since the frame before, in world axes, angles in radians) and ``landmarks.csv`` (id, place
+    at the first frame written, object, size). `progress` is told the number of frames done after each.
+
+    Raises:
+        SequenceError: the sequence is no world, the range is empty, or the folder holds a recording already or
+            cannot be written.
+    """
+    if not isinstance(sequence, WorldSequence):
+        name = getattr(sequence, "name", sequence)
+        raise SequenceError(f"{name}: only synthetic worlds can be rendered, this is a recording")
+    first, last = frame_range(start, stop, len(sequence))
+    root = Path(folder) / "mav0"
+    if root.exists():
+        raise SequenceError(f"{root}: exists already; choose another folder")
+    try:
+        _write(sequence, root, range(first, last), progress, truth_images)
+    except OSError as error:
+        raise SequenceError(f"{root}: cannot be written: {error.strerror or error}") from error
+    return root
+
+
+def _write(
+    sequence: WorldSequence, root: Path, frames: range, progress: Callable[[int], None] | None, truth_images: bool
+) -> None:
+    """Calibrations and tables first, so that a folder cut short is still readable; then the images."""
+    rig, rate = sequence.rig, sequence.values["rate"]
+    steps = DEPTH_STEPS[sequence.kind]
+    _write_yaml(root / "cam0" / "sensor.yaml", _camera_node(rig.left, np.eye(4), rate))
+    _write_yaml(root / "cam1" / "sensor.yaml", _camera_node(rig.right, inverse(rig.T_right_left), rate))
+    _write_yaml(root / "depth0" / "sensor.yaml", {"sensor_type": "depth", "steps_per_metre": steps})
+    truth = sequence.ground_truth
+    body = root / "state_groundtruth_estimate0"
+    body.mkdir()
+    Trajectory(truth.stamps[list(frames)], truth.poses[list(frames)]).write_euroc(body / "data.csv")
+    _write_table(root / "objects.csv", OBJECT_COLUMNS, _object_rows(sequence, frames))
+    _write_table(root / "landmarks.csv", ("id", "x", "y", "z", "object", "size"), _landmark_rows(sequence, frames[0]))
+    (root / "world.txt").write_text(f"synthetic:{sequence.name}\n", encoding="utf-8")
+    with ExitStack() as stack:
+        lists = {name: _ImageList(root / name, stack) for name in _folders(truth_images)}
+        for done, k in enumerate(frames, start=1):
+            _write_images(sequence, k, lists, steps, truth_images)
+            if progress is not None:
+                progress(done)
+
+
+def _folders(truth_images: bool) -> tuple[str, ...]:
+    """Folders of images."""
+    return ("cam0", "cam1", "depth0", "objects0") if truth_images else ("cam0", "cam1")
+
+
+class _ImageList:
+    """A folder of images and its ``data.csv``, a row written with each image."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._data = folder / "data"
+        self._data.mkdir(parents=True)
+        self._table = stack.enter_context((folder / "data.csv").open("w", encoding="ascii"))
+        self._table.write("#timestamp [ns],filename\n")
+
+    def add(self, nanoseconds: int, image: np.ndarray) -> None:
+        """Write an image and its row."""
+        import cv2
+
+        name = f"{nanoseconds}.png"
+        if not cv2.imwrite(str(self._data / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 3]):
+            raise OSError(f"{name} was not written")
+        self._table.write(f"{nanoseconds},{name}\n")
+        self._table.flush()
+
+
+def _write_images(
+    sequence: WorldSequence, k: int, lists: dict[str, _ImageList], steps: int, truth_images: bool
+) -> None:
+    """All images of one frame."""
+    frame = sequence.frame(k)
+    stamp = round(frame.stamp * 1e9)
+    lists["cam0"].add(stamp, frame.left)
+    if frame.right is not None:
+        lists["cam1"].add(stamp, frame.right)
+    if truth_images:
+        depth = np.rint(sequence.depth(k) * steps)
+        lists["depth0"].add(stamp, np.where(depth < 65536, depth, 0).astype(np.uint16))
+        lists["objects0"].add(stamp, sequence.object_ids(k).astype(np.uint16))
+
+
+def _camera_node(camera: PinholeCamera, T_body_camera: Array, rate: float) -> dict[str, Any]:
+    """A camera as EuRoC's ``sensor.yaml`` has it."""
+    models = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
+    return {
+        "sensor_type": "camera",
+        "comment": "rendered",
+        "T_BS": {"cols": 4, "rows": 4, "data": [float(x) for x in T_body_camera.ravel()]},
+        "rate_hz": float(rate),
+        "resolution": [camera.width, camera.height],
+        "camera_model": "pinhole",
+        "intrinsics": [float(x) for x in (camera.fu, camera.fv, camera.u0, camera.v0)],
+        "distortion_model": models[camera.model],
+        "distortion_coefficients": [float(x) for x in camera.distortion or (0.0, 0.0, 0.0, 0.0)],
+    }
+
+
+def _write_yaml(path: Path, node: dict[str, Any]) -> None:
+    """Write a mapping as YAML."""
+    import yaml
+
+    path.parent.mkdir(parents=True)
+    path.write_text(yaml.safe_dump(node, sort_keys=False), encoding="utf-8")
+
+
+def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file."""
+    with path.open("w", encoding="ascii", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _object_rows(sequence: WorldSequence, frames: range) -> Iterable[list[str]]:
+    """Stamp, id, pose and motion of every object in every frame."""
+    for k in frames:
+        now, before = sequence.objects(k), sequence.objects(max(k - 1, frames[0]))
+        for i, T, T_before in zip(now.ids, now.T_world_object, before.T_world_object):
+            motion = T @ inverse(T_before)
+            values = (*T[:3, 3], *angles(T[:3, :3]), *motion[:3, 3], *angles(motion[:3, :3]))
+            yield [f"{sequence.stamps[k]:.9f}", str(int(i)), *(f"{v:.9g}" for v in values)]
+
+
+def _landmark_rows(sequence: WorldSequence, frame: int) -> Iterable[list[str]]:
+    """Id, place in the world, object and size of every landmark."""
+    landmarks = sequence.landmarks
+    poses = {0: np.eye(4), **dict(zip(*_objects(sequence, frame)))}
+    for i, (position, body, size) in enumerate(zip(landmarks.positions, landmarks.object, landmarks.size)):
+        place = transform(poses[int(body)], position[None])[0]
+        yield [str(i), *(f"{x:.9g}" for x in place), str(int(body)), f"{size:.6g}"]
+
+
+def _objects(sequence: WorldSequence, frame: int) -> tuple[list[int], Array]:
+    """Ids and poses of the objects in a frame."""
+    objects = sequence.objects(frame)
+    return [int(i) for i in objects.ids], objects.T_world_object

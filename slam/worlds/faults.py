@@ -1,0 +1,121 @@
+"""Which frames of a recording suffer from what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from slam.data import BoolArray
+from slam.errors import ConfigurationError
+from slam.rig import StereoRig
+from slam.se3 import Array
+from slam.worlds.observe import SimulatedFeatures
+
+_CHOSEN = ("drop", "dropright", "black", "bright", "blur", "burst", "hand")
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Faults of every frame of the undisturbed recording.
+
+    Attributes:
+        drop, dropright, black, bright, blur, burst, hand: which frames suffer (N,); see the options of these names.
+        delay: what the clock has jumped ahead by (N,) [s].
+    """
+
+    drop: BoolArray
+    dropright: BoolArray
+    black: BoolArray
+    bright: BoolArray
+    blur: BoolArray
+    burst: BoolArray
+    hand: BoolArray
+    delay: Array
+
+    @cached_property
+    def any(self) -> BoolArray:
+        """Frames that suffer from anything but being dropped or delayed (N,)."""
+        return self.dropright | self.black | self.bright | self.blur | self.burst | self.hand
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], frames: int, seed: int) -> Faults:
+        """Faults by the options' texts.
+
+        Raises:
+            ConfigurationError: a text cannot be read, or every frame is dropped.
+        """
+        chosen = {}
+        for number, name in enumerate(_CHOSEN):
+            rng = np.random.default_rng([seed, 7, number])
+            chosen[name] = _frames(name, values[name], frames, rng)
+        if chosen["drop"].all():
+            raise ConfigurationError("drop: no frame is left")
+        return cls(**chosen, delay=_delay(values["jump"], frames))
+
+    def spoil(self, frame: int, seen: SimulatedFeatures, rig: StereoRig, rng: np.random.Generator) -> SimulatedFeatures:
+        """What is left of a frame's features under its faults.
+
+        Black and over-exposed frames show nothing, a hand hides a part, blur leaves a third, which are three times as
+        noisy; bursts of noise double the noise.
+        """
+        if not self.any[frame]:
+            return seen
+        keep = np.ones(len(seen.ids), bool)
+        noise = 0.0
+        if self.black[frame] or self.bright[frame]:
+            keep[:] = False
+        if self.hand[frame]:
+            keep &= ~in_hand(seen.features.uv_left, rig.width, rig.height)
+        if self.blur[frame]:
+            keep &= rng.random(len(keep)) < 1 / 3
+            noise = 3.0
+        elif self.burst[frame]:
+            noise = 1.7
+        return seen.select(keep, noise * rng.standard_normal((len(keep), 3)), not self.dropright[frame])
+
+
+def in_hand(uv: Array, width: int, height: int) -> BoolArray:
+    """Which pixels (N, 2) a hand before the lens covers: it comes in from below on the right."""
+    x, y = uv[:, 0] / width, uv[:, 1] / height
+    return (x - 0.75) ** 2 / 0.4**2 + (y - 0.9) ** 2 / 0.6**2 < 1
+
+
+def _frames(name: str, text: str, frames: int, rng: np.random.Generator) -> BoolArray:
+    """Which frames a text such as ``0.02``, ``17`` or ``100:110,200`` means."""
+    out = np.zeros(frames, bool)
+    for part in filter(None, text.split(",")):
+        first, colon, last = part.partition(":")
+        try:
+            if colon:
+                out[int(first) : int(last)] = True
+            elif "." in part:
+                chance = float(part)
+                if not 0 <= chance <= 1:
+                    raise ConfigurationError(f"{name}: a chance must lie in 0..1, got {part}")
+                out |= rng.random(frames) < chance
+            elif int(part) < frames:
+                out[int(part)] = True
+        except ValueError:
+            raise ConfigurationError(
+                f"{name} must be frames (100), ranges (100:110) or a chance (0.02), got {part!r}"
+            ) from None
+    return out
+
+
+def _delay(text: str, frames: int) -> Array:
+    """What the clock has jumped ahead by in every frame [s]."""
+    out = np.zeros(frames)
+    for part in filter(None, text.split(",")):
+        frame, _, seconds = part.partition(":")
+        try:
+            start, by = int(frame), float(seconds)
+        except ValueError:
+            raise ConfigurationError(f"jump must be FRAME:SECONDS, got {part!r}") from None
+        if start < 1 or not (np.isfinite(by) and by > 0):
+            raise ConfigurationError(f"jump must be from frame 1 on and ahead in time, got {part!r}")
+        out[start:] += by
+    return out

@@ -1,0 +1,82 @@
+"""From pictures of a world to what a camera gives: lens, light, sensor noise, and faults of single frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam.worlds.faults import Faults, in_hand
+
+
+@dataclass(frozen=True)
+class ImagingModel:
+    """How images come out; the attributes are the options of the same names.
+
+    Attributes:
+        noise: standard deviation of the sensor noise [grey levels].
+        vignetting: loss of light in the corners.
+        exposure: amplitude of slow changes of brightness, as a share.
+        shutter: time that the shutter is open, as a share of a frame.
+        lens: standard deviation of the lens's blur [px].
+        colour: whether images are BGR.
+        supersample: samples per pixel along each axis.
+    """
+
+    noise: float
+    vignetting: float
+    exposure: float
+    shutter: float
+    lens: float
+    colour: int
+    supersample: int
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> ImagingModel:
+        """From the values of the options."""
+        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
+
+    def shading(self, width: int, height: int) -> np.ndarray:
+        """Share of the light that reaches each pixel (H, W) float32."""
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        x, y = x / (width - 1) * 2 - 1, y / (height - 1) * 2 - 1
+        return (1 - self.vignetting * (x * x + y * y) / 2).astype(np.float32)
+
+    def gain(self, time: float) -> float:
+        """Brightness at a time [s], as automatic exposure wanders."""
+        return 1.0 + self.exposure * float(0.6 * np.sin(0.9 * time) + 0.4 * np.sin(2.3 * time + 1))
+
+
+def sense(
+    image: np.ndarray, model: ImagingModel, shading: np.ndarray, gain: float, faults: Faults, frame: int,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """The image that the camera gives, uint8."""
+    if faults.hand[frame]:
+        image = _cover(image)
+    if faults.blur[frame]:
+        image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
+    elif model.lens > 0.05:
+        image = cv2.GaussianBlur(image, (0, 0), model.lens)
+    gain *= 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
+    light = shading * np.float32(gain)
+    out = image * (light if image.ndim == 2 else light[..., None])
+    noise = model.noise * (8.0 if faults.burst[frame] else 1.0)
+    if noise > 0:
+        out += np.float32(noise) * rng.standard_normal(image.shape, np.float32)
+    np.add(out, np.float32(0.5), out=out)  # to the nearest grey level, as the conversion cuts off
+    return np.clip(out, 0, 255, out=out).astype(np.uint8)
+
+
+def _cover(image: np.ndarray) -> np.ndarray:
+    """The image with a hand before the lens: near, dark, out of focus."""
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    inside = in_hand(np.stack([x.ravel(), y.ravel()], axis=1), width, height).reshape(height, width)
+    weight = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), width / 40)
+    skin = np.float32(55) if image.ndim == 2 else np.array([45, 55, 80], np.float32)
+    weight = weight if image.ndim == 2 else weight[..., None]
+    return (image * (1 - weight) + skin * weight).astype(np.uint8)

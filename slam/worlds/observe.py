@@ -1,0 +1,282 @@
+"""Features straight from projected landmarks: no image, no front end; for Monte-Carlo runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.rig import StereoRig
+from slam.se3 import Array
+from slam.worlds.geometry import hidden
+from slam.worlds.world import World
+
+#: A surface seen at a smaller angle than this (cosine from its normal) shows no feature.
+FACING = 0.25
+
+_MARGIN = 2.0  # no feature so near to the image's border [px]
+_SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
+_KEPT = 20_000  # frames whose visible landmarks are kept
+_FALSE = -1
+_POOL = 4096  # errors of descriptors that are drawn beforehand
+
+
+@dataclass(frozen=True)
+class ObservationModel:
+    """How landmarks become features; the attributes are the options of the same names.
+
+    Attributes:
+        sigma: standard deviation of uL, vL and uR [px].
+        detect: chance that a visible landmark is detected.
+        stereo: chance that it is matched in the right image.
+        outliers: share of false features; half as many true ones are given a false match in the right image.
+        descriptor: length of descriptors.
+        descriptor_noise: typical length of the error of a unit descriptor.
+        confusion: share of landmarks that look nearly like another one.
+    """
+
+    sigma: float
+    detect: float
+    stereo: float
+    outliers: float
+    descriptor: int
+    descriptor_noise: float
+    confusion: float
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> ObservationModel:
+        """From the values of the options."""
+        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class SimulatedFeatures:
+    """Features with their truth, a row each.
+
+    Attributes:
+        features: what a front end would say.
+        ids: landmark of each feature (N,), −1 for false features.
+        objects: object of each feature (N,), 0 for the still world, −1 for false features.
+        false_stereo: true features whose right pixel is false (N,).
+    """
+
+    features: StereoFeatures
+    ids: IdArray
+    objects: IdArray
+    false_stereo: BoolArray
+
+    def select(self, keep: BoolArray, noise: Array, stereo: bool) -> SimulatedFeatures:
+        """Some of the features, with `noise` (N, 3) [px] added to uL, vL and uR; without `stereo` no right pixels."""
+        f = self.features
+        right = f.uv_right[keep] + noise[keep][:, [2, 1]] if stereo else np.full((int(keep.sum()), 2), np.nan)
+        features = StereoFeatures(
+            f.stamp, f.uv_left[keep] + noise[keep, :2], right, f.scale[keep], f.angle[keep], f.response[keep],
+            f.laplacian[keep], f.descriptors[keep], f.threshold,
+        )  # fmt: skip
+        return SimulatedFeatures(features, self.ids[keep], self.objects[keep], self.false_stereo[keep])
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What tells landmarks apart.
+
+    Attributes:
+        descriptors: unit vectors (P, D) float32.
+        laplacian: sign (P,) int8.
+        response: strength (P,).
+        errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
+    """
+
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    response: Array
+    errors: NDArray[np.float32]
+
+
+def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
+    """Looks of all landmarks.
+
+    Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
+    from another one.
+    """
+    rng = np.random.default_rng([layout, 11])
+    count, size = len(world.landmarks), model.descriptor
+    common = rng.standard_normal(size)
+    common *= 1.2 / np.linalg.norm(common)
+    descriptors = _unit(common + _unit(rng.standard_normal((count, size))))
+    twins = np.flatnonzero(rng.random(count) < model.confusion)
+    if count > 1:
+        originals = (twins + rng.integers(1, count, len(twins))) % count
+        descriptors[twins] = _unit(descriptors[originals] + 0.15 * _unit(rng.standard_normal((len(twins), size))))
+    laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
+    errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
+    return Appearance(
+        descriptors.astype(np.float32), laplacian, np.exp(rng.normal(6.5, 1.0, count)), errors.astype(np.float32)
+    )
+
+
+@dataclass(frozen=True)
+class VisibleLandmarks:
+    """Landmarks that can be seen in one frame, a row each.
+
+    Attributes:
+        ids: landmarks (M,).
+        points: in left-camera coordinates (M, 3) [m].
+        uv_left: left pixels (M, 2).
+        uv_right: right pixels (M, 2), NaN where the right camera does not see it.
+        in_right: whether it does (M,).
+        size: diameters in the left image (M,) [px].
+    """
+
+    ids: IdArray
+    points: Array
+    uv_left: Array
+    uv_right: Array
+    in_right: BoolArray
+    size: Array
+
+
+def seen_landmarks(world: World, frame: int) -> VisibleLandmarks:
+    """`visible_landmarks`, kept with the world: the next recording of it sees the same."""
+    found: VisibleLandmarks | None = world.seen.get(frame)
+    if found is None:
+        if len(world.seen) >= _KEPT:
+            world.seen.clear()
+        found = world.seen[frame] = visible_landmarks(world, frame)
+    return found
+
+
+def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
+    """Landmarks within reach, inside the left image, on surfaces that face the camera and not hidden."""
+    T = world.T_world_left[frame]
+    bodies = world.T_world_body(frame)
+    positions = world.landmarks.world_positions(bodies)
+    points = (positions - T[:3, 3]) @ T[:3, :3]
+    ids = _candidates(world, points)
+    offsets = positions[ids] - T[:3, 3]
+    normals = world.landmarks.normals[ids]
+    moving = world.landmarks.object[ids]
+    if moving.any():
+        normals = (bodies[moving][:, :3, :3] @ normals[:, :, None])[..., 0]
+    facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)
+    ids = ids[facing]
+    uv_left, uv_right = world.rig.project(points[ids])
+    inside = world.rig.left.in_image(uv_left, _MARGIN)
+    ids, uv_left, uv_right = ids[inside], uv_left[inside], uv_right[inside]
+    uv_right[~world.rig.right.in_image(uv_right, _MARGIN)] = np.nan
+    if len(world.occluders):
+        occluders = world.occluders.placed(bodies)
+        right_centre = T[:3, 3] - T[:3, :3] @ world.rig.b
+        seen = ~hidden(T[:3, 3], positions[ids], occluders)
+        ids, uv_left, uv_right = ids[seen], uv_left[seen], uv_right[seen]
+        uv_right[hidden(right_centre, positions[ids], occluders)] = np.nan
+    size = np.maximum(world.rig.left.fu * world.landmarks.size[ids] / points[ids, 2], _SMALLEST)
+    return VisibleLandmarks(ids, points[ids], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+
+
+def _candidates(world: World, points: Array) -> IdArray:
+    """Landmarks within reach and roughly in the angle of view, by points (P, 3) in left-camera coordinates."""
+    near, far = world.reach
+    camera = world.rig.left
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    widest = 1.3 * max(camera.u0, camera.width - camera.u0) / camera.fu
+    highest = 1.3 * max(camera.v0, camera.height - camera.v0) / camera.fv
+    return np.flatnonzero((z > near) & (z < far) & (np.abs(x) < widest * z) & (np.abs(y) < highest * z))
+
+
+def simulate(
+    world: World, looks: Appearance, model: ObservationModel, frame: int, stamp: float, rng: np.random.Generator
+) -> SimulatedFeatures:
+    """Features of one frame, in random order.
+
+    The noise is isotropic on uL, vL and uR; vR follows from the epipolar geometry of the three, so that the noisy
+    rays meet. A feature that noise takes out of the left image is not detected.
+    """
+    seen = seen_landmarks(world, frame)
+    chance = rng.random((len(seen.ids), 3))
+    rows = np.flatnonzero(chance[:, 0] < model.detect)
+    matched = seen.in_right[rows] & (chance[rows, 1] < model.stereo)
+    noise = model.sigma * rng.standard_normal((len(rows), 3))
+    uv_left = seen.uv_left[rows] + noise[:, :2]
+    uv_right = np.full_like(uv_left, np.nan)
+    uv_right[matched] = _on_epipolar_line(
+        world.rig, seen.points[rows[matched]], uv_left[matched], seen.uv_right[rows[matched]], noise[matched]
+    )
+    false_stereo = matched & (chance[rows, 2] < model.outliers / 2)
+    if false_stereo.any():
+        _falsify(uv_left, uv_right, np.flatnonzero(false_stereo), rng)
+    extra = round(len(rows) * model.outliers / (1 - model.outliers))
+    false_left, false_right = _false_pixels(world.rig, extra, rng)
+    uv_left, uv_right = np.concatenate([uv_left, false_left]), np.concatenate([uv_right, false_right])
+    uv_right[~_inside(world.rig, uv_right)] = np.nan
+    order = rng.permutation(len(uv_left))
+    order = order[_inside(world.rig, uv_left[order])]
+    source = np.concatenate([rows, np.full(extra, _FALSE)])[order]
+    false_stereo = np.concatenate([false_stereo, np.zeros(extra, bool)])[order]
+    return _features(world, looks, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
+
+
+def _features(
+    world: World, looks: Appearance, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
+    uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
+) -> SimulatedFeatures:  # fmt: skip
+    """Features with the looks of their landmarks; `source` are their rows in `seen`, −1 for those that are nothing."""
+    ids = np.append(seen.ids, _FALSE)[source]  # row −1 is the last one
+    size = np.append(seen.size, 12.0)[source]
+    false = np.flatnonzero(ids == _FALSE)
+    landmark = ids.copy()
+    landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
+    descriptors = looks.descriptors[landmark] + looks.errors[rng.integers(0, _POOL, len(ids))]
+    descriptors[false] = rng.standard_normal((len(false), descriptors.shape[1]), np.float32)
+    descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
+    objects = world.landmarks.object[landmark]
+    objects[false] = _FALSE
+    features = StereoFeatures(
+        stamp, uv_left, uv_right, size, np.zeros(len(ids)), looks.response[landmark], looks.laplacian[landmark],
+        descriptors,
+    )  # fmt: skip
+    return SimulatedFeatures(features, ids, objects, false_stereo)
+
+
+def _on_epipolar_line(rig: StereoRig, points: Array, uv_left: Array, uv_right: Array, noise: Array) -> Array:
+    """Right pixels (M, 2) whose x is the true one and its noise, and whose y lies on the noisy left pixel's line.
+
+    They are the projection of the point that is seen at exactly the noisy uL, vL and uR, found from the true one.
+    """
+    if rig.is_rectified:
+        return np.stack([uv_right[:, 0] + noise[:, 2], uv_left[:, 1]], axis=1)
+    target = np.column_stack([uv_left, uv_right[:, 0] + noise[:, 2]])
+    for _ in range(4):
+        z, J = rig.project_stereo(points)
+        points = points + np.linalg.solve(J, (target - z)[:, :, None])[..., 0]
+    row = rig.right.project((points + rig.b) @ rig.R.T)[:, 1]
+    return np.column_stack([target[:, 2], np.where(np.isfinite(row), row, uv_left[:, 1])])
+
+
+def _falsify(uv_left: Array, uv_right: Array, rows: np.ndarray, rng: np.random.Generator) -> None:
+    """Give rows a false right pixel, near the left pixel's line, in place."""
+    uv_right[rows, 0] = rng.uniform(0, np.maximum(uv_left[rows, 0], 1.0))
+    uv_right[rows, 1] += rng.normal(0, 0.5, len(rows))
+
+
+def _false_pixels(rig: StereoRig, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Left and right pixels of features that are nothing; half of them have a match."""
+    uv_left = rng.random((count, 2)) * (rig.width - 1, rig.height - 1)
+    uv_right = np.stack([uv_left[:, 0] * rng.random(count), uv_left[:, 1] + rng.normal(0, 1, count)], axis=1)
+    uv_right[rng.random(count) < 0.5] = np.nan
+    return uv_left, uv_right
+
+
+def _inside(rig: StereoRig, uv: Array) -> BoolArray:
+    """Which pixels (N, 2) lie in an image; NaN does not."""
+    x, y = uv[:, 0], uv[:, 1]
+    return (x >= 0) & (y >= 0) & (x <= rig.width - 1) & (y <= rig.height - 1)
+
+
+def _unit(rows: Array) -> Array:
+    """Rows scaled to unit length."""
+    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

@@ -1,0 +1,137 @@
+"""The keys of ``NAME?key=value&key=value``: their types, ranges and meanings, in one table each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import unquote
+
+from slam.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class Option:
+    """One key.
+
+    Attributes:
+        name: the key.
+        default: its value where it is not given; its type is the value's type.
+        text: what it means, with its unit.
+        low, high: range of a number, both ends included.
+        choices: the words allowed, where it is a word.
+    """
+
+    name: str
+    default: int | float | str
+    text: str
+    low: float = 0.0
+    high: float = float("inf")
+    choices: tuple[str, ...] = ()
+
+    def parse(self, text: str) -> int | float | str:
+        """The value that a text means; raises ConfigurationError."""
+        if isinstance(self.default, str):
+            if self.choices and text not in self.choices:
+                raise ConfigurationError(f"{self.name} must be one of {', '.join(self.choices)}, got {text!r}")
+            return text
+        kind = type(self.default)
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise ConfigurationError(f"{self.name} must be {what}, got {text!r}") from None
+        if not self.low <= value <= self.high:
+            raise ConfigurationError(f"{self.name} must lie in {self.range}, got {text}")
+        return value
+
+    @property
+    def range(self) -> str:
+        """The range or the choices, for people."""
+        if isinstance(self.default, str):
+            return "|".join(self.choices) if self.choices else "text"
+        return f"{self.low:.10g}..{self.high:.10g}"
+
+
+#: Keys of every world: what is there and how it is recorded. (Their defaults may differ from world to world.)
+RECORDING = (
+    Option("frames", 0, "number of frames; 0 for the whole path", 0, 1_000_000),
+    Option("seed", 0, "of everything random in a recording: noise, misses, outliers, faults", 0, 2**31 - 1),
+    Option("layout", 0, "of what stands where, and of the path's sway", 0, 2**31 - 1),
+    Option("rate", 30.0, "frames per second [Hz]", 0.1, 1000),
+    Option("speed", 1.0, "pace along the path, of camera and objects, as a multiple of the usual one", 0.05, 20),
+    Option("rig", "rectified", "the stereo pair", choices=("rectified", "toedin")),
+    Option("width", 320, "image width [px]; the focal length grows with it", 64, 4096),
+    Option("height", 240, "image height [px]", 48, 4096),
+    Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
+)
+
+#: Keys for observations made without images.
+OBSERVATION = (
+    Option("density", 25.0, "landmarks per square metre of surface, at most", 0, 10_000),
+    Option("sigma", 1.0, "standard deviation of uL, vL and uR [px]", 0, 100),
+    Option("detect", 0.9, "chance that a visible landmark is detected", 0, 1),
+    Option("stereo", 0.95, "chance that a detected one is matched in the right image", 0, 1),
+    Option("outliers", 0.05, "share of features that are false, or are given a false match in the right image", 0, 0.9),
+    Option("descriptor", 64, "length of descriptors", 4, 256),
+    Option("descriptor_noise", 0.12, "typical length of the error of a unit descriptor", 0, 10),
+    Option("confusion", 0.1, "share of landmarks that look nearly like another one", 0, 1),
+)
+
+#: Keys for images.
+IMAGING = (
+    Option("noise", 2.0, "standard deviation of the sensor noise [grey levels]", 0, 100),
+    Option("vignetting", 0.2, "loss of light in the image corners", 0, 1),
+    Option("exposure", 0.0, "amplitude of slow changes of brightness, as a share", 0, 0.9),
+    Option("shutter", 0.0, "time that the shutter is open, as a share of a frame: motion blur", 0, 1),
+    Option("lens", 0.5, "blur of the lens, standard deviation [px]", 0, 10),
+    Option("colour", 0, "1 for colour images (BGR), 0 for grey ones", 0, 1),
+    Option("supersample", 2, "samples per pixel along each axis", 1, 4),
+)
+
+#: Keys for faults; values are frames (100), ranges (100:110, end left out), or a chance for each frame (0.02), and
+#: lists of these, joined by commas.
+FAULTS = (
+    Option("drop", "", "frames that are missing from the recording"),
+    Option("dropright", "", "frames without a right image"),
+    Option("black", "", "black frames"),
+    Option("bright", "", "over-exposed frames"),
+    Option("blur", "", "blurred frames"),
+    Option("burst", "", "frames with eight times the noise"),
+    Option("hand", "", "frames with a hand before the lens"),
+    Option("jump", "", "FRAME:SECONDS: the clock jumps ahead before this frame"),
+)
+
+COMMON = (*RECORDING, *OBSERVATION, *IMAGING, *FAULTS)
+
+
+def option_table(own: Iterable[Option], defaults: Mapping[str, Any]) -> dict[str, Option]:
+    """Options of one world by name: its own, and the common ones with its own defaults."""
+    table = {o.name: o for o in own}
+    for o in COMMON:
+        default = type(o.default)(defaults.get(o.name, o.default))
+        table[o.name] = Option(o.name, default, o.text, o.low, o.high, o.choices)
+    return table
+
+
+def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str, Any]:
+    """Values of all options of a world, from the text after the question mark.
+
+    Raises:
+        ConfigurationError: a key is unknown or stands twice, or a value has a wrong type or lies outside its range.
+    """
+    values: dict[str, Any] = {name: o.default for name, o in table.items()}
+    given: set[str] = set()
+    for part in filter(None, query.split("&")):
+        key, _, text = part.partition("=")
+        key, text = unquote(key), unquote(text)
+        if key not in table:
+            raise ConfigurationError(f"world {world!r} has no option {key!r}; known: {', '.join(sorted(table))}")
+        if key in given:
+            raise ConfigurationError(f"world {world!r}: option {key!r} is given twice")
+        given.add(key)
+        try:
+            values[key] = table[key].parse(text)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"world {world!r}: {error}") from None
+    return values

@@ -1,0 +1,89 @@
+"""How cameras and objects move: poses as smooth functions of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam.euler import rotation
+from slam.se3 import Array, pose
+
+#: Camera axes of a level camera that looks along world +y: x right, y down, z forward.
+R_LEVEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def camera_poses(positions: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Poses ``T_world_left`` (N, 4, 4) of cameras at `positions` (N, 3) [m].
+
+    Args:
+        positions: camera centres in the world.
+        yaw: turn to the left about the vertical (N,) [rad]; 0 looks along +y.
+        pitch: turn upwards (N,) [rad].
+        roll: turn clockwise about the optical axis, as the camera sees it (N,) [rad].
+    """
+    return pose(_turn(yaw, 2) @ R_LEVEL @ _turn(pitch, 0) @ _turn(roll, 2), positions)
+
+
+def yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Array:
+    """``Rz(yaw) Ry(pitch) Rx(roll)`` (3, 3): the orientation of an object in world axes (paper B, step d)."""
+    return rotation(np.array([roll, pitch, yaw]))
+
+
+def _turn(angle: Array, axis: int) -> Array:
+    """Rotations (N, 3, 3) by angles (N,) about one axis."""
+    angle = np.atleast_1d(np.asarray(angle, float))
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[:, i, i] = R[:, j, j] = np.cos(angle)
+    R[:, j, i], R[:, i, j] = np.sin(angle), -np.sin(angle)
+    return R
+
+
+def sway(t: Array, rng: np.random.Generator, slowest: float, fastest: float, terms: int = 5) -> Array:
+    """A smooth random signal (N,) of unit standard deviation with frequencies between two [Hz]."""
+    frequency = np.exp(rng.uniform(np.log(slowest), np.log(fastest), terms))
+    phase = rng.uniform(0, 2 * np.pi, terms)
+    weight = 1 / np.sqrt(frequency)
+    weight /= np.sqrt((weight**2).sum() / 2)
+    return (weight * np.sin(2 * np.pi * np.outer(t, frequency) + phase)).sum(axis=1)
+
+
+def smooth_step(x: Array) -> Array:
+    """0 below 0, 1 above 1, and between them a rise with continuous velocity and acceleration."""
+    x = np.clip(x, 0, 1)
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def through(t: Array, times: Sequence[float], values: Sequence[float]) -> Array:
+    """A value (N,) that moves from stop to stop: it is at ``values[i]`` at ``times[i]`` [s], smoothly."""
+    out = np.full(len(t), float(values[0]))
+    for t0, t1, a, b in zip(times[:-1], times[1:], values[:-1], values[1:]):
+        out += (b - a) * smooth_step((t - t0) / (t1 - t0))
+    return out
+
+
+def carried(t: Array, rng: np.random.Generator, gait: float = 1.8, amount: float = 1.0) -> tuple[Array, Array]:
+    """What carrying by hand adds to a path: offsets (N, 3) [m] across, forward, up, and yaw, pitch, roll (N, 3) [rad].
+
+    Steps lift twice per stride (`gait` [Hz] is the step rate), the body sways once per stride, and the hands shake.
+    """
+    phase = rng.uniform(0, 2 * np.pi)
+    step = 2 * np.pi * gait * t + phase
+    offsets = np.stack(
+        [
+            0.018 * np.sin(step / 2) + 0.003 * sway(t, rng, 1.5, 4),
+            0.006 * np.sin(step + 1) + 0.002 * sway(t, rng, 1.5, 4),
+            0.012 * np.sin(step) + 0.003 * sway(t, rng, 1.5, 4),
+        ],
+        axis=1,
+    )
+    angles = np.stack(
+        [
+            0.012 * np.sin(step / 2 + 0.6) + 0.004 * sway(t, rng, 1, 5),
+            0.006 * np.sin(step + 0.3) + 0.004 * sway(t, rng, 1, 5),
+            0.008 * np.sin(step / 2 + 2) + 0.003 * sway(t, rng, 1, 5),
+        ],
+        axis=1,
+    )
+    return amount * offsets, amount * angles

@@ -1,0 +1,1 @@
+"""The built-in worlds, a module each: ``TEXT``, ``OPTIONS``, ``DEFAULTS`` and ``build(values) -> World``."""

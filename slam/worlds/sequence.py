@@ -1,0 +1,160 @@
+"""A recording of a world: images, or observations without images, and the truth of both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slam.data import IdArray, StereoFeatures, StereoFrame
+from slam.errors import SequenceError
+from slam.rig import StereoRig
+from slam.se3 import Array
+from slam.sequences.base import frame_range
+from slam.trajectory import Trajectory
+from slam.worlds.faults import Faults
+from slam.worlds.geometry import Landmarks
+from slam.worlds.observe import Appearance, ObservationModel, SimulatedFeatures, appearance, simulate
+from slam.worlds.truth import TruthImages, truth_images
+from slam.worlds.world import World
+
+if TYPE_CHECKING:
+    from slam.worlds.recorder import Recorder
+
+
+@dataclass(frozen=True)
+class ObjectPoses:
+    """Poses of the moving objects in one frame.
+
+    Attributes:
+        ids: of the objects (B,), from 1 on.
+        T_world_object: their poses (B, 4, 4).
+    """
+
+    ids: IdArray
+    T_world_object: Array
+
+
+class WorldSequence:
+    """A recording of a built-in world, made when asked for; frame k is the same however it is asked for.
+
+    Attributes:
+        name: text that opens it again, such as ``"aisle?frames=200&seed=3"``.
+        format: ``"synthetic"``.
+        world: what is recorded.
+        values: the values of all options.
+        ground_truth: pose of the left camera at every frame.
+        warnings: always empty; recorded sequences have faults to report here.
+    """
+
+    format = "synthetic"
+
+    def __init__(self, name: str, world: World, values: Mapping[str, Any]) -> None:
+        self.name = name
+        self.world = world
+        self.values = dict(values)
+        self.warnings: list[str] = []
+        self.faults = Faults.of(values, len(world), values["seed"])
+        self._kept = np.flatnonzero(~self.faults.drop)
+        self._stamps = (world.stamps + self.faults.delay)[self._kept]
+        self._last_truth: tuple[int, TruthImages] | None = None
+        self._model = ObservationModel.of(values)
+
+    @property
+    def rig(self) -> StereoRig:
+        """The stereo rig."""
+        return self.world.rig
+
+    @property
+    def kind(self) -> str:
+        """Kind of motion, ``"handheld"`` or ``"driving"``."""
+        return self.world.kind
+
+    @property
+    def stamps(self) -> Array:
+        """Times of the frames (N,) [s]."""
+        return self._stamps
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """The landmarks; the row is the id."""
+        return self.world.landmarks
+
+    @cached_property
+    def ground_truth(self) -> Trajectory:
+        """Pose of the left camera at every frame."""
+        return Trajectory(self._stamps, self.world.T_world_left[self._kept])
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        return self.frames()
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
+        """Images of frames `start` up to, but without, `stop`, each rendered when it is asked for.
+
+        Raises:
+            SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
+        """
+        first, last = frame_range(start, stop, len(self))
+        return (self.frame(k) for k in range(first, last))
+
+    def frame(self, k: int) -> StereoFrame:
+        """Images of frame k."""
+        return self._recorder.record(self._source(k), k, float(self._stamps[k]))
+
+    def depth(self, k: int) -> np.ndarray:
+        """True distance along the left camera's axis in frame k (H, W) float32 [m], 0 where nothing is."""
+        return self._truth(k).depth
+
+    def object_ids(self, k: int) -> np.ndarray:
+        """Which object each pixel of frame k's left image shows (H, W) int32, 0 for the still world."""
+        return self._truth(k).objects
+
+    def objects(self, k: int) -> ObjectPoses:
+        """Poses of the moving objects in frame k."""
+        return ObjectPoses(self.world.object_ids, self.world.T_world_object[:, self._source(k)])
+
+    def observe(self, start: int = 0, stop: int | None = None) -> Iterator[SimulatedFeatures]:
+        """Features with their truth, without images, of frames `start` up to, but without, `stop`; see `frames`."""
+        first, last = frame_range(start, stop, len(self))
+        return (self.simulate(k) for k in range(first, last))
+
+    def observations(self, k: int) -> StereoFeatures:
+        """Features of frame k, without images."""
+        return self.simulate(k).features
+
+    def simulate(self, k: int) -> SimulatedFeatures:
+        """Features of frame k with their truth, without images."""
+        source = self._source(k)
+        rng = np.random.default_rng([self.values["seed"], source, 1])
+        seen = simulate(self.world, self._looks, self._model, source, float(self._stamps[k]), rng)
+        return self.faults.spoil(source, seen, self.rig, rng)
+
+    @cached_property
+    def _looks(self) -> Appearance:
+        """Looks of the landmarks."""
+        return appearance(self.world, self._model, self.values["layout"])
+
+    @cached_property
+    def _recorder(self) -> Recorder:
+        """What makes the images; loaded with OpenCV when the first one is asked for."""
+        from slam.worlds.recorder import Recorder
+
+        return Recorder(self.world, self.values, self.faults)
+
+    def _truth(self, k: int) -> TruthImages:
+        """True depth and objects of frame k; the last frame's are kept."""
+        if self._last_truth is None or self._last_truth[0] != k:
+            self._last_truth = k, truth_images(self.world, self._source(k))
+        return self._last_truth[1]
+
+    def _source(self, k: int) -> int:
+        """The world's frame that is frame k of the recording."""
+        if not 0 <= k < len(self):
+            raise SequenceError(f"{self.name}: there is no frame {k}; it has {len(self)}")
+        return int(self._kept[k])

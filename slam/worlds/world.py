@@ -1,0 +1,73 @@
+"""One description of a world, from which observations and images are made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from slam.data import IdArray
+from slam.rig import StereoRig
+from slam.se3 import Array
+from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Surfaces, landmarks, a camera path and objects with their motion.
+
+    Attributes:
+        name: its name.
+        kind: kind of motion, ``"handheld"`` or ``"driving"``.
+        rig: the stereo rig.
+        stamps: time of each frame (N,) [s].
+        T_world_left: pose of the left camera at each frame (N, 4, 4).
+        rectangles: every surface.
+        landmarks: points that stand out on them.
+        T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
+        reach: nearest and farthest distance at which a landmark can be detected [m].
+        texels: texels per metre at which the surfaces are painted.
+        tile: size of the pieces in which surfaces are drawn [m]; within one, the distance should not change much.
+        sky: colour (BGR) where no surface is.
+        painted: textures painted so far, filled by the recorder.
+        seen: landmarks seen in frames so far, filled by the simulator of observations.
+    """
+
+    name: str
+    kind: str
+    rig: StereoRig
+    stamps: Array
+    T_world_left: Array
+    rectangles: tuple[Rectangle, ...]
+    landmarks: Landmarks
+    T_world_object: Array
+    reach: tuple[float, float]
+    texels: float
+    tile: float = 1.0
+    sky: tuple[int, int, int] = (230, 225, 220)
+    painted: dict[Any, Any] = field(default_factory=dict, repr=False)
+    seen: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @cached_property
+    def object_ids(self) -> IdArray:
+        """Ids of the moving objects (B,)."""
+        return np.arange(1, len(self.T_world_object) + 1)
+
+    def T_world_body(self, frame: int) -> Array:
+        """Poses (B + 1, 4, 4) of all bodies in one frame; row 0, the still world, is the identity."""
+        return np.concatenate([np.eye(4)[None], self.T_world_object[:, frame]])
+
+    @cached_property
+    def arrays(self) -> RectangleArrays:
+        """All rectangles as arrays."""
+        return RectangleArrays.of(self.rectangles)
+
+    @cached_property
+    def occluders(self) -> RectangleArrays:
+        """The rectangles that may hide others."""
+        return self.arrays.select(np.array([r.occludes for r in self.rectangles], bool))

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.worlds import open_world
+from slam.worlds.observe import ObservationModel, appearance, visible_landmarks
+
+CLEAN = "detect=1&stereo=1&outliers=0&confusion=0"
+
+
+def residuals(query: str, frames: int = 38) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of uL, vL, uR (N, 3) [px], and how far vR lies off the epipolar line (N,) [px]."""
+    sequence = open_world(f"aisle?{query}&{CLEAN}")
+    errors, off = [], []
+    for k in range(0, 40 * frames, 40):
+        seen, truth = sequence.simulate(k), visible_landmarks(sequence.world, k)
+        rows = np.searchsorted(truth.ids, seen.ids)
+        stereo = seen.features.has_stereo & truth.in_right[rows]
+        f, rows = seen.features, rows[stereo]
+        left, right = f.uv_left[stereo], f.uv_right[stereo]
+        errors.append(np.column_stack([left - truth.uv_left[rows], right[:, 0] - truth.uv_right[rows, 0]]))
+        point = sequence.rig.triangulate(left, right)
+        off.append(sequence.rig.project(point)[1][:, 1] - right[:, 1])
+    return np.concatenate(errors), np.concatenate(off)
+
+
+@pytest.mark.parametrize("rig", ["rectified", "toedin"])
+def test_noise_is_isotropic_and_keeps_to_the_epipolar_geometry(rig):
+    errors, off = residuals(f"rig={rig}&sigma=0.5")
+    assert len(errors) > 2000
+    covariance = np.cov(errors.T)
+    # The estimate's own deviation is √2 · 0.25 / √2000 = 0.008.
+    assert np.allclose(covariance, 0.25 * np.eye(3), atol=0.04)
+    assert np.abs(errors.mean(axis=0)).max() < 0.05
+    assert np.abs(off).max() < 1e-6
+
+
+def test_without_noise_the_features_are_the_projections():
+    errors, _ = residuals("sigma=0", 5)
+    assert np.abs(errors).max() < 1e-12
+
+
+def test_frames_are_the_same_alone_and_in_sequence_and_differ_by_seed():
+    a, b, c = (open_world(f"desk?seed={seed}") for seed in (1, 1, 2))
+    for k, seen in zip(range(30, 34), a.observe(30, 34)):
+        f, g, h = seen.features, b.observations(k), c.observations(k)
+        assert np.array_equal(f.uv_left, g.uv_left)
+        assert np.array_equal(f.uv_right, g.uv_right, equal_nan=True)
+        assert np.array_equal(f.descriptors, g.descriptors)
+        assert f.uv_left.shape != h.uv_left.shape or not np.array_equal(f.uv_left, h.uv_left)
+        assert f.stamp == a.stamps[k]
+
+
+def test_chances_of_detection_and_of_stereo_matches():
+    sequence = open_world("box?detect=0.6&stereo=0.7&outliers=0")
+    detected = visible = matched = matchable = 0
+    for k in range(0, 300, 3):
+        seen, truth = sequence.simulate(k), visible_landmarks(sequence.world, k)
+        detected, visible = detected + len(seen.ids), visible + len(truth.ids)
+        in_right = truth.in_right[np.searchsorted(truth.ids, seen.ids)]
+        matched += (seen.features.has_stereo & in_right).sum()
+        matchable += in_right.sum()
+    assert visible > 3000
+    assert detected / visible == pytest.approx(0.6, abs=0.03)  # 3 deviations of 0.009
+    assert matched / matchable == pytest.approx(0.7, abs=0.03)
+
+
+def test_share_of_outliers():
+    seen = [open_world("aisle?outliers=0.3").simulate(k) for k in range(0, 1500, 50)]
+    false = np.concatenate([s.ids for s in seen]) < 0
+    assert false.mean() == pytest.approx(0.3, abs=0.02)
+    assert all((s.objects[s.ids < 0] == -1).all() for s in seen)
+    stereo = np.concatenate([s.false_stereo for s in seen])[~false]
+    assert stereo.mean() == pytest.approx(0.15 * 0.95 * 0.8, abs=0.05)  # of those with a match, about 0.8 of all
+
+
+def test_descriptors_find_their_landmark_in_the_next_frame():
+    sequence = open_world("desk?outliers=0&confusion=0&descriptor=16")
+    right = total = 0
+    for k in range(0, 300, 30):
+        a, b = sequence.simulate(k), sequence.simulate(k + 1)
+        distance = np.linalg.norm(a.features.descriptors[:, None] - b.features.descriptors, axis=2)
+        both = np.isin(a.ids, b.ids)
+        right += (b.ids[distance.argmin(axis=1)] == a.ids)[both].sum()
+        total += both.sum()
+    assert np.allclose(np.linalg.norm(a.features.descriptors, axis=1), 1, atol=1e-6)
+    assert a.features.descriptors.dtype == np.float32
+    assert a.features.descriptors.shape[1] == 16
+    assert right / total > 0.99
+
+
+@pytest.mark.parametrize("confusion", [0.0, 0.4])
+def test_share_of_landmarks_that_look_like_another(confusion):
+    sequence = open_world(f"aisle?confusion={confusion}")
+    descriptors = appearance(sequence.world, ObservationModel.of(sequence.values), 0).descriptors
+    distance = np.sqrt(np.maximum(2 - 2 * descriptors @ descriptors.T, 0)) + 9 * np.eye(len(descriptors))
+    assert 0.75 < np.median(distance) < 1.05, "as far apart as SURF's of unlike features"
+    alike = (distance.min(axis=1) < 0.25).mean()
+    assert confusion <= alike + 0.03 and alike <= 2 * confusion + 0.01
+
+
+def test_only_what_the_camera_sees_is_visible():
+    """Visibility from geometry against the rendered depth: a second way to the same truth."""
+    sequence = open_world("boxes?camera=moving&density=200")
+    for k in (60, 200, 330):
+        truth = visible_landmarks(sequence.world, k)
+        depth, objects = sequence.depth(k), sequence.object_ids(k)
+        u, v = np.rint(truth.uv_left).astype(int).T
+        near = np.abs(depth[v, u] - truth.points[:, 2]) < 0.02 + 0.01 * truth.points[:, 2]
+        assert near.mean() > 0.97, "but for pixels on edges, the landmark is what the pixel shows"
+        same = objects[v, u] == sequence.landmarks.object[truth.ids]
+        assert same.mean() > 0.97
+        on_objects = sequence.landmarks.object[truth.ids] > 0
+        assert 10 < on_objects.sum() < len(truth.ids)
+
+
+def test_a_hidden_landmark_is_not_seen():
+    """Landmarks of the wall behind the boxes are left out, and none of that wall that nothing hides."""
+    sequence = open_world("boxes?camera=still&density=200")
+    world, k = sequence.world, 200
+    seen = visible_landmarks(world, k)
+    positions = world.landmarks.world_positions(world.T_world_body(k))
+    T = world.T_world_left[k]
+    points = (positions - T[:3, 3]) @ T[:3, :3]
+    uv = world.rig.left.project(points)
+    facing = (world.landmarks.object == 0) & (world.landmarks.normals[:, 1] < -0.9)
+    hidden = np.setdiff1d(np.flatnonzero(world.rig.left.in_image(uv, 3.0) & facing & (points[:, 2] > 0.3)), seen.ids)
+    u, v = np.rint(uv[hidden]).astype(int).T
+    assert len(hidden) > 10
+    assert (sequence.depth(k)[v, u] < points[hidden, 2] - 0.1).mean() > 0.9
+
+
+def test_moving_landmarks_move_with_their_object():
+    sequence = open_world("box?camera=still")
+    landmarks = sequence.landmarks
+    rows = np.flatnonzero(landmarks.object == 1)
+    assert len(rows) > 5
+    world = landmarks.world_positions(sequence.world.T_world_body(250))
+    T = sequence.objects(250).T_world_object[0]
+    assert np.allclose(world[rows], landmarks.positions[rows] @ T[:3, :3].T + T[:3, 3])
+    assert np.array_equal(np.delete(world, rows, 0), np.delete(landmarks.positions, rows, 0))
+
+
+def test_faults_take_features_away():
+    sequence = open_world("aisle?black=3&dropright=4&hand=5&blur=6&bright=7")
+    counts = [len(sequence.observations(k)) for k in range(8)]
+    assert counts[3] == counts[7] == 0
+    assert not sequence.observations(4).has_stereo.any()
+    assert 0.3 * counts[2] < counts[5] < 0.95 * counts[2]
+    assert counts[6] < 0.6 * counts[2]
+    assert len(sequence.observations(3).descriptors) == 0

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.worlds import open_world
+from slam.worlds.observe import visible_landmarks
+from slam.worlds.textures.layout import fill_shelves
+from slam.worlds.textures.ripmap import Ripmap
+
+
+def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The saddle of grey levels near a pixel (2,): a cubic fitted to 9x9 pixels, moved until it is centred."""
+    y, x = (g.ravel().astype(float) for g in np.mgrid[-4:5, -4:5])
+    weight = np.exp(-(x * x + y * y) / 8)
+    terms = np.stack([x * x, x * y, y * y, x, y, np.ones(81), x**3, x * x * y, x * y * y, y**3], axis=1)
+    solve = np.linalg.pinv(terms * weight[:, None])
+    place = start.copy()
+    for _ in range(6):
+        window = cv2.getRectSubPix(image, (9, 9), (float(place[0]), float(place[1]))).ravel()
+        c = solve @ (window * weight)
+        place += np.clip(-np.linalg.solve([[2 * c[0], c[1]], [c[1], 2 * c[2]]], c[3:5]), -1, 1)
+    return place
+
+
+def corner_errors(sequence, frames) -> np.ndarray:
+    """Rendered minus projected corners (N, 2) [px], left and right, of fields at least 22 px wide seen from before."""
+    errors = []
+    world, rig = sequence.world, sequence.rig
+    for k in frames:
+        frame, seen = sequence.frame(k), visible_landmarks(sequence.world, k)
+        offset = world.landmarks.positions[seen.ids] - world.T_world_left[k][:3, 3]
+        facing = -(world.landmarks.normals[seen.ids] * offset).sum(axis=1) / np.linalg.norm(offset, axis=1)
+        clear = (seen.size > 22) & (facing > 0.5)
+        for image, uv, camera in ((frame.left, seen.uv_left, rig.left), (frame.right, seen.uv_right, rig.right)):
+            smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+            places = uv[clear & camera.in_image(uv, 12)]
+            errors += [saddle(smooth, place) - place for place in places]
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("rig", ["rectified", "toedin"])
+@pytest.mark.parametrize("step", [0.1, 0.097])  # one falls on texels' and tiles' edges, the other does not
+def test_corners_are_drawn_where_they_project_in_both_images(board_world, rig, step):
+    sequence = board_world(f"rig={rig}&noise=0&vignetting=0", step)
+    errors = corner_errors(sequence, range(0, 400, 40))
+    distance = np.linalg.norm(errors, axis=1)
+    assert len(errors) > 80
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+    assert np.median(distance) < 0.02
+    assert np.percentile(distance, 95) < 0.05
+
+
+def test_more_samples_bring_every_corner_within_a_twentieth_of_a_pixel(board_world):
+    errors = corner_errors(board_world("noise=0&vignetting=0&supersample=4", 0.097), (0, 150, 300))
+    assert len(errors) > 30
+    assert np.linalg.norm(errors, axis=1).max() < 0.05
+
+
+def test_detail_finer_than_pixels_leaves_no_pattern(board_world):
+    """Fields of 2 mm are less than half a pixel wide: they must turn grey, not into false patterns."""
+    sequence = board_world("noise=0&vignetting=0&lens=0", 0.002)
+    wall = sequence.object_ids(60) == 0
+    depth = sequence.depth(60)
+    image = sequence.frame(60).left.astype(float)
+    inner = cv2.erode(((depth > 1.0) & (depth < 3.0) & wall).astype(np.uint8), np.ones((9, 9))) > 0
+    assert inner.sum() > 5000
+    assert abs(image[inner].mean() - 130) < 3
+    assert image[inner].std() < 6  # of 90 grey levels in the texture
+
+
+def test_rendering_twice_gives_the_same_bytes_whatever_the_order_and_the_threads():
+    first, second = open_world("box?frames=40"), open_world("box?frames=40")
+    threads = cv2.getNumThreads()
+    in_sequence = list(first.frames(20, 23))
+    try:
+        cv2.setNumThreads(1)
+        alone = second.frame(22)
+        cv2.setNumThreads(4)
+        again = second.frame(22)
+    finally:
+        cv2.setNumThreads(threads)
+    for frame in (alone, again):
+        assert np.array_equal(frame.left, in_sequence[2].left)
+        assert np.array_equal(frame.right, in_sequence[2].right)
+    assert (alone.index, alone.stamp) == (22, in_sequence[2].stamp)
+    assert alone.left.dtype == np.uint8 and alone.left.shape == (240, 320)
+
+
+def test_another_seed_is_another_recording_of_the_same_world():
+    a, b = open_world("box?frames=5&seed=1").frame(2), open_world("box?frames=5&seed=2").frame(2)
+    difference = a.left.astype(float) - b.left
+    assert not np.array_equal(a.left, b.left)
+    assert difference.std() == pytest.approx(2 * np.sqrt(2), rel=0.1), "only the noise of 2 grey levels differs"
+
+
+def test_depth_is_that_of_the_landmarks_and_of_the_stereo_pair():
+    sequence = open_world("startup?rig=toedin&tremor=0&frames=2")
+    depth = sequence.depth(0)
+    assert depth.dtype == np.float32 and depth.shape == (240, 320)
+    seen = visible_landmarks(sequence.world, 0)
+    u, v = np.rint(seen.uv_left).astype(int).T
+    assert np.abs(depth[v, u] - seen.points[:, 2]).max() < 2e-3  # half a pixel on a wall at right angles
+
+
+def test_object_image_is_where_the_object_is():
+    sequence = open_world("box?camera=still")
+    ids = sequence.object_ids(30)
+    assert np.unique(ids).tolist() == [0, 1]
+    T, size = sequence.objects(30).T_world_object[0], np.array([0.24, 0.16, 0.20])
+    corner = np.array([[-size[0], 0, -size[2]], [0, 0, 0]])  # of its front, at rest in B0
+    world = corner @ T[:3, :3].T + T[:3, 3]
+    camera = sequence.ground_truth.poses[30]
+    uv = sequence.rig.left.project((world - camera[:3, 3]) @ camera[:3, :3])
+    rows, columns = np.nonzero(ids)
+    assert columns.min() == pytest.approx(uv[0, 0], abs=1)
+    # The right side and, the box being above the camera, the bottom are seen, too: only two sides are the front's.
+    assert rows.min() == pytest.approx(uv[1, 1], abs=1)
+
+
+def test_no_pixel_of_a_room_is_without_a_surface():
+    for query in ("aisle?return=1", "desk", "field", "boxes"):
+        sequence = open_world(query)
+        for k in np.linspace(0, len(sequence) - 1, 5).astype(int):
+            assert (sequence.depth(k) > 0).all(), query
+
+
+def test_faults_in_images():
+    query = "box?frames=12&black=1&bright=2&blur=3&burst=4&hand=5&dropright=6"
+    frames = list(open_world(query))
+    images = [frame.left.astype(float) for frame in frames]
+    assert images[1].mean() < 4
+    assert images[2].mean() > 230
+    sharpness = [cv2.Laplacian(frame.left, cv2.CV_64F).std() for frame in frames]
+    assert sharpness[3] < 0.7 * sharpness[0]
+    assert np.std(images[4] - images[7]) > 3 * np.std(images[8] - images[7])
+    assert images[5][180:, 200:280].std() < 0.3 * images[0][180:, 200:280].std(), "the hand is out of focus"
+    assert frames[6].right is None and frames[5].right is not None
+
+
+def test_options_of_the_camera():
+    plain = open_world("box?frames=400&noise=0&vignetting=0").frame(75).left.astype(float)
+    dim = open_world("box?frames=400&noise=0&vignetting=0.5").frame(75).left
+    assert dim[:20, :20].mean() < 0.7 * plain[:20, :20].mean()
+    assert dim[110:130, 150:170].mean() > 0.97 * plain[110:130, 150:170].mean()
+    blurred = open_world("box?frames=400&noise=0&vignetting=0&shutter=1").frame(75).left
+    moving = open_world("box?frames=400").object_ids(75) > 0
+    change = np.abs(blurred - plain)
+    assert change[moving].mean() > 3 * change[~moving].mean(), "the box moves, the camera hardly does"
+    wander = [open_world(f"box?noise=0&exposure={e}").frame(30).left.mean() for e in (0, 0.3)]
+    assert abs(wander[1] / wander[0] - 1) > 0.05
+    colour = open_world("box?frames=2&colour=1").frame(0).left
+    assert colour.shape == (240, 320, 3)
+    assert np.ptp(colour.astype(int), axis=2).mean() > 5
+
+
+def test_a_ripmap_keeps_the_mean_and_never_runs_out():
+    picture = np.random.default_rng(0).integers(0, 255, (60, 90), dtype=np.uint8)
+    ripmap = Ripmap(picture)
+    assert ripmap.level(np.array([1 / 200, 1 / 200])) is not None
+    assert ripmap.level(np.array([1 / 200, 1 / 200])).shape == (60, 90)
+    assert ripmap.level(np.array([2 / 90, 1 / 60])).shape == (60, 45)
+    assert ripmap.level(np.array([50.0, 50.0])).shape == (1, 1)
+    assert ripmap.level(np.array([4 / 90, 4 / 60])).mean() == pytest.approx(picture.mean(), abs=0.5)
+
+
+def test_books_stand_on_their_boards_and_beside_each_other():
+    books = fill_shelves(2.7, 2.14, 3)
+    assert len(books.left) > 200
+    foot = np.round(books.top + books.height, 6)
+    for board in np.unique(foot):
+        row = np.flatnonzero(foot == board)
+        row = row[np.argsort(books.left[row])]
+        gap = books.left[row][1:] - (books.left + books.width)[row][:-1]
+        assert gap.min() > 0
+    assert (books.left + books.width + books.lean).max() < 2.7
+
+
+@pytest.mark.parametrize("frame", [20, 150])
+def test_the_aisle_gives_surf_what_paper_a_s_camera_gave(frame):
+    """Paper A, III.A: 837 features at a D_threshold of 0, 41 at 10000, with two octaves on a 320x240 image."""
+    from frontends.surf import Surf
+
+    image = open_world("aisle?frames=200").frame(frame).left
+    counts = [len(Surf(threshold=t, octaves=2).detect(image)) for t in (0, 2550, 10000)]
+    assert 600 < counts[0] < 1200
+    assert 150 < counts[1] < 500
+    assert 20 < counts[2] < 100

@@ -1,0 +1,65 @@
+"""Short forms of every built-in world through both back ends, with bands around the accuracy measured.
+
+Two levels: simulated observations (``sigma=0.7``, which is what the default settings assume), and rendered images.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.config import SystemConfig
+from slam.evaluation import consistency, evaluate
+from slam.runner import RunOptions, run
+from slam.sequences import open_sequence
+from slam.system import StereoSlam
+from slam.trajectory import Trajectory
+
+#: World, and about twice the online ATE [m] measured with either back end.
+OBSERVED = {
+    "aisle?frames=80&sigma=0.7": 0.008,
+    "aisle?frames=40&sigma=0.7&rig=toedin": 0.010,
+    "desk?frames=60&sigma=0.7": 0.010,
+    "field?frames=50&sigma=0.7": 0.010,
+    "startup?frames=60&sigma=0.7": 0.016,
+    "box?frames=80&sigma=0.7": 0.030,
+    "boxes?frames=80&sigma=0.7": 0.040,
+    "street?frames=30&sigma=0.7": 0.060,
+}
+RENDERED = {"aisle?frames=20": 0.005, "desk?frames=20": 0.005, "box?frames=20": 0.015, "street?frames=8": 0.06}
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("world", OBSERVED)
+def test_observed_world(world, backend):
+    sequence = open_sequence(f"synthetic:{world}")
+    system = StereoSlam(sequence.rig, None, backend, kind=sequence.kind)
+    results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
+    assert {r.status.value for r in results[1:]} == {"tracked"}
+    estimates = [r.estimate for r in results]
+    online = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
+    assert evaluate(online, sequence)["ATE RMSE [m]"] < OBSERVED[world]
+    assert evaluate(system.trajectory(), sequence)["ATE RMSE [m]"] < OBSERVED[world]
+    if "box" in world:
+        return  # moving boxes bend the path as long as nothing detects them, and the covariance cannot know
+    honesty = consistency(online, np.array([e.covariance for e in estimates]), sequence)
+    # Six degrees of freedom; one run's errors are correlated, so its mean scatters far more than the band says.
+    assert honesty["mean NEES"] < 20
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("world", RENDERED)
+def test_rendered_world(world, backend, tmp_path):
+    sequence = open_sequence(f"synthetic:{world}")
+    summary = run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), tmp_path))
+    assert summary["status"] == {"started": 1, "tracked": len(sequence) - 1}
+    assert summary["accuracy"]["online"]["ATE RMSE [m]"] < RENDERED[world]
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_faults_are_survived(backend, tmp_path):
+    """Black frames, a missing right image, missing frames: the run goes on, and its status says what happened."""
+    sequence = open_sequence("synthetic:desk?frames=40&black=12:15&dropright=20:22&drop=27")
+    summary = run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), tmp_path))
+    assert summary["status"] == {"started": 1, "predicted": 3, "tracked": 35}
+    assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.02
