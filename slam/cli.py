@@ -78,7 +78,7 @@ def run_command(
 
     opened = open_sequence(sequence, format=format)
     start, stop = parse_frames(frames)
-    config = SystemConfig.for_kind(kind or opened.kind).with_settings(settings or [])
+    config = SystemConfig.for_kind(kind or opened.kind, frontend).with_settings(settings or [])
     options = RunOptions(backend, frontend, config, out, start, stop)
     with Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet) as progress:
         summary = run(opened, options, progress.frame)

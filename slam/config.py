@@ -8,9 +8,16 @@ from typing import Any
 from slam.association import AssociationConfig
 from slam.map_management import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
+from slam.selfcalibration import SelfCalibrationConfig
 
 #: Map management of a kind of motion: a car does not come back soon to what lies behind it.
 MAPS = {"handheld": MapConfig(), "driving": MapConfig(max_landmarks=300)}
+
+#: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does.
+FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
+    ("handheld", "surf"): {"upright": False},
+    ("driving", "surf"): {"upright": True},
+}
 
 
 @dataclass(frozen=True)
@@ -21,6 +28,7 @@ class SystemConfig:
         models: noise, priors and motion model of all back ends.
         association: search windows, descriptor distances, geometric check.
         map: which features become landmarks and which landmarks are dropped.
+        self_calibration: the disparity offset found while running.
         frontend: options of the front end by name.
         backend: options of the back end by name.
     """
@@ -28,19 +36,21 @@ class SystemConfig:
     models: EstimatorModels = field(default_factory=EstimatorModels)
     association: AssociationConfig = field(default_factory=AssociationConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    self_calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     frontend: dict[str, Any] = field(default_factory=dict)
     backend: dict[str, Any] = field(default_factory=dict)
 
     __pydantic_config__ = FORBID_UNKNOWN
 
     @classmethod
-    def for_kind(cls, kind: str) -> SystemConfig:
-        """The default settings for a kind of motion, ``"handheld"`` or ``"driving"``.
+    def for_kind(cls, kind: str, frontend: str | None = "surf") -> SystemConfig:
+        """The default settings for a kind of motion, ``"handheld"`` or ``"driving"``, and a front end by name.
 
         Raises:
             ConfigurationError: the kind is not known.
         """
-        return cls(models=models_for(kind), map=MAPS[kind])
+        models = models_for(kind)
+        return cls(models=models, map=MAPS[kind], frontend=dict(FRONTENDS.get((kind, frontend), {})))
 
     def to_json(self) -> dict[str, Any]:
         """The tree as plain types; arrays as lists."""

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from slam.data import BoolArray
 from slam.se3 import Array
 
 
-def chi_square_limits(dof: Array, probability: float) -> Array:
-    """Quantiles of χ² at `probability` for degrees of freedom (M,)."""
-    return np.asarray(2.0 * gammaincinv(np.asarray(dof, float) / 2.0, probability))
+def chi_square_limits(dof: NDArray, probability: float) -> Array:
+    """Quantiles of χ² at `probability` for degrees of freedom (M,), integers."""
+    table = np.array([_quantile(n, probability) for n in range(int(np.max(dof, initial=0)) + 1)])
+    return np.asarray(table[np.asarray(dof, int)])
+
+
+@lru_cache(maxsize=256)
+def _quantile(dof: int, probability: float) -> float:
+    return float(2.0 * gammaincinv(dof / 2.0, probability)) if dof else 0.0
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:
@@ -47,6 +56,5 @@ def chi_square_gate(residuals: Array, innovation_covariances: Array, probability
         innovation_covariances: (M, 3, 3) [px²], measurement noise included.
         probability: share of right measurements that pass where the covariances are right, in (0, 1).
     """
-    limits = chi_square_limits(np.array([2.0, 3.0]), probability)
-    distance = squared_distances(residuals, innovation_covariances)
-    return np.asarray(distance <= limits[np.isfinite(residuals[:, 2]).astype(int)])
+    dof = np.where(np.isnan(residuals[:, 2]), 2, 3)
+    return np.asarray(squared_distances(residuals, innovation_covariances) <= chi_square_limits(dof, probability))

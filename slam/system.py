@@ -26,6 +26,7 @@ from slam.landmarks import LandmarkRows
 from slam.map_management import bad_landmarks, new_landmarks, surplus_landmarks
 from slam.recognition import Recogniser, Recognition
 from slam.rig import StereoRig
+from slam.selfcalibration import SelfCalibration
 from slam.trajectory import Trajectory
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
@@ -63,7 +64,7 @@ class StereoSlam:
         config: SystemConfig | None = None,
     ) -> None:
         self.rig = rig
-        self.config = config or SystemConfig.for_kind(kind)
+        self.config = config or SystemConfig.for_kind(kind, frontend if isinstance(frontend, str) else None)
         c = self.config
         self.frontend: Frontend | None = (
             registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
@@ -74,6 +75,7 @@ class StereoSlam:
             else backend
         )
         self.landmarks: LandmarkRows | None = None
+        self.calibration = SelfCalibration(rig, c.self_calibration)
         self._recogniser = Recogniser(rig, c.association, c.models.pixel_sigma)
         self._index = -1
         self._next_id = 0
@@ -102,7 +104,9 @@ class StereoSlam:
         self._index += 1
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         clock.lap("predict")
+        measured, features = features, self.calibration.correct(features)
         found = self._recognise(prediction, landmarks, features)
+        self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
         report = self.backend.update(_observations(features, found), found.T_world_left)
         clock.lap("update")

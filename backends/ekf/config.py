@@ -1,0 +1,46 @@
+"""Options of the EKF back end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from slam.errors import ConfigurationError
+
+MEASUREMENTS = ("stereo", "left")
+
+
+@dataclass(frozen=True)
+class EkfConfig:
+    """Options of `EkfBackend`.
+
+    Attributes:
+        measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
+        iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
+            updates where the first is not linear to within the noise.
+
+    Raises:
+        ConfigurationError: a value is out of its range.
+    """
+
+    measurement: str = "stereo"
+    iterations: int = 5
+
+    def __post_init__(self) -> None:
+        if self.measurement not in MEASUREMENTS:
+            raise ConfigurationError(f"ekf: measurement must be one of {MEASUREMENTS}, got {self.measurement!r}")
+        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
+            raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
+
+    @classmethod
+    def from_options(cls, options: dict[str, Any]) -> EkfConfig:
+        """The configuration of keyword options.
+
+        Raises:
+            ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
+        """
+        known = [f.name for f in fields(cls)]
+        unknown = sorted(set(options) - set(known))
+        if unknown:
+            raise ConfigurationError(f"ekf: unknown option {unknown[0]!r}; known: {', '.join(known)}")
+        return cls(**options)

@@ -1,0 +1,9 @@
+"""The modified SURF of paper A: detector, descriptors, stereo matching, front end."""
+
+from __future__ import annotations
+
+from frontends.surf.config import SurfConfig
+from frontends.surf.frontend import SurfFrontend
+from frontends.surf.surf import Keypoints, Surf
+
+__all__ = ["Keypoints", "Surf", "SurfConfig", "SurfFrontend"]

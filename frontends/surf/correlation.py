@@ -1,0 +1,162 @@
+"""Sub-pixel positions by image correlation: Gauss-Newton alignment of a right patch to the left one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frontends.surf.kernels import kernel, vector_helper
+
+_HALVES = (7, 11)  # half widths of the two patch sizes [px]
+_ITERATIONS = 12
+_CONVERGED = 0.01  # px
+
+
+def patch_windows(spread: float = 0.4) -> NDArray[np.float32]:
+    """Gaussian weights (2, 23, 24) of the pixels of the two patch sizes; rows padded with zeros to vector registers.
+
+    `spread` is the Gaussian's sigma in units of the patch's half width.
+    """
+    out = np.zeros((2, 2 * _HALVES[1] + 1, 24), np.float32)
+    for k, half in enumerate(_HALVES):
+        line = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * (spread * half) ** 2))
+        n = 2 * half + 1
+        out[k, :n, :n] = np.outer(line, line) / line.sum() ** 2
+    return out
+
+
+@vector_helper
+def _sample(image, x, y, half, rows, lanes, blend, out):
+    """Bilinear samples (rows, lanes) with the first one at (x - half, y - half); False where they leave the image."""
+    top, left = int(np.floor(y)) - half, int(np.floor(x)) - half
+    if top < 0 or left < 0 or top + rows + 1 > image.shape[0] or left + lanes + 1 > image.shape[1]:
+        return False
+    a, b = np.float32(y - np.floor(y)), np.float32(x - np.floor(x))
+    pixels = image.reshape(-1)
+    stride = image.shape[1]
+    for r in range(rows):
+        start = np.uint64((top + r) * stride + left)
+        below = np.uint64(start + np.uint64(stride))
+        for c in range(lanes + 1):
+            u = np.float32(pixels[start + np.uint64(c)])
+            blend[c] = u + a * (np.float32(pixels[below + np.uint64(c)]) - u)
+        for c in range(lanes):
+            out[r, c] = blend[c] + b * (blend[c + 1] - blend[c])
+    return True
+
+
+@vector_helper
+def _template(sampled, window, k, rows, lanes, weighted, gx, gy):
+    """Weighted patch and gradients from samples one pixel wider on each side, and their weighted sums.
+
+    Returns the patch's mean and standard deviation; the gradients' sums x, y; the normal matrix xx, xy, yy of the
+    gradients less their means; and the sums of gradients times patch, x, y.
+    """
+    zero = np.float32(0.0)
+    s, ss, sx, sy, xx, xy, yy, px, py = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    half = np.float32(0.5)
+    for r in range(rows):
+        for c in range(lanes):
+            w = window[k, r, c]
+            v = sampled[r + 1, c + 1]
+            dx = half * (sampled[r + 1, c + 2] - sampled[r + 1, c])
+            dy = half * (sampled[r + 2, c + 1] - sampled[r, c + 1])
+            wv, wx, wy = w * v, w * dx, w * dy
+            weighted[r, c], gx[r, c], gy[r, c] = wv, wx, wy
+            s += wv
+            ss += wv * v
+            sx += wx
+            sy += wy
+            xx += wx * dx
+            xy += wx * dy
+            yy += wy * dy
+            px += wx * v
+            py += wy * v
+    deviation = np.sqrt(max(ss - s * s, zero))
+    return s, deviation, sx, sy, xx - sx * sx, xy - sx * sy, yy - sy * sy, px, py
+
+
+@vector_helper
+def _compare(patch, window, k, rows, lanes, weighted, gx, gy):
+    """Weighted sums over a patch: itself, its square, times the template, times the gradients x and y."""
+    zero = np.float32(0.0)
+    s, ss, both, px, py = zero, zero, zero, zero, zero
+    for r in range(rows):
+        for c in range(lanes):
+            v = patch[r, c]
+            wv = window[k, r, c] * v
+            s += wv
+            ss += wv * v
+            both += weighted[r, c] * v
+            px += gx[r, c] * v
+            py += gy[r, c] * v
+    return s, np.sqrt(max(ss - s * s, zero)), both, px, py
+
+
+def refine(
+    left: NDArray,
+    right: NDArray,
+    uv: NDArray[np.float64],
+    size: NDArray[np.float64],
+    start: NDArray[np.float64],
+    min_correlation: float,
+    reach: tuple[float, float],
+    windows: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Right pixels (N, 2) to sub-pixel accuracy by image correlation.
+
+    The right patch moves in both directions until its difference from the left patch is least; brightness offset
+    and contrast are removed from both. NaN where a patch leaves the image, has no texture, moves further than
+    `reach` from the start, does not converge, or correlates below `min_correlation`.
+
+    Args:
+        left: grey image (H, W) float32.
+        right: the other one.
+        uv: left pixels (N, 2).
+        size: of the features (N,) [px]; large ones are compared in large patches.
+        start: first guess of the right pixels (N, 2), NaN where there is none.
+        min_correlation: least normalised correlation.
+        reach: largest shift along the row and across [px].
+        windows: see `patch_windows`.
+    """
+    out = np.full((len(uv), 2), np.nan)
+    _refine(left, right, uv, size, start, min_correlation, reach[0], reach[1], windows, out)
+    return out
+
+
+@kernel
+def _refine(left, right, uv, size, start, min_correlation, reach_x, reach_y, windows, out):
+    """The same into `out`."""
+    sampled, patch = np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32)
+    weighted, gx, gy = np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32)
+    blend = np.zeros(32, np.float32)
+    for i in range(len(uv)):
+        if np.isnan(start[i, 0]):
+            continue
+        k = 0 if size[i] < 24.0 else 1
+        half = 7 if k == 0 else 11
+        rows, lanes = 2 * half + 1, 2 * half + 2
+        if not _sample(left, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
+            continue
+        mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
+        det = xx * yy - xy * xy
+        if deviation < 1e-3 or det <= 1e-4 * (xx + yy) ** 2:
+            continue
+        x, y = start[i, 0], start[i, 1]
+        for _ in range(_ITERATIONS):
+            if not _sample(right, x, y, half, rows, lanes, blend, patch):
+                break
+            mean2, deviation2, both, px, py = _compare(patch, windows, k, rows, lanes, weighted, gx, gy)
+            if deviation2 < 1e-3:
+                break
+            gain = deviation / deviation2
+            ex = (tx - mean * sx) - gain * (px - mean2 * sx)
+            ey = (ty - mean * sy) - gain * (py - mean2 * sy)
+            dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
+            x, y = x + dx, y + dy
+            if not (abs(x - start[i, 0]) <= reach_x and abs(y - start[i, 1]) <= reach_y):
+                break
+            if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
+                if (both - mean * mean2) / (deviation * deviation2) >= min_correlation:
+                    out[i, 0], out[i, 1] = x, y
+                break

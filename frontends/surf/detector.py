@@ -1,0 +1,237 @@
+"""The fast Hessian detector (paper A, III.A): responses, non-maximum suppression and refinement in one pass.
+
+The responses of a few rows at a time live in a small rotating buffer, so they never make a round trip through main
+memory; the first and the last layer of an octave, which only rival the maxima of the others, are computed only where
+such a maximum needs them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frontends.surf.filters import Filters
+from frontends.surf.kernels import helper, kernel, vector_helper
+
+#: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
+COLUMNS = 6
+
+#: What each of a filter's eight boxes counts in Dxx, Dyy and Dxy, see `filters.BOXES`.
+_SIGNS = np.array([[1, -3, 0, 0, 0, 0, 0, 0], [0, 0, 1, -3, 0, 0, 0, 0], [0, 0, 0, 0, 1, 1, -1, -1]], np.int32)
+
+
+@helper
+def _response_at(pixels, at, filters, layer):
+    """The determinant ``Dxx Dyy − 0.81 Dxy²`` and the sign of ``Dxx + Dyy`` of the filter with its top left at `at`."""
+    o = filters.offsets
+    dxx, dyy, dxy = np.int32(0), np.int32(0), np.int32(0)
+    for k in range(8):
+        a, b = pixels[at + o[layer, 4 * k]], pixels[at + o[layer, 4 * k + 1]]
+        c, d = pixels[at + o[layer, 4 * k + 2]], pixels[at + o[layer, 4 * k + 3]]
+        box = np.int32(np.int32(d - c) - np.int32(b - a))
+        dxx = np.int32(dxx + _SIGNS[0, k] * box)
+        dyy = np.int32(dyy + _SIGNS[1, k] * box)
+        dxy = np.int32(dxy + _SIGNS[2, k] * box)
+    xx, yy, xy = np.float32(dxx), np.float32(dyy), np.float32(dxy)
+    response = xx * yy * filters.weights[layer, 0] - xy * xy * filters.weights[layer, 1]
+    return response, np.sign(np.int64(dxx) + np.int64(dyy))
+
+
+@vector_helper
+def _vertical_parts(s, at, stride, c, need, n, out, to, between):
+    """Combine rows of the flat integral image for the filters whose top row begins at `at`.
+
+    Dxx takes the rows at its lobes' top and bottom edges; Dyy three lobes one above the other, weights 1, -2, 1; Dxy
+    an upper and a lower lobe, weights 1, -1. They go to `to`, `to + between` and `to + 2 between`, n elements each,
+    where `need` asks for them.
+    """
+    if need[0]:
+        a, b = at + c[2] * stride, at + c[7] * stride
+        for x in range(n):
+            k = np.uint64(x)
+            out[to + k] = np.int32(s[b + k] - s[a + k])
+    if need[1]:
+        a, b, d, e = at, at + c[3] * stride, at + c[6] * stride, at + c[9] * stride
+        for x in range(n):
+            k = np.uint64(x)
+            lobe = np.int32(s[d + k] - s[b + k])
+            out[to + between + k] = np.int32(np.int32(s[e + k] - s[a + k]) - np.int32(3) * lobe)
+    if need[2]:
+        a, b, d, e = at + c[1] * stride, at + c[4] * stride, at + c[5] * stride, at + c[8] * stride
+        for x in range(n):
+            k = np.uint64(x)
+            out[to + between + between + k] = np.int32(np.int32(s[b + k] - s[a + k]) - np.int32(s[e + k] - s[d + k]))
+
+
+@vector_helper
+def _determinants(m, c, weight, weight_xy, n, out, to):
+    """Horizontal part of the filters and the determinants ``Dxx Dyy − 0.81 Dxy²`` of a row."""
+    a0, a3, a6, a9, b2, b7, c1, c4, c5, c8 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]
+    for x in range(n):
+        j = np.uint64(x)
+        dxx = np.float32(np.int32(np.int32(m[a9 + j] - m[a0 + j]) - np.int32(3) * np.int32(m[a6 + j] - m[a3 + j])))
+        dyy = np.float32(np.int32(m[b7 + j] - m[b2 + j]))
+        dxy = np.float32(np.int32(np.int32(m[c4 + j] - m[c1 + j]) - np.int32(m[c8 + j] - m[c5 + j])))
+        out[to + j] = dxx * dyy * weight - dxy * dxy * weight_xy
+
+
+@helper
+def _response_row(phases, filters, layer, y0, buffer, count, out, to):
+    """`count` determinants of one row of one layer, filters' top row `y0`, into the flat array `out` from `to` on."""
+    step, rows, n = phases.shape
+    pixels, c = phases.reshape(-1), filters.corners[layer]
+    for p in range(step):
+        at = np.uint64((p * rows + y0) * n)
+        need = filters.parts[layer, p]
+        _vertical_parts(pixels, at, np.uint64(n), c, need, n, buffer, np.uint64(p * n), np.uint64(step * n))
+    _determinants(buffer, filters.columns[layer], filters.weights[layer, 0], filters.weights[layer, 1], count, out, to)
+
+
+@vector_helper
+def _mark_peaks(above, before, row, after, below, threshold, mask):
+    """Mark the columns that exceed the threshold and their four neighbours in the layer."""
+    for j in range(mask.size):
+        v = row[j]
+        mask[j] = (v > threshold) & (v > before[j]) & (v > after[j]) & (v > above[j]) & (v > below[j])
+
+
+@helper
+def _neighbourhood(ring, slots, j, pixels, stride, filters, layer, row, cube):
+    """Fill the 3x3x3 responses around a peak of a layer; False as soon as one of them is not below it."""
+    step, inner = filters.step, ring.shape[0]
+    v = ring[layer - 1, slots[1], j]
+    for dl in range(-1, 2):
+        if 1 <= layer + dl <= inner:
+            for di in range(3):
+                for dj in range(3):
+                    r = ring[layer + dl - 1, slots[di], j + dj - 1]
+                    if r >= v and (dl != 0 or di != 1 or dj != 1):
+                        return False
+                    cube[dl + 1, di, dj] = r
+    for dl in range(-1, 2, 2):
+        if not 1 <= layer + dl <= inner:
+            centre = filters.centre[layer + dl]
+            for di in range(3):
+                for dj in range(3):
+                    at = step * (row - centre + di - 1) * stride + step * (j - centre + dj - 1)
+                    r, _ = _response_at(pixels, np.uint64(at), filters, layer + dl)
+                    if r >= v:
+                        return False
+                    cube[dl + 1, di, dj] = r
+    return True
+
+
+@helper
+def _newton_step(c, offset):
+    """Offset (x, y, layer) of the extremum of a quadratic through the 3x3x3 responses; False where out of reach."""
+    v = c[1, 1, 1]
+    gx, gy, gs = 0.5 * (c[1, 1, 0] - c[1, 1, 2]), 0.5 * (c[1, 0, 1] - c[1, 2, 1]), 0.5 * (c[0, 1, 1] - c[2, 1, 1])
+    xx, yy = c[1, 1, 0] - 2 * v + c[1, 1, 2], c[1, 0, 1] - 2 * v + c[1, 2, 1]
+    ss = c[0, 1, 1] - 2 * v + c[2, 1, 1]
+    xy = 0.25 * (c[1, 2, 2] - c[1, 2, 0] - c[1, 0, 2] + c[1, 0, 0])
+    xs = 0.25 * (c[2, 1, 2] - c[2, 1, 0] - c[0, 1, 2] + c[0, 1, 0])
+    ys = 0.25 * (c[2, 2, 1] - c[2, 0, 1] - c[0, 2, 1] + c[0, 0, 1])
+    cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
+    det = xx * cxx + xy * cxy + xs * cxs
+    if det == 0.0:
+        return False
+    cyy, cys, css = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
+    offset[0] = (cxx * gx + cxy * gy + cxs * gs) / det
+    offset[1] = (cxy * gx + cyy * gy + cys * gs) / det
+    offset[2] = (cxs * gx + cys * gy + css * gs) / det
+    still = offset[0] == 0.0 and offset[1] == 0.0 and offset[2] == 0.0
+    return not still and abs(offset[0]) <= 1.0 and abs(offset[1]) <= 1.0 and abs(offset[2]) <= 1.0
+
+
+@helper
+def _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube, offset, out, found):
+    """Candidates among the marked columns of a row, appended to `out`; returns how many `out` holds then."""
+    step, size = filters.step, filters.sizes[layer]
+    ds = size - filters.sizes[layer - 1]
+    centre = filters.centre[layer]
+    for word in range(words.size):
+        if words[word] == 0:
+            continue
+        for j in range(8 * word, 8 * word + 8):
+            if mask[j] == 0 or not _neighbourhood(ring, slots, j, pixels, stride, filters, layer, row, cube):
+                continue
+            if not _newton_step(cube, offset):
+                continue
+            x0, y0 = step * (j - centre), step * (row - centre)
+            out[found, 0] = x0 + 0.5 * (size - 1) + step * offset[0]
+            out[found, 1] = y0 + 0.5 * (size - 1) + step * offset[1]
+            out[found, 2] = np.rint(size + offset[2] * ds)
+            out[found, 3] = cube[1, 1, 1]
+            _, out[found, 4] = _response_at(pixels, np.uint64(y0 * stride + x0), filters, layer)
+            found += 1
+    return found
+
+
+def detect_octave(
+    integral: NDArray[np.int32],
+    phases: NDArray[np.int32],
+    filters: Filters,
+    octave: int,
+    threshold: float,
+    first_row: int,
+    last_row: int,
+) -> NDArray[np.float64]:
+    """Maxima of the Hessian determinant in one octave and a range of grid rows.
+
+    Args:
+        integral: see `integral_image`.
+        phases: it by column phase, see `column_phases`.
+        filters: of the octave, see `make_filters`.
+        octave: 0-based.
+        threshold: D_threshold; only responses above it count.
+        first_row: first grid row to search.
+        last_row: the row after the last one.
+
+    Returns:
+        Candidates (N, COLUMNS) in raster order of the grid.
+    """
+    columns, inner = (integral.shape[1] - 1) // filters.step, len(filters.sizes) - 2
+    buffer = np.empty(3 * filters.step * phases.shape[2], np.int32)
+    ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
+    words = np.zeros((columns + 7) // 8, np.uint64)
+    # At most one strict maximum in each 2x2 block of a layer.
+    out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
+    found = _scan(
+        integral, phases, filters, np.float32(threshold), first_row, last_row, buffer, ring, words,
+        words.view(np.uint8), out,
+    )  # fmt: skip
+    out[:found, 5] = octave
+    return out[:found].copy()
+
+
+@kernel
+def _scan(integral, phases, filters, threshold, first_row, last_row, buffer, ring, words, mask, out):
+    """The search itself; returns the number of candidates written to `out`."""
+    step, height, width = filters.step, integral.shape[0] - 1, integral.shape[1] - 1
+    rows, columns, inner = height // step, width // step, ring.shape[0]
+    pixels, stride, responses = integral.reshape(-1), integral.shape[1], ring.reshape(-1)
+    slots, cube, offset = np.empty(3, np.int64), np.empty((3, 3, 3)), np.empty(3)
+    found = np.int64(0)
+    for i in range(max(0, first_row - 1), min(rows, last_row + 1)):
+        for layer in range(1, inner + 1):
+            size, start = filters.sizes[layer], filters.centre[layer]
+            if start <= i <= start + (height - size) // step:
+                to = np.uint64((3 * (layer - 1) + i % 3) * ring.shape[2] + start)
+                count = 1 + (width - size) // step
+                _response_row(phases, filters, layer, step * (i - start), buffer, count, responses, to)
+        row = i - 1
+        slots[0], slots[1], slots[2] = (row - 1) % 3, row % 3, i % 3
+        for layer in range(1, inner + 1):
+            margin = filters.centre[layer + 1] + 1
+            if row < first_row or not margin <= row < rows - margin:
+                continue
+            a, b = margin, columns - margin
+            here = ring[layer - 1, slots[1]]
+            mask[:a] = 0
+            mask[b:] = 0
+            _mark_peaks(
+                ring[layer - 1, slots[0], a:b], here[a - 1 :], here[a:b], here[a + 1 :], ring[layer - 1, slots[2], a:b],
+                threshold, mask[a:b],
+            )  # fmt: skip
+            found = _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube, offset, out, found)
+    return found

@@ -1,0 +1,205 @@
+"""Search along epipolar lines of rectified images by normalised correlation, at half resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frontends.surf.kernels import helper, kernel, vector_helper
+
+_HALF = 4  # half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
+_SIDE = 2 * _HALF + 1
+_FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
+_NEIGHBOURS = 2  # columns about the best place that are no rivals of it
+
+
+@dataclass(frozen=True)
+class HalfImage:
+    """An image at half resolution, ready for correlation.
+
+    Attributes:
+        pixels: grey values (H/2, W/2) float32 on the scale of 8-bit images.
+        weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
+            or leaves the image.
+    """
+
+    pixels: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+def half_image(image: NDArray, full_scale: float) -> HalfImage:
+    """Halve a grey image (H, W) of pixels 0..full_scale for `search_rows`."""
+    import cv2
+
+    height, width = image.shape
+    small = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+    pixels = small.astype(np.float32) * np.float32(255.0 / full_scale)
+    weight = np.zeros_like(pixels)
+    _weigh(pixels, weight)
+    return HalfImage(pixels, weight)
+
+
+@kernel
+def _weigh(pixels, weight):
+    """Weights of the patches about all pixels of an image."""
+    sums, squares = np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32)
+    for y in range(_HALF, pixels.shape[0] - _HALF):
+        _column_sums(pixels, y, sums, squares)
+        _row_weights(sums, squares, weight, y)
+
+
+@vector_helper
+def _row_weights(sums, squares, weight, y):
+    """Weights of a row from the column sums of its patches."""
+    area, zero = np.float32(_SIDE * _SIDE), np.float32(0.0)
+    least = np.float32(_FLAT * _FLAT) * area
+    for x in range(sums.size - 2 * _HALF):
+        s, q = zero, zero
+        for c in range(_SIDE):
+            s += sums[x + c]
+            q += squares[x + c]
+        spread = q - s * s / area
+        weight[y, x + _HALF] = np.float32(1.0) / np.sqrt(spread) if spread > least else zero
+
+
+@vector_helper
+def _column_sums(pixels, y, sums, squares):
+    """Sums of pixels and of their squares over the patch rows about row y, less a middle grey to keep digits."""
+    grey = np.float32(128.0)
+    for x in range(sums.size):
+        s, q = np.float32(0.0), np.float32(0.0)
+        for r in range(_SIDE):
+            v = pixels[y - _HALF + r, x] - grey
+            s += v
+            q += v * v
+        sums[x], squares[x] = s, q
+
+
+@vector_helper
+def _zero_mean_patch(image, x, y, patch):
+    """Patch about a pixel, its mean removed."""
+    total = np.float32(0.0)
+    for r in range(_SIDE):
+        for c in range(_SIDE):
+            patch[r, c] = image[y - _HALF + r, x - _HALF + c]
+            total += patch[r, c]
+    for r in range(_SIDE):
+        for c in range(_SIDE):
+            patch[r, c] -= total / np.float32(_SIDE * _SIDE)
+
+
+@vector_helper
+def _correlate(pixels, weights, stride, y, first, count, patch, own, scores):
+    """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`."""
+    for j in range(count):
+        scores[j] = np.float32(0.0)
+    for r in range(_SIDE):
+        start = np.uint64((y - _HALF + r) * stride + first - _HALF)
+        w0, w1, w2, w3, w4 = patch[r, 0], patch[r, 1], patch[r, 2], patch[r, 3], patch[r, 4]
+        w5, w6, w7, w8 = patch[r, 5], patch[r, 6], patch[r, 7], patch[r, 8]
+        for j in range(count):
+            k = start + np.uint64(j)
+            scores[j] += (
+                w0 * pixels[k] + w1 * pixels[k + np.uint64(1)] + w2 * pixels[k + np.uint64(2)]
+                + w3 * pixels[k + np.uint64(3)] + w4 * pixels[k + np.uint64(4)] + w5 * pixels[k + np.uint64(5)]
+                + w6 * pixels[k + np.uint64(6)] + w7 * pixels[k + np.uint64(7)] + w8 * pixels[k + np.uint64(8)]
+            )  # fmt: skip
+    at = np.uint64(y * stride + first)
+    for j in range(count):
+        scores[j] *= own * weights[at + np.uint64(j)]
+
+
+@helper
+def _best(scores, count):
+    """Column of the best score."""
+    best = 0
+    for j in range(1, count):
+        if scores[j] > scores[best]:
+            best = j
+    return best
+
+
+@helper
+def _rival(scores, count, best):
+    """Best score away from the best place."""
+    rival = np.float32(-1.0)
+    for j in range(count):
+        if scores[j] > rival and abs(j - best) > _NEIGHBOURS:
+            rival = scores[j]
+    return rival
+
+
+@helper
+def _search(pixels, weights, stride, rows, band, y, first, last, patch, own, scores):
+    """Best place of a patch in columns first..last of the rows within `band` of y: x, y, score and rival's score."""
+    count = last - first + 1
+    found, row, score, rival = -1, -1, np.float32(-1.0), np.float32(-1.0)
+    for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
+        _correlate(pixels, weights, stride, v, first, count, patch, own, scores)
+        best = _best(scores, count)
+        if scores[best] > score:
+            if abs(first + best - found) > _NEIGHBOURS:
+                rival = max(rival, score)
+            found, row, score = first + best, v, scores[best]
+        rival = max(rival, _rival(scores, count, found - first))
+    return found, row, score, rival
+
+
+def search_rows(
+    left: HalfImage,
+    right: HalfImage,
+    uv: NDArray[np.float64],
+    low: float,
+    high: float,
+    band: int,
+    min_correlation: float,
+    uniqueness: float,
+) -> NDArray[np.float64]:
+    """Right positions (N, 2) of left features to a pixel or two, by correlation along rows; NaN where there is none.
+
+    A place counts where it correlates with at least `min_correlation`, clearly better than any rival, and where
+    the search back from it, in the left image, ends within a pixel of where it began.
+
+    Args:
+        left: the rectified left image at half resolution.
+        right: the right one.
+        uv: left pixels (N, 2) at full resolution.
+        low: least disparity [px, full resolution].
+        high: largest disparity.
+        band: rows searched above and below the feature's own [half-resolution px].
+        min_correlation: least correlation.
+        uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
+    """
+    out = np.full((len(uv), 2), np.nan)
+    _search_rows(
+        left.pixels, left.weight, right.pixels, right.weight, uv, 0.5 * low, 0.5 * high, band, min_correlation,
+        uniqueness, out,
+    )  # fmt: skip
+    return out
+
+
+@kernel
+def _search_rows(left, left_weight, right, right_weight, uv, low, high, band, min_correlation, uniqueness, out):
+    """The same into `out`; disparities at half resolution."""
+    height, width = left.shape
+    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(width, np.float32)
+    a, aw, b, bw = left.reshape(-1), left_weight.reshape(-1), right.reshape(-1), right_weight.reshape(-1)
+    for i in range(len(uv)):
+        px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
+        x, y = int(np.rint(px)), int(np.rint(py))
+        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left_weight[y, x] == 0.0:
+            continue
+        first, last = max(_HALF, int(np.floor(x - high))), min(width - 1 - _HALF, int(np.ceil(x - low)))
+        if last <= first:
+            continue
+        _zero_mean_patch(left, x, y, patch)
+        found, row, score, rival = _search(b, bw, width, height, band, y, first, last, patch, left_weight[y, x], scores)
+        if score < min_correlation or 1.0 - score > uniqueness * (1.0 - rival):
+            continue
+        _zero_mean_patch(right, found, row, patch)
+        first, last = max(_HALF, int(np.floor(found + low))), min(width - 1 - _HALF, int(np.ceil(found + high)))
+        back, _, _, _ = _search(a, aw, width, height, band, row, first, last, patch, right_weight[row, found], scores)
+        if abs(back - x) <= 1:
+            out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5

@@ -1,0 +1,173 @@
+"""The SURF front end: a stereo frame in, features with stereo matches out."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frontends.surf.config import SurfConfig
+from frontends.surf.correlation import patch_windows, refine
+from frontends.surf.epipolar import half_image, search_rows
+from frontends.surf.images import FULL_SCALE, grey
+from frontends.surf.integral import integral_image
+from frontends.surf.selection import adapted_threshold, spread
+from frontends.surf.surf import Keypoints, Surf
+from slam.data import StereoFeatures, StereoFrame
+from slam.errors import ConfigurationError, SequenceError
+from slam.rig import StereoRig
+
+_SURPLUS = 1.35  # features detected for each one needed, to have a choice when spreading them
+_CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima
+_TRIES = 4  # detections at most in one image
+_REACH = 3.0  # largest sub-pixel correction along the row [px]
+_COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor
+_OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighbouring rows
+
+
+class SurfFrontend:
+    """Detects SURF features in the left image, matches them along epipolar lines, and refines the right pixels.
+
+    Args:
+        rig: the stereo rig; images that are not rectified are rectified inside, results are in the rig's own pixels.
+        config: settings.
+        mask: (H, W) in the left image of the rig; features lie where it is not zero.
+        **options: single settings, see `SurfConfig`.
+
+    Raises:
+        ConfigurationError: an option is unknown or out of its range.
+    """
+
+    def __init__(
+        self, rig: StereoRig, config: SurfConfig | None = None, mask: NDArray | None = None, **options: Any
+    ) -> None:
+        self.rig = rig
+        self.config = config = SurfConfig.with_options(config, **options)
+        self._surf = Surf(
+            config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
+        )
+        self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
+        self._windows = patch_windows()
+        self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
+
+    @property
+    def threshold(self) -> float:
+        """D_threshold for the next frame."""
+        return self._threshold
+
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        """Features of one stereo frame, see `slam.interfaces.Frontend`."""
+        pair = [frame.left] if frame.right is None else [frame.left, frame.right]
+        images = self._surf.workers.run([partial(self._image, frame, image, k) for k, image in enumerate(pair)])
+        left = images[0]
+        keypoints, descriptors, threshold = self._describe(left)
+        uv_right = np.full((len(keypoints), 2), np.nan)
+        if len(images) > 1:
+            uv_right = self._match(left, images[1], keypoints)
+        return self._features(frame.stamp, keypoints, uv_right, descriptors, threshold)
+
+    def _image(self, frame: StereoFrame, image: NDArray, side: int) -> NDArray:
+        """Grey, rectified image of the left (0) or right (1) camera."""
+        what = f"frame {frame.index}, {('left', 'right')[side]} image"
+        image = grey(image, what)
+        if image.shape != (self.rig.height, self.rig.width):
+            raise SequenceError(
+                f"{what}: {image.shape[1]}x{image.shape[0]} pixels, "
+                f"but the calibration is for {self.rig.width}x{self.rig.height}"
+            )
+        return self._rectify(image, side)
+
+    def _rectify(self, image: NDArray, side: int) -> NDArray:
+        """Image of the rectified twin's left (0) or right (1) camera."""
+        if self.rig.is_rectified:
+            return image
+        import cv2
+
+        maps = self.rig.rectified.maps[side]
+        return cv2.remap(image, maps.x, maps.y, cv2.INTER_LINEAR)
+
+    def _rectified_mask(self, mask: NDArray) -> NDArray[np.uint8]:
+        """The mask, 0 and 1, in the rectified left image."""
+        if mask.shape != (self.rig.height, self.rig.width):
+            size = "x".join(str(n) for n in mask.shape[::-1])
+            raise ConfigurationError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
+        return (self._rectify((mask != 0).astype(np.uint8), 0) != 0).astype(np.uint8)
+
+    def _detect(self, image: NDArray, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+        """Features, and the D_threshold that found them (paper A, III.A).
+
+        It was adapted after the last image. Should it still find less than half of what is wanted, as in the first
+        image or after the light went out, it is lowered at once.
+        """
+        c = self.config
+        target = int((_CHOICE if c.localise else 1.0) * _SURPLUS * c.features)
+        for _ in range(_TRIES):
+            threshold = self._threshold
+            keypoints = self._surf.detect_in(integral, FULL_SCALE[image.dtype], self._mask, threshold)
+            if c.adaptive:
+                self._threshold = adapted_threshold(threshold, len(keypoints), target, c.min_threshold, c.max_threshold)
+            if 2 * len(keypoints) >= target or self._threshold >= threshold:
+                break
+        return keypoints, threshold
+
+    def _describe(self, image: NDArray) -> tuple[Keypoints, NDArray[np.float32], float]:
+        """Spread and described features of the left image, and the D_threshold that found them."""
+        integral = integral_image(image)
+        keypoints, threshold = self._detect(image, integral)
+        if self.config.localise:
+            keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
+            keypoints = self._surf.localise_in(integral, keypoints, FULL_SCALE[image.dtype])
+        return *self._surf.describe_in(integral, self._spread(keypoints, self.config.features)), threshold
+
+    def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
+        """At most `limit` features, spread over the image."""
+        return keypoints.select(spread(keypoints.uv, limit, self.config.grid, self.rig.width, self.rig.height))
+
+    def _match(self, left: NDArray, right: NDArray, keypoints: Keypoints) -> NDArray[np.float64]:
+        """Right pixels (N, 2) of the left features in the rectified images, NaN where unmatched."""
+        c = self.config
+        low, high = self._disparities()
+        scale = FULL_SCALE[left.dtype], FULL_SCALE[right.dtype]
+        a, b = self._surf.workers.run([partial(half_image, left, scale[0]), partial(half_image, right, scale[1])])
+        left, right = left.astype(np.float32), right.astype(np.float32)
+        band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
+
+        def locate(first: int, last: int) -> NDArray[np.float64]:
+            """Right pixels of some of the features."""
+            uv, size = keypoints.uv[first:last], keypoints.size[first:last]
+            start = search_rows(a, b, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
+            return refine(left, right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._windows)
+
+        found = np.concatenate(self._surf.workers.over(len(keypoints), locate))
+        disparity = keypoints.uv[:, 0] - found[:, 0]
+        off_line = np.abs(found[:, 1] - keypoints.uv[:, 1]) > c.epipolar
+        found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan
+        return found
+
+    def _disparities(self) -> tuple[float, float]:
+        """Range of disparities [px] of the rectified pair for the range of depths."""
+        twin = self.rig.rectified.rig
+        shift = twin.left.u0 - twin.right.u0
+        product = twin.left.fu * twin.baseline
+        return product / self.config.max_depth + shift, product / self.config.min_depth + shift
+
+    def _features(
+        self,
+        stamp: float,
+        keypoints: Keypoints,
+        uv_right: NDArray,
+        descriptors: NDArray[np.float32],
+        threshold: float,
+    ) -> StereoFeatures:
+        """The features in pixels of the rig's own images."""
+        uv_left: NDArray = keypoints.uv
+        if not self.rig.is_rectified:
+            uv_left = self.rig.rectified.unrectify_left(uv_left)
+            uv_right = self.rig.rectified.unrectify_right(uv_right)
+        angle = np.zeros(len(keypoints)) if self.config.upright else keypoints.angle
+        return StereoFeatures(
+            stamp, uv_left, uv_right, keypoints.size, angle, keypoints.response, keypoints.laplacian, descriptors,
+            threshold,
+        )  # fmt: skip

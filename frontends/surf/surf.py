@@ -1,0 +1,260 @@
+"""The modified SURF of paper A (III.A, III.B), with the regular 64-D descriptor beside the 16-D one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frontends.surf.compilation import announce_compilation
+from frontends.surf.descriptor import describe, gaussian_weights
+from frontends.surf.detector import COLUMNS, detect_octave
+from frontends.surf.filters import Filters, layer_sizes, make_filters
+from frontends.surf.images import FULL_SCALE, binary_mask, grey
+from frontends.surf.integral import column_phases, integral_image
+from frontends.surf.localisation import first_of_each, localise
+from frontends.surf.orientation import DISC, orientations
+from frontends.surf.workers import Workers
+from slam.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    import cv2
+
+#: Angle of upright features [rad]: OpenCV's convention, 270 degrees.
+UPRIGHT_ANGLE = 1.5 * np.pi
+
+_REACH = 0.15  # furthest that localisation moves a feature, in units of its size
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Detected features, a row each, by falling response.
+
+    Attributes:
+        uv: pixels (N, 2), the centre of the first pixel at (0, 0).
+        size: diameter (N,) [px]: the side of the box filter that responded most.
+        angle: orientation (N,) [rad] in 0..2π, y down; `UPRIGHT_ANGLE` where upright; NaN where not measured.
+        response: determinant of the Hessian (N,), on OpenCV's scale for 8-bit images.
+        laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
+        octave: 0-based octave (N,) int8.
+    """
+
+    uv: NDArray[np.float64]
+    size: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    response: NDArray[np.float64]
+    laplacian: NDArray[np.int8]
+    octave: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def select(self, rows: NDArray) -> Keypoints:
+        """The features of these rows (a mask or indices)."""
+        return Keypoints(
+            self.uv[rows], self.size[rows], self.angle[rows], self.response[rows], self.laplacian[rows],
+            self.octave[rows],
+        )  # fmt: skip
+
+
+class Surf:
+    """Detects and describes SURF features.
+
+    Args:
+        threshold: D_threshold, the least determinant of the Hessian, on OpenCV's scale for 8-bit images.
+        octaves: 1 to 4. Paper A uses two.
+        layers: layers searched for maxima in each octave, 2 or 3.
+        descriptor: 16 (paper A) or 64 (regular) dimensions.
+        upright: leave the orientation out; better where the camera keeps its roll, as in stereo.
+        threads: number of threads; results do not depend on it.
+
+    Raises:
+        ConfigurationError: a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        threshold: float = 100.0,
+        octaves: int = 2,
+        layers: int = 2,
+        descriptor: int = 64,
+        upright: bool = True,
+        threads: int = 1,
+    ) -> None:
+        if not (np.isfinite(threshold) and threshold >= 0):
+            raise ConfigurationError(f"threshold: must be a number of at least 0, not {threshold}")
+        if octaves not in (1, 2, 3, 4):
+            raise ConfigurationError(f"octaves: must be 1 to 4, not {octaves}")
+        if layers not in (2, 3):
+            raise ConfigurationError(f"layers: must be 2 or 3, not {layers}")
+        if descriptor not in (16, 64):
+            raise ConfigurationError(f"descriptor: must be 16 or 64, not {descriptor}")
+        if not isinstance(threads, int) or threads < 1:
+            raise ConfigurationError(f"threads: must be a whole number of at least 1, not {threads}")
+        announce_compilation()
+        self.threshold = float(threshold)
+        self.octaves = octaves
+        self.layers = layers
+        self.descriptor = descriptor
+        self.upright = bool(upright)
+        self.workers = Workers(threads)
+        self._weights = gaussian_weights(4 if descriptor == 64 else 2)
+
+    def detect(self, image: NDArray, mask: NDArray | None = None, threshold: float | None = None) -> Keypoints:
+        """Features of an image (H, W) or (H, W, 3|4), uint8 or uint16, by falling response.
+
+        Args:
+            image: the image, of any size.
+            mask: (H, W); features lie where it is not zero.
+            threshold: D_threshold for this image alone.
+
+        Raises:
+            SequenceError: the image or the mask is unusable.
+        """
+        image = grey(image)
+        mask = None if mask is None else binary_mask(mask, image.shape)
+        return self.detect_in(integral_image(image), FULL_SCALE[image.dtype], mask, threshold)
+
+    def localise(self, image: NDArray, keypoints: Keypoints) -> Keypoints:
+        """Move features to the maxima of the response in continuous position and size.
+
+        They then stay in place when the image moves or grows: a tenth of a pixel instead of half a pixel when it
+        grows by a tenth. Those without a maximum near by (about a quarter) are left out; sizes are no whole numbers.
+
+        Raises:
+            SequenceError: the image is unusable.
+        """
+        image = grey(image)
+        return self.localise_in(integral_image(image), keypoints, FULL_SCALE[image.dtype])
+
+    def describe(self, image: NDArray, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
+        """Orient (unless upright) and describe features; those that cannot be oriented are left out.
+
+        Returns the features and their unit descriptors (N, 16 or 64) float32.
+
+        Raises:
+            SequenceError: the image is unusable.
+        """
+        return self.describe_in(integral_image(grey(image)), keypoints)
+
+    def detect_and_describe(self, image: NDArray, mask: NDArray | None = None) -> tuple[Keypoints, NDArray[np.float32]]:
+        """`detect` and `describe` in one."""
+        image = grey(image)
+        integral = integral_image(image)
+        mask = None if mask is None else binary_mask(mask, image.shape)
+        return self.describe_in(integral, self.detect_in(integral, FULL_SCALE[image.dtype], mask))
+
+    def detectAndCompute(
+        self, image: NDArray, mask: NDArray | None = None
+    ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
+        """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64)."""
+        import cv2
+
+        keypoints, descriptors = self.detect_and_describe(image, mask)
+        degrees = np.rad2deg(keypoints.angle)
+        rows = zip(keypoints.uv, keypoints.size, degrees, keypoints.response, keypoints.octave, keypoints.laplacian)
+        return tuple(
+            cv2.KeyPoint(float(uv[0]), float(uv[1]), float(size), float(angle), float(r), int(octave), int(sign))
+            for uv, size, angle, r, octave, sign in rows
+        ), descriptors
+
+    def detect_in(
+        self,
+        integral: NDArray[np.int32],
+        full_scale: float,
+        mask: NDArray[np.uint8] | None = None,
+        threshold: float | None = None,
+    ) -> Keypoints:
+        """`detect` on an integral image of pixels 0..full_scale, to share it between steps."""
+        limit = self.threshold if threshold is None else threshold
+        height, width = integral.shape[0] - 1, integral.shape[1] - 1
+        usable = [o for o in range(self.octaves) if min(width, height) >= layer_sizes(o, self.layers)[2]]
+        bank = [make_filters(o, self.layers, 255.0 / full_scale, width + 1) for o in usable]
+        phases = [partial(column_phases, integral, 1 << o) for o in usable[1:]]
+        first = self.workers.run(
+            phases + [task for f in bank[:1] for task in self._scans(integral, integral[None], f, 0, limit)]
+        )
+        rest = self.workers.run(
+            [task for o, p, f in zip(usable[1:], first, bank[1:]) for task in self._scans(integral, p, f, o, limit)]
+        )
+        rows = np.concatenate([np.zeros((0, COLUMNS)), *first[len(phases) :], *rest])
+        if mask is not None:
+            rows = rows[_mostly_inside(rows, mask)]
+        return _as_keypoints(rows[np.argsort(-rows[:, 3], kind="stable")])
+
+    def localise_in(self, integral: NDArray[np.int32], keypoints: Keypoints, full_scale: float) -> Keypoints:
+        """`localise` on an integral image of pixels 0..full_scale; of several that share a maximum one stays."""
+        x, y = np.ascontiguousarray(keypoints.uv.T)
+        size = np.ascontiguousarray(keypoints.size)
+        place = np.concatenate(
+            self.workers.over(len(x), lambda a, b: localise(integral, x[a:b], y[a:b], size[a:b], _REACH))
+        )
+        rows = np.flatnonzero(np.isfinite(place[:, 0]))
+        place = place[rows]
+        response = place[:, 3] * (255.0 / full_scale) ** 2
+        order = np.argsort(-response, kind="stable")
+        place, rows, response = place[order], rows[order], response[order]
+        x, y, size = np.ascontiguousarray(place[:, :3].T)
+        first = first_of_each(x, y, size)
+        rows = rows[first]
+        return Keypoints(
+            place[first, :2], size[first], keypoints.angle[rows], response[first], keypoints.laplacian[rows],
+            keypoints.octave[rows],
+        )  # fmt: skip
+
+    def describe_in(self, integral: NDArray[np.int32], keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
+        """`describe` on an integral image."""
+        x, y = np.ascontiguousarray(keypoints.uv.T)
+        size = np.ascontiguousarray(keypoints.size)
+        if self.upright:
+            angle = np.full(len(x), UPRIGHT_ANGLE)
+        else:
+            shares = self.workers.over(len(x), lambda a, b: orientations(integral, x[a:b], y[a:b], size[a:b], DISC))
+            angle = np.concatenate(shares)
+            good = np.isfinite(angle)
+            if not good.all():
+                return self.describe_in(integral, keypoints.select(good))
+        oriented = Keypoints(
+            keypoints.uv, keypoints.size, angle, keypoints.response, keypoints.laplacian, keypoints.octave
+        )
+        shares = self.workers.over(
+            len(x),
+            lambda a, b: describe(
+                integral, x[a:b], y[a:b], size[a:b], None if self.upright else angle[a:b], self._weights
+            ),
+        )
+        return oriented, np.concatenate(shares)
+
+    def _scans(
+        self, integral: NDArray[np.int32], phases: NDArray[np.int32], filters: Filters, octave: int, limit: float
+    ) -> list[Callable[[], NDArray[np.float64]]]:
+        """Searches of an octave, stripe by stripe; more than threads, as they do not take equally long."""
+        rows, threads = (integral.shape[0] - 1) >> octave, self.workers.threads
+        count = 1 if threads == 1 else max(1, min(2 * threads, rows // 32))
+        edges = [rows * k // count for k in range(count + 1)]
+        return [partial(detect_octave, integral, phases, filters, octave, limit, a, b) for a, b in pairwise(edges)]
+
+
+def _as_keypoints(rows: NDArray[np.float64]) -> Keypoints:
+    """Candidate rows of the detector as arrays of their own, angle not measured."""
+    return Keypoints(
+        np.ascontiguousarray(rows[:, :2]), rows[:, 2].copy(), np.full(len(rows), np.nan), rows[:, 3].copy(),
+        rows[:, 4].astype(np.int8), rows[:, 5].astype(np.int8),
+    )  # fmt: skip
+
+
+def _mostly_inside(rows: NDArray[np.float64], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Candidates at least half of whose filter square lies on the mask."""
+    sums = integral_image(mask)
+    half = 0.5 * rows[:, 2]
+    left = np.clip(np.rint(rows[:, 0] + 0.5 - half), 0, mask.shape[1]).astype(int)
+    right = np.clip(np.rint(rows[:, 0] + 0.5 + half), 0, mask.shape[1]).astype(int)
+    top = np.clip(np.rint(rows[:, 1] + 0.5 - half), 0, mask.shape[0]).astype(int)
+    bottom = np.clip(np.rint(rows[:, 1] + 0.5 + half), 0, mask.shape[0]).astype(int)
+    inside = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return 2 * inside >= np.maximum((right - left) * (bottom - top), 1)

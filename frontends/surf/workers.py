@@ -1,0 +1,41 @@
+"""Work on one image in several threads; what comes out does not depend on their number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+_SMALLEST_SHARE = 32  # items that are worth a thread
+
+
+class Workers:
+    """A few threads for kernels that let go of Python's global lock.
+
+    Args:
+        threads: number of threads, the caller's own included; with 1 everything runs in the caller.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool: ThreadPoolExecutor | None = None
+
+    def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
+        """Results of independent tasks, in their order."""
+        if self.threads == 1 or len(tasks) < 2:
+            return [task() for task in tasks]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.threads - 1, thread_name_prefix="surf")
+        futures = [self._pool.submit(task) for task in tasks[1:]]
+        first = tasks[0]()
+        # The caller takes what nobody has begun yet, from the far end.
+        results = [task() if future.cancel() else future for task, future in zip(tasks[:0:-1], futures[::-1])][::-1]
+        return [first, *(r.result() if isinstance(r, Future) else r for r in results)]
+
+    def over(self, count: int, function: Callable[[int, int], Any]) -> list[Any]:
+        """Results of ``function(first, last)`` on consecutive shares of `count` items."""
+        shares = max(1, min(self.threads, count // _SMALLEST_SHARE))
+        edges = [count * k // shares for k in range(shares + 1)]
+        return self.run([partial(function, a, b) for a, b in pairwise(edges)])

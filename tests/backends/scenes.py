@@ -1,0 +1,97 @@
+"""A tiny deterministic scene for the tests of back ends: a rig, a path, points, and what the rig sees of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam import se3
+from slam.data import Observations, UpdateReport
+from slam.interfaces import Backend
+from slam.models import MotionModel
+from slam.rig import StereoRig
+from slam.se3 import Array
+
+RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Truth and measurements: `poses` (F, 4, 4) T_world_left, the first the identity; `points` (N, 3) in the world."""
+
+    rig: StereoRig
+    stamps: Array
+    poses: Array
+    points: Array
+    observations: tuple[Observations, ...]
+
+    def __iter__(self) -> Iterator[tuple[float, Array, Observations]]:
+        return iter(zip(self.stamps, self.poses, self.observations))
+
+
+def path(frames: int, dt: float, velocity: Array, rate: Array) -> Array:
+    """Poses (F, 4, 4) of constant body velocity [m/s] and body rate [rad/s] from the identity."""
+    step = se3.exp(dt * np.concatenate([rate, velocity]))
+    poses = [np.eye(4)]
+    for _ in range(frames - 1):
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+def random_path(frames: int, dt: float, velocity: Array, motion: MotionModel, rng: np.random.Generator) -> Array:
+    """Poses (F, 4, 4) whose velocities walk randomly as `motion` says: world velocity, and body rate."""
+    T, v, w = np.eye(4), np.array(velocity, float), np.zeros(3)
+    poses = [T]
+    sigma_v, sigma_w = np.sqrt(motion.velocity_variance(dt))
+    for _ in range(frames - 1):
+        v, w = v + sigma_v * rng.standard_normal(3), w + sigma_w * rng.standard_normal(3)
+        T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
+        poses.append(T)
+    return np.array(poses)
+
+
+def cloud(poses: Array, count: int, rng: np.random.Generator, near: float = 3.0, far: float = 12.0) -> Array:
+    """`count` points (N, 3) in the world, each in view of a pose drawn from `poses`, between two depths [m]."""
+    depth = rng.uniform(near, far, count)
+    uv = rng.uniform((0, 0), (RIG.width - 1, RIG.height - 1), (count, 2))
+    rays = np.concatenate([RIG.left.normalise(uv), np.ones((count, 1))], axis=1) * depth[:, None]
+    chosen = poses[rng.integers(len(poses), size=count)]
+    return np.einsum("nij,nj->ni", chosen[:, :3, :3], rays) + chosen[:, :3, 3]
+
+
+def observe(T: Array, points: Array, sigma: float, rng: np.random.Generator, limit: int = 30) -> Observations:
+    """What the rig sees at pose `T` (4, 4): up to `limit` points in both images, the lowest ids, with noise [px]."""
+    local = se3.transform(se3.inverse(T), points)
+    left, right = RIG.project(local)
+    seen = np.flatnonzero((local[:, 2] > 0.5) & RIG.left.in_image(left) & RIG.right.in_image(right))[:limit]
+    noise = sigma * rng.standard_normal((2, len(seen), 2))
+    return Observations(seen.astype(np.int64), left[seen] + noise[0], right[seen] + noise[1])
+
+
+def scene(
+    poses: Array, points: int = 200, sigma: float = 0.5, dt: float = 0.1, seed: int = 0, limit: int = 30
+) -> Scene:
+    """A scene along `poses` [(F, 4, 4)] with `points` points and pixel noise `sigma` [px]."""
+    rng = np.random.default_rng(seed)
+    world = cloud(poses, points, rng)
+    observations = tuple(observe(T, world, sigma, rng, limit) for T in poses)
+    return Scene(RIG, dt * np.arange(len(poses)), poses, world, observations)
+
+
+def step(backend: Backend, stamp: float, seen: Observations, known: set[int]) -> UpdateReport:
+    """One frame: predict, update with what is known, add what is new and has a depth; `known` grows."""
+    backend.predict(stamp)
+    old = np.array([i in known for i in seen.ids], bool)
+    report = backend.update(seen.select(old))
+    new = ~old & np.isfinite(RIG.triangulate(seen.uv_left, seen.uv_right)).all(axis=1)
+    backend.add(seen.select(new))
+    known.update(seen.ids[new].tolist())
+    return report
+
+
+def run(backend: Backend, data: Scene) -> list[UpdateReport]:
+    """All frames of a scene through a back end."""
+    known: set[int] = set()
+    return [step(backend, stamp, seen, known) for stamp, _, seen in data]

@@ -1,0 +1,309 @@
+"""The filter's arithmetic, each part against the plain dense formula or finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from backends.ekf.angles import (
+    CANONICAL,
+    anchor,
+    attitude,
+    body_rate_derivative,
+    pose_jacobian,
+    reanchor,
+)
+from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.measurement import innovation_covariances, linearise, stacked
+from backends.ekf.solve import Problem, _iterate, gate, solve
+from slam import se3
+from slam.euler import angles, body_rate_matrix, rotation
+from slam.testing import GENERAL_RIG
+from tests.backends.scenes import RIG
+from tests.slam.numeric import jacobian
+
+ATTITUDES = [np.array(phi) for phi in ([0.0, 0, 0], [0.3, -0.7, 2.0], [1.5, 1.2, -3.0], [-2.0, -1.4, 0.5])]
+
+
+def positive(n: int, rng: np.random.Generator) -> np.ndarray:
+    A = rng.standard_normal((n, n))
+    return A @ A.T + np.eye(n)
+
+
+# --- the angles' world ---
+
+
+def test_the_camera_starts_level_in_the_angles_world():
+    R = se3.so3_exp(np.array([0.4, -0.8, 2.0]))
+    R_world_angles, phi = anchor(R)
+    np.testing.assert_allclose(attitude(R_world_angles, phi), R, atol=1e-12)
+    np.testing.assert_allclose(phi, [np.pi / 2, 0, np.pi / 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("axis, changes", [(1, 2), (0, 0), (2, 1)])  # heading: φz; up and down: φx; roll: φy
+def test_turning_about_one_camera_axis_changes_one_angle(axis, changes):
+    turn = np.zeros(3)
+    turn[axis] = 0.3
+    change = angles(CANONICAL @ se3.so3_exp(turn)) - angles(CANONICAL)
+    assert abs(change[changes]) == pytest.approx(0.3)
+    assert np.abs(np.delete(change, changes)).max() < 1e-12
+
+
+@pytest.mark.parametrize("phi", ATTITUDES)
+def test_the_pose_jacobian_is_the_derivative(phi):
+    world, r = se3.so3_exp(np.array([0.2, 1.0, -0.4])), np.array([1.0, -2.0, 3.0])
+    T = se3.pose(attitude(world, phi), r)
+
+    def perturbation(x):
+        R = attitude(world, x[3:])
+        return np.concatenate([se3.so3_log(T[:3, :3].T @ R), T[:3, :3].T @ (x[:3] - r)])
+
+    expected = jacobian(perturbation, np.concatenate([r, phi]))
+    np.testing.assert_allclose(pose_jacobian(T[:3, :3], phi), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("phi", ATTITUDES)
+def test_the_body_rate_derivative(phi):
+    omega = np.array([0.7, -1.1, 0.4])
+    expected = jacobian(lambda x: body_rate_matrix(x) @ omega, phi)
+    np.testing.assert_allclose(body_rate_derivative(phi, omega), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("phi", ATTITUDES)
+def test_a_new_angles_world_is_the_same_state(phi):
+    rng = np.random.default_rng(0)
+    world, state = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(12)
+    state[3:6] = phi
+    new_world, new, _ = reanchor(world, state)
+    np.testing.assert_allclose(attitude(new_world, new[3:6]), attitude(world, phi), atol=1e-12)
+    body = body_rate_matrix(phi) @ state[9:12]
+    np.testing.assert_allclose(body_rate_matrix(new[3:6]) @ new[9:12], body, atol=1e-12)
+    np.testing.assert_array_equal(new[[0, 1, 2, 6, 7, 8]], state[[0, 1, 2, 6, 7, 8]])
+
+
+@pytest.mark.parametrize("phi", ATTITUDES)
+def test_the_jacobian_of_a_new_angles_world(phi):
+    rng = np.random.default_rng(1)
+    world, state = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(12)
+    state[3:6] = phi
+    new_world, _, J = reanchor(world, state)
+
+    def moved(x):  # the same change of variables with the new world held fixed
+        after = x.copy()
+        after[3:6] = angles(new_world.T @ attitude(world, x[3:6]))
+        after[9:12] = np.linalg.solve(body_rate_matrix(after[3:6]), body_rate_matrix(x[3:6]) @ x[9:12])
+        return after
+
+    np.testing.assert_allclose(J, jacobian(moved, state), atol=1e-7)
+
+
+# --- measurements ---
+
+
+@pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
+@pytest.mark.parametrize("phi", ATTITUDES)
+def test_measurement_jacobians(rig, phi):
+    rng = np.random.default_rng(2)
+    world, r = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(3)
+    h = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
+    points = h @ attitude(world, phi).T + r
+    line = linearise(rig, world, np.concatenate([r, phi]), points)
+    np.testing.assert_allclose(line.z, rig.project_stereo(h)[0], atol=1e-9)
+
+    def measured(x):
+        return linearise(rig, world, x[:6], x[6:].reshape(-1, 3)).z
+
+    x = np.concatenate([r, phi, points.reshape(-1)])
+    everything = np.ones((5, 3), bool)
+    np.testing.assert_allclose(stacked(line, everything), jacobian(measured, x), rtol=1e-6, atol=1e-5)
+
+
+def test_rows_not_measured_are_zero():
+    line = linearise(RIG, np.eye(3), np.zeros(6), np.array([[0.1, 0.2, 5.0], [0.3, -0.1, -4.0]]))
+    rows = np.array([[True, True, False], [False] * 3])
+    H = stacked(line, rows)
+    assert np.isfinite(H).all() and (H[2:] == 0).all() and (H[:2, :9] != 0).any(axis=1).all()
+
+
+def test_innovation_covariances_are_blocks_of_the_dense_ones():
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-1, -1, 4), (1, 1, 10), (4, 3))
+    line = linearise(RIG, np.eye(3), np.zeros(6), points)
+    P = positive(6 + 12, rng)
+    H = stacked(line, np.ones((4, 3), bool))
+    S = H @ P @ H.T + 0.25 * np.eye(12)
+    cross = P[6:, :6].reshape(4, 3, 6)
+    blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
+    found = innovation_covariances(line, P[:6, :6], cross, blocks, 0.5)
+    for i in range(4):
+        np.testing.assert_allclose(found[i], S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-9)
+
+
+# --- the covariance matrix ---
+
+
+def grown(landmarks: int, rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
+    """A covariance with landmarks, and the same as a dense matrix."""
+    camera = positive(CAMERA, rng)
+    covariance, dense = Covariance(camera), camera
+    while covariance.count < landmarks:
+        count = min(7, landmarks - covariance.count)
+        J = rng.standard_normal((count, 3, 6))
+        noise = np.array([positive(3, rng) for _ in range(count)])
+        covariance.append(J, noise)
+        dense = augmented(dense, J, noise)
+    return covariance, dense
+
+
+def augmented(P: np.ndarray, J: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    F = np.zeros((3 * len(J), len(P)))
+    F[:, :6] = J.reshape(-1, 6)
+    own = F @ P @ F.T
+    for i, block in enumerate(noise):
+        own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
+    return np.block([[P, P @ F.T], [F @ P, own]])
+
+
+def columns_of(slots) -> np.ndarray:
+    return np.concatenate([np.arange(6), *[CAMERA + 3 * s + np.arange(3) for s in slots]])
+
+
+def test_augmentation_has_the_full_cross_covariance():
+    covariance, dense = grown(40, np.random.default_rng(4))
+    np.testing.assert_allclose(covariance.full(), dense, rtol=1e-12)
+    assert covariance.count == 40 and covariance.size == 132 <= covariance.capacity
+
+
+def test_parts_of_the_matrix():
+    covariance, dense = grown(23, np.random.default_rng(5))
+    slots = np.array([4, 0, 22, 11])
+    np.testing.assert_allclose(covariance.camera, dense[:CAMERA, :CAMERA], rtol=1e-12)
+    np.testing.assert_allclose(covariance.pose, dense[:6, :6], rtol=1e-12)
+    for block, cross, s in zip(covariance.blocks(slots), covariance.cross(slots), slots):
+        rows = slice(CAMERA + 3 * s, CAMERA + 3 * s + 3)
+        np.testing.assert_allclose(block, dense[rows, rows], rtol=1e-12)
+        np.testing.assert_allclose(cross, dense[rows, :6], rtol=1e-12)
+    G = covariance.gather(slots)
+    assert G.flags.f_contiguous and (G[covariance.size :] == 0).all()
+    np.testing.assert_allclose(G[: covariance.size], dense[:, columns_of(slots)], rtol=1e-12)
+
+
+def test_moving_the_camera_is_the_printed_prediction():
+    covariance, dense = grown(9, np.random.default_rng(6))
+    dt, noise = 0.3, positive(CAMERA, np.random.default_rng(7))
+    A = np.eye(len(dense))
+    A[:3, 6:9] = A[3:6, 9:12] = dt * np.eye(3)
+    dense = A @ dense @ A.T
+    dense[:CAMERA, :CAMERA] += noise
+    covariance.move_camera(dt, noise)
+    np.testing.assert_allclose(covariance.full(), dense, rtol=1e-11, atol=1e-12)
+
+
+def test_a_change_of_the_cameras_state():
+    covariance, dense = grown(9, np.random.default_rng(8))
+    J = np.eye(len(dense))
+    J[:CAMERA, :CAMERA] = np.random.default_rng(9).standard_normal((CAMERA, CAMERA))
+    covariance.transform_camera(J[:CAMERA, :CAMERA])
+    np.testing.assert_allclose(covariance.full(), J @ dense @ J.T, rtol=1e-11, atol=1e-11)
+
+
+def test_subtraction():
+    covariance, dense = grown(20, np.random.default_rng(10))
+    W = np.zeros((covariance.capacity, 5), order="F")
+    W[: covariance.size] = 0.1 * np.random.default_rng(11).standard_normal((covariance.size, 5))
+    covariance.subtract(W)
+    n = covariance.size
+    np.testing.assert_allclose(covariance.full(), dense - W[:n] @ W[:n].T, rtol=1e-12, atol=1e-12)
+
+
+def test_landmarks_come_and_go():
+    rng = np.random.default_rng(12)
+    covariance, dense = grown(300, rng)
+    largest = covariance.capacity
+    order = list(range(300))  # which landmark each slot holds
+    for _ in range(260):
+        slot = int(rng.integers(len(order)))
+        covariance.drop(slot)
+        order[slot] = order[-1]
+        order.pop()
+    rows = np.concatenate([np.arange(CAMERA), *[CAMERA + 3 * i + np.arange(3) for i in order]])
+    expected = dense[np.ix_(rows, rows)]
+    np.testing.assert_allclose(covariance.full(), expected, rtol=1e-9, atol=1e-11)
+    assert covariance.capacity < largest / 3, "memory follows the map down"
+    J, noise = rng.standard_normal((50, 3, 6)), np.tile(np.eye(3), (50, 1, 1))
+    covariance.append(J, noise)
+    np.testing.assert_allclose(covariance.full(), augmented(expected, J, noise), rtol=1e-9, atol=1e-11)
+    covariance.drop(covariance.count - 1)
+    np.testing.assert_allclose(covariance.full(), augmented(expected, J[:-1], noise[:-1]), rtol=1e-9, atol=1e-11)
+
+
+def test_the_papers_angles_are_the_ones_of_the_state():
+    # R(φ) = Rz Ry Rx, with the world turned: the filter's attitude is the printed matrix times a constant
+    phi = np.array([0.3, -0.2, 0.9])
+    np.testing.assert_allclose(attitude(np.eye(3), phi), rotation(phi), atol=1e-15)
+
+
+# --- the update on the gathered state ---
+
+
+def far_off(iterations: int, guess: bool = False) -> Problem:
+    """An update whose prior is 1.5 m and 0.15 rad off, with points at 4 to 8 m."""
+    rng = np.random.default_rng(13)
+    world, phi = anchor(np.eye(3))
+    points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
+    truth = np.concatenate([[0.3, -0.2, 1.5], phi + np.array([0.05, 0.15, -0.1])])
+    z = linearise(RIG, world, truth, points).z + 0.5 * rng.standard_normal((12, 3))
+    prior = np.concatenate([np.zeros(3), phi, points.reshape(-1)])
+    prior[6:] += 0.05 * rng.standard_normal(36)
+    P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.full(36, 0.05**2)]))
+
+    def at(x):
+        return linearise(RIG, world, x[:6], x[6:].reshape(-1, 3))
+
+    return Problem(prior, P, z, 0.5, at, iterations, 0.9999, truth - prior[:6] if guess else None)
+
+
+def cost(problem: Problem, x: np.ndarray) -> float:
+    d = x - problem.prior
+    residual = (problem.z - problem.linearise(x).z).reshape(-1) / problem.sigma
+    return float(d @ np.linalg.solve(problem.covariance, d) + residual @ residual)
+
+
+@pytest.mark.parametrize("guess", [False, True])
+def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch):
+    monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-6)
+    problem = far_off(30, guess)
+    solution = solve(problem, replace(gate(problem), used=np.ones(12, bool)))
+    x = problem.prior + problem.covariance @ solution.s
+    deviation = np.sqrt(np.diag(problem.covariance))
+
+    def residuals(step):  # whitened by the prior, so that a general solver has an easy time
+        x = problem.prior + deviation * step
+        return np.concatenate([step, ((problem.z - problem.linearise(x).z) / problem.sigma).reshape(-1)])
+
+    best = least_squares(residuals, np.zeros(42), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(x, problem.prior + deviation * best.x, atol=1e-5)
+    assert solution.nis == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
+
+
+def test_more_iterations_never_raise_the_cost():
+    costs = []
+    for iterations in (2, 3, 5, 8):
+        problem = far_off(iterations)
+        solution = solve(problem, replace(gate(problem), used=np.ones(12, bool)))
+        costs.append(cost(problem, problem.prior + problem.covariance @ solution.s))
+    assert costs[0] < cost(problem, problem.prior) and (np.diff(costs) <= 1e-9).all()
+    assert costs[-1] < 2 * 36
+
+
+def test_conditional_distances_are_what_leaving_out_would_change():
+    """A landmark's squared distance from what the others predict is the fall of the NIS when it is left out."""
+    problem = far_off(1)
+    everything = np.ones(12, bool)
+    whole = _iterate(problem, everything, gate(problem).start, None)
+    for j in (0, 5, 11):
+        without = _iterate(problem, np.arange(12) != j, gate(problem).start, None)
+        assert whole.nis - without.nis == pytest.approx(whole.distances[j], rel=1e-6)

@@ -1,0 +1,188 @@
+"""The front end as the system calls it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import frontends
+from frontends.surf import SurfConfig, SurfFrontend
+from slam.data import StereoFrame
+from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.interfaces import Frontend
+from slam.rig import StereoRig
+from tests.frontends.scenes import stereo_pair
+
+RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
+LEFT, RIGHT = stereo_pair(12.0)
+BLACK = np.zeros((240, 320), np.uint8)
+
+
+def bytes_of(features):
+    arrays = (
+        features.uv_left, features.uv_right, features.scale, features.angle, features.response, features.laplacian,
+        features.descriptors,
+    )  # fmt: skip
+    return b"".join(a.tobytes() for a in arrays) + np.float64(features.threshold).tobytes()
+
+
+def test_by_name():
+    assert "surf" in frontends.names()
+    frontend = frontends.create("surf", RIG, features=123)
+    assert isinstance(frontend, Frontend)
+    assert frontend.config.features == 123
+    with pytest.raises(UnknownNameError, match="surf"):
+        frontends.create("sift", RIG)
+
+
+def test_fields():
+    features = SurfFrontend(RIG, features=150).extract(StereoFrame(3, 1.5, LEFT, RIGHT))
+    assert features.stamp == 1.5
+    assert 100 < len(features) <= 150
+    assert features.descriptors.shape == (len(features), 64)
+    assert features.descriptors.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+    assert features.laplacian.dtype == np.int8
+    assert set(features.laplacian) == {-1, 1}
+    assert (features.angle == 0).all()
+    assert (np.diff(features.response) <= 0).all()
+    assert features.response.min() > 0.5 * features.threshold
+    assert np.isfinite(features.uv_left).all()
+    assert np.isnan(features.uv_right).any(axis=1).tolist() == np.isnan(features.uv_right).all(axis=1).tolist()
+
+
+@pytest.mark.parametrize("options", [{}, {"upright": False, "descriptor": 16}, {"localise": False}])
+def test_same_bytes_whatever_the_threads(options):
+    runs = []
+    for threads in (1, 2, 5):
+        frontend = SurfFrontend(RIG, threads=threads, **options)
+        runs.append([bytes_of(frontend.extract(StereoFrame(k, float(k), LEFT, RIGHT))) for k in range(3)])
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_nothing_to_see():
+    frontend = SurfFrontend(RIG)
+    assert len(frontend.extract(StereoFrame(0, 0.0, BLACK, BLACK))) == 0
+    # The next image does not suffer from it: D_threshold is found anew at once.
+    assert len(frontend.extract(StereoFrame(1, 0.1, LEFT, RIGHT))) > 100
+    assert not SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, BLACK)).has_stereo.any()
+
+
+def test_missing_right_image():
+    features = SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, None))
+    assert len(features) > 100
+    assert not features.has_stereo.any()
+
+
+def test_colour_and_16_bit():
+    plain = SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, RIGHT))
+    colour = StereoFrame(0, 0.0, np.dstack([LEFT] * 3), np.dstack([RIGHT] * 4))
+    assert bytes_of(SurfFrontend(RIG).extract(colour)) == bytes_of(plain)
+    deep = StereoFrame(0, 0.0, LEFT.astype(np.uint16) * 257, RIGHT.astype(np.uint16) * 257)
+    features = SurfFrontend(RIG).extract(deep)
+    assert len(features) == pytest.approx(len(plain), rel=0.02)
+    assert features.has_stereo.mean() == pytest.approx(plain.has_stereo.mean(), abs=0.02)
+
+
+def test_mask():
+    mask = np.zeros((240, 320), np.uint8)
+    mask[120:] = 1
+    features = SurfFrontend(RIG, mask=mask).extract(StereoFrame(0, 0.0, LEFT, RIGHT))
+    assert len(features) > 30
+    assert features.uv_left[:, 1].min() > 115  # localisation may move a feature by a sixth of its size
+    assert len(SurfFrontend(RIG, mask=BLACK).extract(StereoFrame(0, 0.0, LEFT, RIGHT))) == 0
+    with pytest.raises(ConfigurationError, match="mask: 10x10"):
+        SurfFrontend(RIG, mask=np.ones((10, 10)))
+
+
+def test_threshold_keeps_the_number_of_features():
+    frontend = SurfFrontend(RIG, features=100)
+    counts, thresholds = [], []
+    for k in range(16):
+        contrast = 1.0 if k < 8 else 0.3
+        left = (120 + contrast * (LEFT.astype(float) - 120)).astype(np.uint8)
+        features = frontend.extract(StereoFrame(k, 0.1 * k, left, None))
+        counts.append(len(features))
+        thresholds.append(features.threshold)
+    assert min(counts) >= 95
+    # Responses go with the fourth power of the contrast: 0.3 to the fourth is 1/123.
+    assert thresholds[15] < 0.2 * thresholds[7]
+    assert thresholds[6] == thresholds[7]
+    assert thresholds[14] == thresholds[15]
+    fixed = SurfFrontend(RIG, adaptive=False, threshold=777).extract(StereoFrame(0, 0.0, LEFT, None))
+    assert fixed.threshold == 777
+
+
+def test_features_are_spread():
+    busy = BLACK.copy() + 120
+    busy[:, :100] = LEFT[:, :100]
+    busy[:, 100:] = (120 + 0.3 * (LEFT[:, 100:].astype(float) - 120)).astype(np.uint8)
+    features = SurfFrontend(RIG, features=120, grid=(6, 4)).extract(StereoFrame(0, 0.0, busy, None))
+    share = (features.uv_left[:, 0] < 100).mean()
+    assert share < 0.6  # a third of the area; without the grid it takes nearly all
+    alone = SurfFrontend(RIG, features=120, grid=(1, 1)).extract(StereoFrame(0, 0.0, busy, None))
+    assert (alone.uv_left[:, 0] < 100).mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "says"),
+    [
+        (LEFT[:100], RIGHT, "frame 7, left image: 320x100 pixels, but the calibration is for 320x240"),
+        (LEFT, RIGHT[:, :100], "frame 7, right image: 100x240 pixels"),
+        (LEFT.astype(float), RIGHT, "frame 7, left image: pixels must be uint8 or uint16, not float64"),
+    ],
+)
+def test_unusable_images(left, right, says):
+    with pytest.raises(SequenceError, match=says):
+        SurfFrontend(RIG).extract(StereoFrame(7, 0.0, left, right))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"colour": 1}, "colour: not an option of the surf front end; known: features, "),
+        ({"features": 0}, "features: "),
+        ({"features": 10.5}, "features: "),
+        ({"features": "many"}, "features: "),
+        ({"threshold": float("nan")}, "threshold: "),
+        ({"descriptor": 32}, "descriptor: must be one of"),
+        ({"upright": 1.0}, "upright: "),
+        ({"grid": (0, 3)}, "grid: "),
+        ({"grid": 4}, "grid: "),
+        ({"min_depth": 5, "max_depth": 2}, "min_depth: "),
+        ({"min_threshold": 50, "max_threshold": 20}, "min_threshold: "),
+        ({"threads": 0}, "threads: "),
+        ({"threads": 1.5}, "threads: "),
+    ],
+)
+def test_bad_options_name_their_key(options, says):
+    with pytest.raises(ConfigurationError, match=f"^{says}"):
+        SurfFrontend(RIG, **options)
+
+
+def test_options_override_a_configuration():
+    config = SurfConfig(features=50, descriptor=16)
+    frontend = SurfFrontend(RIG, config, features=70)
+    assert (frontend.config.features, frontend.config.descriptor) == (70, 16)
+    assert config.features == 50
+
+
+FIRST_USE = """
+import numpy as np
+from frontends.surf import Surf
+image = np.random.default_rng(0).integers(0, 255, (40, 40), np.uint8)
+assert len(Surf(0, octaves=1).detect(image)) > 0
+"""
+
+
+def test_first_use_says_why_it_takes_long_and_later_ones_do_not(tmp_path):
+    run = [sys.executable, "-c", FIRST_USE]
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": ":".join(filter(None, sys.path))}
+    first, second = (
+        subprocess.run(run, env=environment, capture_output=True, text=True, check=True).stderr for _ in range(2)
+    )
+    assert "compiling the SURF kernels" in first
+    assert "compiling" not in second

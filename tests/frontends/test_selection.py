@@ -1,0 +1,63 @@
+"""The adaptive D_threshold and the spreading over the image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from frontends.surf.selection import adapted_threshold, spread
+
+
+def counter(total, steepness):
+    """Number of features by threshold, of a scene with `total` features at threshold 1."""
+    return lambda threshold: round(total * max(threshold, 1.0) ** -steepness)
+
+
+@pytest.mark.parametrize("steepness", [0.3, 0.6, 1.0, 1.6])
+@pytest.mark.parametrize("start", [5.0, 300.0, 20000.0])
+def test_settles_without_swinging(steepness, start):
+    scene = counter(1000 * 300**steepness, steepness)
+    threshold, path = start, []
+    for _ in range(40):
+        path.append(threshold)
+        threshold = adapted_threshold(threshold, scene(threshold), 1000, 1.0, 1e6)
+    assert 0.84 < scene(threshold) / 1000 < 1.16
+    assert path[-1] == path[-5]  # it stands still
+    side = np.sign(np.diff(np.log(path)))
+    assert (side[:-1] * side[1:] < 0).sum() <= 1  # it passes the mark once at most
+
+
+def test_limits_hold():
+    assert adapted_threshold(10, 0, 100, 5, 1000) == 5
+    assert adapted_threshold(900, 10_000, 100, 5, 1000) == 1000
+    assert adapted_threshold(0.0, 10_000, 100, 0, 1000) > 0
+
+
+def test_small_errors_are_left_alone():
+    assert adapted_threshold(300, 1100, 1000, 5, 1000) == 300
+    assert adapted_threshold(300, 900, 1000, 5, 1000) == 300
+
+
+def test_no_cell_takes_all():
+    rng = np.random.default_rng(0)
+    poster = rng.uniform((0, 0), (40, 40), (500, 2))  # the strongest 500 lie in one corner
+    rest = rng.uniform((0, 0), (320, 240), (500, 2))
+    uv = np.concatenate([poster, rest])
+    kept = spread(uv, 200, (8, 6), 320, 240)
+    assert len(kept) == 200
+    assert (np.diff(kept) > 0).all()
+    assert (kept < 500).mean() < 0.15
+    cells = set(map(tuple, (uv[kept] // 40).astype(int)))
+    assert len(cells) == 48
+
+
+def test_what_poor_cells_leave_goes_to_the_strongest():
+    rng = np.random.default_rng(0)
+    uv = rng.uniform((0, 0), (40, 40), (500, 2))
+    assert np.array_equal(spread(uv, 200, (8, 6), 320, 240), np.arange(200))
+
+
+def test_fewer_than_the_limit_all_stay():
+    uv = np.random.default_rng(0).uniform((-1, -1), (321, 241), (50, 2))
+    assert np.array_equal(spread(uv, 50, (8, 6), 320, 240), np.arange(50))
+    assert len(spread(np.zeros((0, 2)), 50, (8, 6), 320, 240)) == 0

@@ -1,0 +1,105 @@
+"""Stereo matches on pairs with known disparity, rectified and not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from frontends.surf import SurfFrontend
+from slam import se3
+from slam.camera import PinholeCamera
+from slam.data import StereoFrame
+from slam.rig import StereoRig
+from tests.frontends.scenes import photograph, stereo_pair, texture
+
+RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
+
+
+@pytest.mark.parametrize("disparity", [2.5, 12.0, 12.25, 37.75])
+def test_disparity_of_a_wall(disparity):
+    left, right = stereo_pair(disparity)
+    features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, left, right))
+    inside = features.uv_left[:, 0] > disparity + 25  # the rest has no counterpart in the right image
+    assert inside.sum() > 60
+    assert features.has_stereo[inside].mean() > 0.95
+    errors = (features.uv_left - features.uv_right)[features.has_stereo] - (disparity, 0.0)
+    assert np.median(np.abs(errors[:, 0])) < 0.05  # a bar of 0.15 px, with room
+    assert np.median(np.abs(errors[:, 1])) < 0.05
+    assert (np.abs(errors) < 0.5).all(axis=1).mean() > 0.98
+
+
+def test_unlike_exposure():
+    left, right = stereo_pair(12.25)
+    right = np.clip(0.6 * right + 40, 0, 255).astype(np.uint8)
+    features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, left, right))
+    assert features.has_stereo.mean() > 0.8
+    disparity = (features.uv_left - features.uv_right)[features.has_stereo, 0]
+    assert np.median(np.abs(disparity - 12.25)) < 0.05
+
+
+def test_range_of_depths():
+    left, right = stereo_pair(12.0)
+    frame = StereoFrame(0, 0.0, left, right)
+    depth = 260 * 0.12 / 12.0
+    assert SurfFrontend(RIG, min_depth=0.9 * depth, max_depth=1.1 * depth).extract(frame).has_stereo.mean() > 0.8
+    for limits in ({"min_depth": 1.1 * depth}, {"max_depth": 0.9 * depth}):
+        # A wrong place within the range may correlate by chance.
+        assert SurfFrontend(RIG, **limits).extract(frame).has_stereo.mean() < 0.02
+
+
+def test_unlike_rows_need_a_wider_band():
+    left, right = stereo_pair(12.0)
+    right = np.roll(right, 4, axis=0)
+    frame = StereoFrame(0, 0.0, left, right)
+    assert SurfFrontend(RIG).extract(frame).has_stereo.mean() < 0.02
+    features = SurfFrontend(RIG, epipolar=5.0).extract(frame)
+    assert features.has_stereo.mean() > 0.8
+    assert np.nanmedian((features.uv_right - features.uv_left)[:, 1]) == pytest.approx(4.0, abs=0.05)
+
+
+def test_repeated_texture_gives_no_match():
+    tile = photograph(texture(240, 40, seed=3))
+    wall = np.tile(tile, (1, 8))
+    features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, wall, np.roll(wall, -12, axis=1)))
+    several = features.uv_left[:, 0] > 70  # with one place in reach there is nothing to mistake it for
+    assert several.sum() > 60
+    assert features.has_stereo[several].mean() < 0.05
+
+
+def test_another_scene_gives_no_match():
+    left, _ = stereo_pair(12.0, seed=1)
+    _, right = stereo_pair(12.0, seed=5)
+    features = SurfFrontend(RIG, features=200).extract(StereoFrame(0, 0.0, left, right))
+    assert len(features) > 60
+    assert features.has_stereo.mean() < 0.02
+
+
+def seen_wall(camera, T_camera_left, wall, scale, depth):
+    """Photograph of a plane at z = depth [m] of the left camera, `scale` pixels of texture a metre."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    xy = camera.normalise(np.stack([u.ravel(), v.ravel()], axis=1).astype(float))
+    T_left_camera = se3.inverse(T_camera_left)
+    rays = np.c_[xy, np.ones(len(xy))] @ T_left_camera[:3, :3].T
+    origin = T_left_camera[:3, 3]
+    points = origin + rays * ((depth - origin[2]) / rays[:, 2])[:, None]
+    x, y = (points[:, :2] * scale + np.array(wall.shape[::-1]) / 2).T.astype(np.float32)
+    seen = cv2.remap(wall, x.reshape(u.shape), y.reshape(u.shape), cv2.INTER_CUBIC)
+    return photograph(seen, noise=1.0)
+
+
+def test_distorted_and_turned_cameras():
+    left = PinholeCamera(300.0, 298.0, 162.0, 118.0, 320, 240, "radtan", (-0.28, 0.07, 2e-4, 2e-5))
+    right = PinholeCamera(299.0, 301.0, 158.0, 123.0, 320, 240, "radtan", (-0.27, 0.06, -1e-4, 1e-4))
+    rig = StereoRig(left, right, se3.so3_exp(np.array([0.01, -0.02, 0.015])), np.array([-0.11, 0.004, -0.003]))
+    wall, depth = texture(1200, 1400, seed=2, finest=3.0), 2.0
+    images = [seen_wall(camera, T, wall, 400, depth) for camera, T in ((left, np.eye(4)), (right, rig.T_right_left))]
+    features = SurfFrontend(rig, features=300).extract(StereoFrame(0, 0.0, *images))
+    assert len(features) > 100
+    assert features.has_stereo.mean() > 0.8
+    # Raw pixels: triangulated with the rig's own general model, they lie on the wall.
+    points = rig.triangulate(features.uv_left, features.uv_right)[features.has_stereo]
+    assert np.median(points[:, 2]) == pytest.approx(depth, rel=0.005)
+    _, expected = rig.project(points * (depth / points[:, 2])[:, None])
+    errors = np.abs(features.uv_right[features.has_stereo] - expected)
+    assert (np.median(errors, axis=0) < 0.1).all()

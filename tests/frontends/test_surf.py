@@ -1,0 +1,246 @@
+"""Detection and description: what does not need the reference."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from frontends.surf import Keypoints, Surf
+from slam.errors import ConfigurationError, SequenceError
+from tests.frontends.scenes import photograph, texture, warped, zoom_about
+
+VALUES = texture(240, 320)
+IMAGE = photograph(VALUES)
+
+
+def same_features(a, b):
+    return all(
+        np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        for name in ("uv", "size", "angle", "response", "laplacian", "octave")
+    )
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return Surf(300).detect_and_describe(IMAGE)
+
+
+def read_only(image):
+    image = image.copy()
+    image.flags.writeable = False
+    return image
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        read_only,
+        np.asfortranarray,
+        lambda image: image[::-1][::-1],
+        lambda image: np.repeat(image, 2, axis=1)[:, ::2],
+        lambda image: image[:, :, None],
+        lambda image: np.dstack([image] * 3),
+        lambda image: np.dstack([image, image, image, np.full_like(image, 7)]),
+    ],
+)
+def test_layouts_give_the_same_bytes(plain, change):
+    keypoints, descriptors = Surf(300).detect_and_describe(change(IMAGE))
+    assert same_features(keypoints, plain[0])
+    assert descriptors.tobytes() == plain[1].tobytes()
+
+
+@pytest.mark.parametrize("kind", ["<u2", ">u2"])
+def test_16_bit_images_are_on_the_scale_of_8_bit_ones(plain, kind):
+    keypoints, descriptors = Surf(300).detect_and_describe((IMAGE.astype(np.uint16) * 257).astype(kind))
+    assert len(keypoints) == len(plain[0])
+    # Only the rounding of single-precision products differs.
+    np.testing.assert_allclose(keypoints.uv, plain[0].uv, atol=1e-3)
+    np.testing.assert_allclose(keypoints.response, plain[0].response, rtol=1e-4)
+    np.testing.assert_allclose(descriptors, plain[1], atol=1e-3)
+
+
+def test_sums_beyond_32_bits_wrap_around_harmlessly():
+    bright = np.full((600, 600), 60000, np.uint16)
+    bright[180:420, 140:460] = IMAGE[:240, :320].astype(np.uint16) + 59000
+    assert int(bright.sum(dtype=np.int64)) > 2**32
+    dim = bright - np.uint16(59000)
+    for upright in (True, False):
+        a = Surf(0.01, upright=upright).detect_and_describe(bright)
+        b = Surf(0.01, upright=upright).detect_and_describe(dim)
+        assert len(a[0]) == len(b[0]) > 100
+        # Cell sums are single-precision: a pedestal 200 times the contrast costs as much of their 24 bits.
+        np.testing.assert_allclose(a[1], b[1], atol=5e-3)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("descriptor", [16, 64])
+def test_threads_do_not_change_a_byte(upright, descriptor):
+    one, *others = [
+        Surf(100, octaves=3, descriptor=descriptor, upright=upright, threads=n).detect_and_describe(IMAGE)
+        for n in (1, 2, 3, 7)
+    ]
+    assert len(one[0]) > 200
+    for other in others:
+        assert same_features(one[0], other[0])
+        assert one[1].tobytes() == other[1].tobytes()
+
+
+@pytest.mark.parametrize("octaves", [1, 2, 4])
+@pytest.mark.parametrize("layers", [2, 3])
+def test_smallest_images(octaves, layers):
+    rng = np.random.default_rng(1)
+    for shape in ((0, 0), (0, 5), (1, 1), (1, 90), (9, 9), (23, 23), (24, 24), (25, 60), (27, 27), (55, 54)):
+        image = rng.integers(0, 256, shape, np.uint8)
+        for upright in (True, False):
+            keypoints, descriptors = Surf(0, octaves, layers, upright=upright).detect_and_describe(image)
+            assert descriptors.shape == (len(keypoints), 64)
+            assert np.isfinite(descriptors).all()
+
+
+def test_black_and_white_images_have_no_features():
+    for value in (0, 255):
+        keypoints, descriptors = Surf(0).detect_and_describe(np.full((100, 120), value, np.uint8))
+        assert len(keypoints) == 0
+        assert descriptors.shape == (0, 64)
+
+
+def test_a_blob_is_found_where_it_is():
+    y, x = np.mgrid[:120, :160]
+    for sign, grey in ((1, 40), (-1, 220)):
+        blob = 130 + (grey - 130) * np.exp(-((x - 80.3) ** 2 + (y - 60.6) ** 2) / (2 * 4.0**2))
+        keypoints = Surf(500).detect(photograph(blob))
+        assert len(keypoints) >= 1
+        # The detector interpolates coarse samples: a quarter of a pixel; the continuous maximum is ten times better.
+        np.testing.assert_allclose(keypoints.uv[0], (80.3, 60.6), atol=0.25)
+        assert keypoints.laplacian[0] == sign
+        localised = Surf(500).localise(photograph(blob), keypoints)
+        np.testing.assert_allclose(localised.uv[0], (80.3, 60.6), atol=0.03)
+
+
+def test_features_come_by_falling_response():
+    keypoints = Surf(50).detect(IMAGE)
+    assert (np.diff(keypoints.response) <= 0).all()
+    assert keypoints.response[-1] > 50
+    stronger = Surf(50).detect(IMAGE, threshold=2000)
+    assert len(stronger) == (keypoints.response > 2000).sum()
+
+
+def test_mask():
+    mask = np.zeros(IMAGE.shape, np.uint8)
+    mask[:, :160] = 255
+    everywhere, left = Surf(100).detect(IMAGE), Surf(100).detect(IMAGE, mask)
+    assert 0 < len(left) < len(everywhere)
+    # At least half of the filter lies on the mask, so the centre does, to the rounding of half a pixel.
+    assert left.uv[:, 0].max() < 160.5
+    assert (everywhere.uv[:, 0] < 159).sum() <= len(left)
+    assert len(Surf(100).detect(IMAGE, np.zeros(IMAGE.shape, bool))) == 0
+    assert same_features(Surf(100).detect(IMAGE, np.ones(IMAGE.shape, bool)), everywhere)
+
+
+def nearest_pairs(a, b, A, reach):
+    """Rows of the features of two images that lie within `reach` of each other, by the true map."""
+    there = a.uv @ A[:, :2].T + A[:, 2]
+    distance = np.linalg.norm(there[:, None] - b.uv[None], axis=2)
+    first = np.flatnonzero(distance.min(axis=1) < reach)
+    return first, distance.argmin(axis=1)[first], distance.min(axis=1)[first]
+
+
+@pytest.mark.parametrize(("degrees", "tolerance"), [(30.0, 10.0), (90.0, 1e-6), (200.0, 10.0)])
+def test_orientation_follows_the_image(degrees, tolerance):
+    A = zoom_about((160, 120), 1.0, degrees)
+    surf = Surf(800, upright=False)
+    a, da = surf.detect_and_describe(IMAGE)
+    b, db = surf.detect_and_describe(warped(VALUES, A))
+    i, j, _ = nearest_pairs(a, b, A, 1.0)
+    middle = np.linalg.norm(a.uv[i] - (160, 120), axis=1) < 70  # what turns in from outside is a reflection
+    i, j = i[middle], j[middle]
+    assert len(i) > 20
+    turn = (np.rad2deg(b.angle[j] - a.angle[i]) - degrees + 180) % 360 - 180
+    # Box filters and windows in steps of 5 degrees repeat themselves at quarter turns, and change in between.
+    assert np.median(np.abs(turn)) < tolerance
+    assert np.median((da[i] * db[j]).sum(axis=1)) > 0.97
+
+
+def test_localised_features_stay_when_the_image_grows():
+    A = zoom_about((160, 120), 1.1, 0.0, (0.37, 0.21))
+    other = warped(VALUES, A, noise=1.0)
+    errors = []
+    for localise in (False, True):
+        surf = Surf(300)
+        a, b = surf.detect(IMAGE), surf.detect(other)
+        if localise:
+            a, b = surf.localise(IMAGE, a), surf.localise(other, b)
+        *_, distance = nearest_pairs(a, b, A, 2.0)
+        assert len(distance) > 80
+        errors.append(np.median(distance))
+    assert errors[1] < 0.2
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_16_dimensions_are_the_four_central_areas_of_64(upright):
+    keypoints = Surf(300).detect(IMAGE)
+    inside = (np.abs(keypoints.uv - (160, 120)) < (90, 60)).all(axis=1)
+    keypoints = keypoints.select(inside)
+    _, long = Surf(300, upright=upright).describe(IMAGE, keypoints)
+    _, short = Surf(300, descriptor=16, upright=upright).describe(IMAGE, keypoints)
+    central = long.reshape(-1, 4, 4, 4)[:, 1:3, 1:3].reshape(-1, 16)
+    central /= np.linalg.norm(central, axis=1, keepdims=True)
+    assert len(keypoints) > 20
+    # The samples are the same; upright squares round their edges to single precision from another origin.
+    np.testing.assert_allclose(short, central, atol=2e-4)
+
+
+def test_detect_and_compute_gives_opencv_keypoints():
+    keypoints, descriptors = Surf(300, upright=False).detectAndCompute(IMAGE, None)
+    ours, _ = Surf(300, upright=False).detect_and_describe(IMAGE)
+    assert isinstance(keypoints[0], cv2.KeyPoint)
+    np.testing.assert_allclose([k.pt for k in keypoints], ours.uv, atol=1e-4)
+    np.testing.assert_allclose([k.angle for k in keypoints], np.rad2deg(ours.angle), atol=1e-3)
+    assert [k.class_id for k in keypoints] == list(ours.laplacian)
+    assert descriptors.dtype == np.float32
+    nothing, empty = Surf(300).detectAndCompute(np.zeros((50, 50), np.uint8), None)
+    assert nothing == ()
+    assert empty.shape == (0, 64)
+
+
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (IMAGE.astype(np.float32), "uint8 or uint16, not float32"),
+        (IMAGE[None, None], r"shape \(1, 1, 240, 320\)"),
+        (np.zeros((5, 5, 2), np.uint8), r"shape \(5, 5, 2\)"),
+    ],
+)
+def test_unusable_images(image, says):
+    with pytest.raises(SequenceError, match=says):
+        Surf().detect(image)
+
+
+def test_unusable_mask():
+    with pytest.raises(SequenceError, match="mask: shape"):
+        Surf().detect(IMAGE, np.ones((3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"threshold": -1}, "threshold"),
+        ({"threshold": float("nan")}, "threshold"),
+        ({"octaves": 0}, "octaves"),
+        ({"layers": 4}, "layers"),
+        ({"descriptor": 128}, "descriptor"),
+        ({"threads": 0}, "threads"),
+    ],
+)
+def test_bad_settings_name_their_key(options, key):
+    with pytest.raises(ConfigurationError, match=f"^{key}: "):
+        Surf(**options)
+
+
+def test_select_takes_masks_and_indices():
+    keypoints = Surf(300).detect(IMAGE)
+    assert isinstance(keypoints, Keypoints)
+    mask = keypoints.octave == 1
+    assert same_features(keypoints.select(mask), keypoints.select(np.flatnonzero(mask)))
