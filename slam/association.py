@@ -34,7 +34,8 @@ class AssociationConfig:
         wide_d_match, wide_ratio: the same for matching against the whole map without windows.
         minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
         consistency_sigmas: reprojection error up to which a match agrees with a pose, in units of the pixel noise.
-        hypotheses: number of poses tried in the geometric check.
+        hypotheses, wide_hypotheses: number of poses tried in the geometric check, of matches in windows and of matches
+            against the whole map.
         tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
             matches suffice, and no second search is made.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
@@ -50,6 +51,7 @@ class AssociationConfig:
     minimum_consistent: int = 8
     consistency_sigmas: float = 5.0
     hypotheses: int = 100
+    wide_hypotheses: int = 1000
     tight_window: float = 12.0
     refined_window: float = 3.0
 
@@ -64,7 +66,7 @@ class AssociationConfig:
             raise ConfigurationError("association: 0 < window_min <= window_max is required")
         if not (0 < self.ratio <= 1 and 0 < self.wide_ratio <= 1):
             raise ConfigurationError("association: ratios must lie in (0, 1]")
-        if self.hypotheses < 1 or self.minimum_consistent < 3:
+        if min(self.hypotheses, self.wide_hypotheses) < 1 or self.minimum_consistent < 3:
             raise ConfigurationError("association: hypotheses >= 1 and minimum_consistent >= 3 are required")
 
 

@@ -79,7 +79,7 @@ class Recogniser:
         tight = _median_deviation(prediction) <= self.config.tight_window
         if consensus.inliers.sum() < self.config.minimum_consistent:
             matches_wide = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, self.config)
-            wide = self._consensus(matches_wide, positions, features, prediction.T_world_left, seed)
+            wide = self._consensus(matches_wide, positions, features, prediction.T_world_left, seed, wide=True)
             if wide.inliers.sum() >= self.config.minimum_consistent:
                 matches, consensus, tight = matches_wide, wide, False
             elif not tight:
@@ -98,13 +98,12 @@ class Recogniser:
         return Matches(rows[found.landmarks], found.features)
 
     def _consensus(
-        self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int
+        self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
     ) -> PoseConsensus:
         measured = measurement_rows(features.uv_left[matches.features], features.uv_right[matches.features])
         threshold = self.config.consistency_sigmas * self.pixel_sigma
-        return find_consensus(
-            self.rig, positions[matches.landmarks], measured, guess, threshold, self.config.hypotheses, seed
-        )
+        hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
+        return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
 
     def _again(
         self,

@@ -46,15 +46,15 @@ class SelfCalibrationConfig:
     """
 
     enabled: bool = True
-    prior_probability: float = 0.5
+    prior_probability: float = 0.1
     prior_sigma: float = 0.3
     pixel_sigma: float = 0.5
     disparity_sigma: float = 0.3
     max_radius: float = 0.6
     kept_share: float = 0.5
     minimum_common: int = 20
-    strongest_pair: float = 0.15
-    weakest_pair: float = 0.5
+    strongest_pair: float = 0.1
+    weakest_pair: float = 0.35
     inflation: float = 1.25
 
     __pydantic_config__ = FORBID_UNKNOWN
@@ -189,10 +189,12 @@ def offset_from_pair(
     weighted by Student's t distribution, whose scale is estimated.
 
     Args:
-        first, second: ``(x, y, d)`` (N, 3) of the landmarks [px], d the measured disparity.
+        first: ``(x, y, d)`` (N, 3) of the landmarks in one view [px], d the measured disparity.
+        second: the same landmarks in the other view (N, 3).
         focal: focal length [px].
         offset: first guess [px].
-        pixel_sigma, disparity_sigma: noise of x and y, and of d [px].
+        pixel_sigma: noise of x and y [px].
+        disparity_sigma: noise of d [px].
 
     Returns:
         The offset [px], and its information with all else marginalised out [1/px²]: zero where there is no solution.

@@ -368,7 +368,10 @@ def estimate_is_in_order(factory: Factory) -> None:
     backend = run.backend
     whole, pose_only = backend.estimate(), backend.estimate(landmarks=False)
     assert (np.diff(whole.ids) > 0).all()
-    np.testing.assert_array_equal(backend.positions(whole.ids[::-1]), whole.positions[::-1])
+    # An offline back end may solve for `estimate` alone, so `positions` may be an earlier answer, but not another one.
+    off = np.abs(backend.positions(whole.ids[::-1])[::-1] - whole.positions)
+    deviations = np.sqrt(np.diagonal(whole.covariances, axis1=1, axis2=2))
+    assert (off < deviations).all(), "positions and estimate differ by more than a standard deviation"
     assert len(pose_only.ids) == 0 and pose_only.positions.shape == (0, 3) and pose_only.covariances.shape == (0, 3, 3)
     np.testing.assert_array_equal(pose_only.T_world_left, whole.T_world_left)
     np.testing.assert_allclose(pose_only.covariance, whole.covariance, rtol=1e-9)

@@ -14,7 +14,7 @@ from frontends.surf.kernels import helper, kernel, vector_helper
 
 _SIGMA = 3.3  # of the Gaussian weight, in cells
 _SUB = 5  # wavelets along a sub-area's side
-_BOX = 1.5  # side of the boxes of turned squares, in cells
+_BOX = 1.6  # side of the boxes of turned squares, in cells
 _LANES = 8  # rows of working arrays are padded to whole vector registers
 
 
@@ -92,35 +92,46 @@ def _upright_cells(integral, x, y, width, n, at, fraction, rows, gathered, strip
 
 
 @vector_helper
-def _turned_cells(integral, x, y, width, angle, n, cells):
+def _place_boxes(px, py, cosine, sine, extent, least, last_x, last_y, stride, place, weight):
+    """Where the boxes of a row of turned cells lie in the flat integral image, from (px, py) on.
+
+    ``place`` (3, lanes) takes top left corners, widths, and heights in rows of the image; ``weight`` one over areas.
+    """
+    zero, narrow, wide = np.float32(0.0), np.float32(1.0) / np.float32(least), np.float32(1.0) / np.float32(least + 1)
+    for j in range(weight.size):
+        left = min(max(px + np.float32(j) * cosine, zero), last_x)
+        top = min(max(py + np.float32(j) * sine, zero), last_y)
+        x0, y0 = np.int32(left), np.int32(top)
+        x1, y1 = np.int32(left + extent), np.int32(top + extent)
+        width, height = np.int32(x1 - x0), np.int32(y1 - y0)
+        place[0, j] = np.int32(np.int32(y0 * stride) + x0)
+        place[1, j] = width
+        place[2, j] = np.int32(height * stride)
+        weight[j] = (narrow if width == least else wide) * (narrow if height == least else wide)
+
+
+@vector_helper
+def _turned_cells(integral, x, y, width, angle, n, place, weight, cells):
     """Cell means of a turned square about (x, y): axis-aligned boxes of whole pixels about the turned cell centres.
 
     Boxes are wider than cells, which makes descriptors steadier; each edge is rounded by itself. Boxes that would
     leave the image are pushed back to its edge.
     """
     cosine, sine = np.float32(width * np.cos(angle)), np.float32(width * np.sin(angle))
-    side = _BOX * width
-    least = int(side)  # rounding makes boxes this wide, or a pixel wider
-    narrow, wide = np.float32(1.0 / max(least, 1)), np.float32(1.0 / (least + 1))
-    pixels, stride = integral.reshape(-1), np.uint32(integral.shape[1])
+    extent = _BOX * width
+    least = np.int32(extent)  # rounding makes boxes this wide, or a pixel wider
+    pixels, stride = integral.reshape(-1), np.int32(integral.shape[1])
     last_x, last_y = np.float32(integral.shape[1] - 2 - least), np.float32(integral.shape[0] - 2 - least)
-    zero, shift = np.float32(0.0), 1.0 - 0.5 * side
-    extent = np.float32(side)
+    x0, y0 = x + 1.0 - 0.5 * extent, y + 1.0 - 0.5 * extent
     for i in range(n):
         u, v = -0.5 * (n - 1), i - 0.5 * (n - 1)
-        px, py = np.float32(x + shift + u * cosine - v * sine), np.float32(y + shift + u * sine + v * cosine)
+        px, py = np.float32(x0 + u * cosine - v * sine), np.float32(y0 + u * sine + v * cosine)
+        _place_boxes(px, py, cosine, sine, np.float32(extent), least, last_x, last_y, stride, place, weight)
         for j in range(n):
-            left = min(max(px + np.float32(j) * cosine, zero), last_x)
-            top = min(max(py + np.float32(j) * sine, zero), last_y)
-            x0, y0 = np.uint32(np.int32(left)), np.uint32(np.int32(top))
-            x1, y1 = np.uint32(np.int32(left + extent)), np.uint32(np.int32(top + extent))
-            a, b = np.uint32(y0 * stride), np.uint32(y1 * stride)
-            upper = np.int32(pixels[np.uint32(a + x1)] - pixels[np.uint32(a + x0)])
-            lower = np.int32(pixels[np.uint32(b + x1)] - pixels[np.uint32(b + x0)])
-            weight = (narrow if np.int32(x1 - x0) == least else wide) * (
-                narrow if np.int32(y1 - y0) == least else wide
-            )
-            cells[i, j] = np.float32(np.int32(lower - upper)) * weight
+            a = np.uint64(place[0, j])
+            b, right = a + np.uint64(place[2, j]), np.uint64(place[1, j])
+            upper, lower = np.int32(pixels[a + right] - pixels[a]), np.int32(pixels[b + right] - pixels[b])
+            cells[i, j] = np.float32(np.int32(lower - upper)) * weight[j]
 
 
 @vector_helper
@@ -199,6 +210,7 @@ def _describe_turned(integral, x, y, size, angle, weights, out):
     """Descriptors of turned squares into `out`."""
     n, lanes = weights.shape[0] + 1, weights.shape[1]
     cells, sums = np.zeros((n, lanes + 8), np.float32), np.empty((4, lanes), np.float32)
+    place, weight = np.empty((3, lanes), np.int32), np.empty(lanes, np.float32)
     for k in range(x.size):
-        _turned_cells(integral, x[k], y[k], size[k] * (1.2 / 9.0), angle[k], n, cells)
+        _turned_cells(integral, x[k], y[k], size[k] * (1.2 / 9.0), angle[k], n, place, weight, cells)
         _sum_areas(cells, weights, False, sums, out, k)

@@ -16,25 +16,29 @@ from frontends.surf.kernels import helper, kernel, vector_helper
 #: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
 COLUMNS = 6
 
-#: What each of a filter's eight boxes counts in Dxx, Dyy and Dxy, see `filters.BOXES`.
-_SIGNS = np.array([[1, -3, 0, 0, 0, 0, 0, 0], [0, 0, 1, -3, 0, 0, 0, 0], [0, 0, 0, 0, 1, 1, -1, -1]], np.int32)
+#: The boxes' numbers, from an array because Numba compiles a helper anew for each literal number it is called with.
+_N = np.arange(8)
+
+
+@helper
+def _box(pixels, at, offsets, layer, box):
+    """Sum of the pixels of a numbered box, see `filters.BOXES`, of the filter with its top left at `at`."""
+    n = 4 * box
+    a, b = pixels[at + offsets[layer, n]], pixels[at + offsets[layer, n + 1]]
+    c, d = pixels[at + offsets[layer, n + 2]], pixels[at + offsets[layer, n + 3]]
+    return np.int32(np.int32(d - c) - np.int32(b - a))
 
 
 @helper
 def _response_at(pixels, at, filters, layer):
     """The determinant ``Dxx Dyy − 0.81 Dxy²`` and the sign of ``Dxx + Dyy`` of the filter with its top left at `at`."""
-    o = filters.offsets
-    dxx, dyy, dxy = np.int32(0), np.int32(0), np.int32(0)
-    for k in range(8):
-        a, b = pixels[at + o[layer, 4 * k]], pixels[at + o[layer, 4 * k + 1]]
-        c, d = pixels[at + o[layer, 4 * k + 2]], pixels[at + o[layer, 4 * k + 3]]
-        box = np.int32(np.int32(d - c) - np.int32(b - a))
-        dxx = np.int32(dxx + _SIGNS[0, k] * box)
-        dyy = np.int32(dyy + _SIGNS[1, k] * box)
-        dxy = np.int32(dxy + _SIGNS[2, k] * box)
+    n, o = _N, filters.offsets
+    dxx = _box(pixels, at, o, layer, n[0]) - 3 * _box(pixels, at, o, layer, n[1])
+    dyy = _box(pixels, at, o, layer, n[2]) - 3 * _box(pixels, at, o, layer, n[3])
+    dxy = _box(pixels, at, o, layer, n[4]) + _box(pixels, at, o, layer, n[5])
+    dxy -= _box(pixels, at, o, layer, n[6]) + _box(pixels, at, o, layer, n[7])
     xx, yy, xy = np.float32(dxx), np.float32(dyy), np.float32(dxy)
-    response = xx * yy * filters.weights[layer, 0] - xy * xy * filters.weights[layer, 1]
-    return response, np.sign(np.int64(dxx) + np.int64(dyy))
+    return xx * yy * filters.weights[layer, 0] - xy * xy * filters.weights[layer, 1], np.sign(dxx + dyy)
 
 
 @vector_helper

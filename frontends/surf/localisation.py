@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from frontends.surf.filters import BOXES
 from frontends.surf.kernels import helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
@@ -29,8 +28,10 @@ _PLACES = np.array(
     ],
     np.float64,
 )  # fmt: skip
-_BOXES = np.array(BOXES)
-_SIGNS = np.array([[1, -3, 0, 0, 0, 0, 0, 0], [0, 0, 1, -3, 0, 0, 0, 0], [0, 0, 0, 0, 1, 1, -1, -1]], np.float64)
+
+
+#: The corners' numbers, from an array because Numba compiles a helper anew for each literal number it is called with.
+_N = np.arange(10)
 
 
 @vector_helper
@@ -46,23 +47,29 @@ def _corner(pixels, stride, y, fy, x, fx):
 
 
 @vector_helper
+def _box(pixels, stride, whole, part, top, bottom, left, right):
+    """Sum of a box between the numbered corner positions."""
+    y0, y1, x0, x1 = whole[1, top], whole[1, bottom], whole[0, left], whole[0, right]
+    fy0, fy1, fx0, fx1 = part[1, top], part[1, bottom], part[0, left], part[0, right]
+    a, p = _corner(pixels, stride, y0, fy0, x0, fx0)
+    b, q = _corner(pixels, stride, y0, fy0, x1, fx1)
+    c, r = _corner(pixels, stride, y1, fy1, x0, fx0)
+    d, s = _corner(pixels, stride, y1, fy1, x1, fx1)
+    return np.float64(np.int32(np.int32(d - c) - np.int32(b - a))) + ((s - r) - (q - p))
+
+
+@vector_helper
 def _response(pixels, stride, x, y, size, whole, part):
     """Determinant of the Hessian at any position and size; the filter must lie inside the image."""
+    n, w, f = _N, whole, part
     for k in range(10):
         u, v = x + 0.5 + size * (k / 9.0 - 0.5), y + 0.5 + size * (k / 9.0 - 0.5)
-        whole[0, k], whole[1, k] = np.int64(u), np.int64(v)
-        part[0, k], part[1, k] = u - whole[0, k], v - whole[1, k]
-    dxx, dyy, dxy = 0.0, 0.0, 0.0
-    for k in range(8):
-        top, bottom, left, right = _BOXES[k, 0], _BOXES[k, 1], _BOXES[k, 2], _BOXES[k, 3]
-        a, p = _corner(pixels, stride, whole[1, top], part[1, top], whole[0, left], part[0, left])
-        b, q = _corner(pixels, stride, whole[1, top], part[1, top], whole[0, right], part[0, right])
-        c, r = _corner(pixels, stride, whole[1, bottom], part[1, bottom], whole[0, left], part[0, left])
-        d, s = _corner(pixels, stride, whole[1, bottom], part[1, bottom], whole[0, right], part[0, right])
-        box = np.float64(np.int32(np.int32(d - c) - np.int32(b - a))) + ((s - r) - (q - p))
-        dxx += _SIGNS[0, k] * box
-        dyy += _SIGNS[1, k] * box
-        dxy += _SIGNS[2, k] * box
+        w[0, k], w[1, k] = np.int64(u), np.int64(v)
+        f[0, k], f[1, k] = u - w[0, k], v - w[1, k]
+    dxx = _box(pixels, stride, w, f, n[2], n[7], n[0], n[9]) - 3.0 * _box(pixels, stride, w, f, n[2], n[7], n[3], n[6])
+    dyy = _box(pixels, stride, w, f, n[0], n[9], n[2], n[7]) - 3.0 * _box(pixels, stride, w, f, n[3], n[6], n[2], n[7])
+    dxy = _box(pixels, stride, w, f, n[1], n[4], n[1], n[4]) + _box(pixels, stride, w, f, n[5], n[8], n[5], n[8])
+    dxy -= _box(pixels, stride, w, f, n[1], n[4], n[5], n[8]) + _box(pixels, stride, w, f, n[5], n[8], n[1], n[4])
     area = size * size
     dxx, dyy, dxy = dxx * 5.4 / area, dyy * 5.4 / area, dxy * 9.0 / area
     return dxx * dyy - 0.81 * dxy * dxy

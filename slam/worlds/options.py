@@ -69,7 +69,7 @@ RECORDING = (
 #: Keys for observations made without images.
 OBSERVATION = (
     Option("density", 25.0, "landmarks per square metre of surface, at most", 0, 10_000),
-    Option("sigma", 1.0, "standard deviation of uL, vL and uR [px]", 0, 100),
+    Option("sigma", 0.7, "standard deviation of uL, vL and uR [px]", 0, 100),
     Option("detect", 0.9, "chance that a visible landmark is detected", 0, 1),
     Option("stereo", 0.95, "chance that a detected one is matched in the right image", 0, 1),
     Option("outliers", 0.05, "share of features that are false, or are given a false match in the right image", 0, 0.9),

@@ -1,0 +1,155 @@
+"""The maximum-likelihood answer over all measurements, by Levenberg-Marquardt: the yardstick for the other back ends.
+
+Every landmark is a variable and every accepted measurement a factor of its own; nothing is approximated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from backends.smoother import SmootherBackend
+from backends.smoother.rebuild import add_landmark, add_poses, optimise
+from backends.smoother.records import IndexArray
+from backends.smoother.solver import Change
+from backends.smoother.threads import one_blas_thread
+from backends.smoother.variables import landmark_key, pose_key
+from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
+from slam.errors import ConfigurationError
+from slam.models import EstimatorModels
+from slam.rig import StereoRig
+from slam.se3 import Array, transform
+from slam.trajectory import Trajectory
+
+_ITERATIONS = 100
+
+
+class BatchBackend:
+    """Levenberg-Marquardt over all poses and landmarks.
+
+    A smoother runs along: it predicts, gates and gives the first values. The problem is solved when the trajectory or
+    the landmarks are asked for; with ``online=True`` whenever the pose is, which costs more with every frame.
+
+    Args:
+        rig: the cameras.
+        models: noise, priors, motion and gate.
+        online: whether the pose alone is the solved one as well, and not the smoother's.
+        options: of the smoother, see `backends.smoother.config.SmootherConfig`.
+
+    Raises:
+        ConfigurationError: an option is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        models: EstimatorModels = EstimatorModels(),  # noqa: B008
+        online: bool = False,
+        **options: Any,
+    ) -> None:
+        if not isinstance(online, bool):
+            raise ConfigurationError(f"batch: online must be true or false, got {online!r}")
+        self.rig = rig
+        self.models = models
+        self.online = online
+        self._smoother = SmootherBackend(rig, models, **options)
+        self._solution: _Solution | None = None
+
+    def predict(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.Backend.predict`: the smoother's."""
+        prediction = self._smoother.predict(stamp)
+        self._solution = None
+        return prediction
+
+    def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
+        """See `slam.interfaces.Backend.update`: the smoother's."""
+        self._solution = None
+        return self._smoother.update(observations, guess)
+
+    def add(self, observations: Observations) -> None:
+        """See `slam.interfaces.Backend.add`."""
+        self._smoother.add(observations)
+        self._solution = None
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
+        self._smoother.remove(ids)
+
+    @one_blas_thread
+    def estimate(self, landmarks: bool = True) -> Estimate:
+        """See `slam.interfaces.Backend.estimate`."""
+        rough = self._smoother.estimate(landmarks)
+        if not (landmarks or self.online or self._solution is not None):
+            return rough
+        solution = self._solved()
+        marks = self._smoother.records.landmarks
+        slots = marks.slots(rough.ids)
+        positions, covariances = rough.positions.copy(), rough.covariances.copy()
+        for row, serial in enumerate(marks.serial[slots].tolist()):
+            if serial in solution.landmarks:
+                positions[row] = solution.values.atPoint3(landmark_key(serial))
+                covariances[row] = solution.covariance(landmark_key(serial))
+        P = solution.covariance(pose_key(len(solution.poses) - 1))
+        return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
+
+    def positions(self, ids: IdArray) -> Array:
+        """See `slam.interfaces.Backend.positions`: the smoother's."""
+        return self._smoother.positions(ids)
+
+    @one_blas_thread
+    def trajectory(self) -> Trajectory:
+        """See `slam.interfaces.Backend.trajectory`."""
+        rough = self._smoother.trajectory()
+        return Trajectory(rough.stamps, self._solved().poses.copy()) if len(rough) else rough
+
+    def _solved(self) -> _Solution:
+        if self._solution is None:
+            self._solution = _Solution(self._smoother)
+        return self._solution
+
+
+class _Solution:
+    """A solved problem.
+
+    Attributes:
+        values: all variables.
+        poses: (F, 4, 4).
+        landmarks: serial numbers of the landmarks that are variables.
+    """
+
+    def __init__(self, smoother: SmootherBackend) -> None:
+        change = Change()
+        make, records = smoother.factor_maker, smoother.records
+        add_poses(change, make, records)
+        self.landmarks: set[int] = set()
+        for serial, rows in _by_landmark(records.measurements.landmark):
+            first = int(rows[0])  # with a right pixel: the landmark was triangulated from it
+            local = make.stereo.triangulate(records.measurements.z[first : first + 1])
+            T = records.path.poses[records.measurements.frame[first]]
+            add_landmark(change, make, records, landmark_key(serial), rows, transform(T, local)[0])
+            self.landmarks.add(serial)
+        self._factors = change.factors
+        self.values = optimise(change, _ITERATIONS)
+        self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(records.path.count)])
+
+    @cached_property
+    def _marginals(self) -> gtsam.Marginals:
+        return gtsam.Marginals(self._factors, self.values)
+
+    def covariance(self, key: int) -> Array:
+        """Marginal covariance of a variable."""
+        return np.asarray(self._marginals.marginalCovariance(key))
+
+
+def _by_landmark(landmark: NDArray[np.int32]) -> Iterator[tuple[int, IndexArray]]:
+    """Serial numbers of landmarks measured at least twice, each with its measurements' rows."""
+    order = np.argsort(landmark, kind="stable")
+    serials, starts = np.unique(landmark[order], return_index=True)
+    for serial, rows in zip(serials.tolist(), np.split(order, starts[1:])):
+        if serial >= 0 and len(rows) > 1:
+            yield serial, rows

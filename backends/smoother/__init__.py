@@ -1,0 +1,6 @@
+"""The GTSAM smoother: ISAM2 over smart stereo factors. See `backends.smoother.backend`."""
+
+from backends.smoother.backend import SmootherBackend
+from backends.smoother.config import SmootherConfig
+
+__all__ = ["SmootherBackend", "SmootherConfig"]

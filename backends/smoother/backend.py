@@ -1,0 +1,195 @@
+"""The smoother back end: the protocol on top of the pose graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from backends.smoother import pose_only
+from backends.smoother.config import SmootherConfig
+from backends.smoother.graph import FactorMaker
+from backends.smoother.posegraph import PoseGraph
+from backends.smoother.prediction import (
+    PredictedPoints,
+    PredictedPose,
+    normalised_innovation,
+    predict_points,
+    predict_pose,
+)
+from backends.smoother.records import IndexArray, Records
+from backends.smoother.stereo import RectifiedStereo
+from backends.smoother.threads import one_blas_thread
+from backends.smoother.uncertainty import quadratic
+from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.errors import MeasurementError
+from slam.models import EstimatorModels
+from slam.rig import StereoRig
+from slam.se3 import Array, inverse, log
+from slam.trajectory import Trajectory
+
+
+class SmootherBackend:
+    """ISAM2 over smart stereo factors: all poses are estimated together and revised with every frame.
+
+    The motion model is the papers' (see `backends.smoother.motion`). Which landmarks are eliminated and which are
+    variables: see `backends.smoother.posegraph`. Covariances: see `backends.smoother.uncertainty`.
+
+    Args:
+        rig: the cameras; measurements of any rig are rectified first.
+        models: noise, priors, motion and gate.
+        options: see `SmootherConfig`.
+
+    Raises:
+        ConfigurationError: an option is unknown or out of range.
+    """
+
+    def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
+        self.rig = rig
+        self.models = models
+        self.config = SmootherConfig.from_options(options)
+        self._stereo = RectifiedStereo.of(rig)
+        self._make = FactorMaker(self._stereo, models)
+        self._graph = PoseGraph(self._make, self.config)
+        self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
+
+    @property
+    def records(self) -> Records:
+        """Poses, measurements and landmarks as they are believed now; not to be changed."""
+        return self._graph.records
+
+    @property
+    def factor_maker(self) -> FactorMaker:
+        """Makes factors with this back end's rig and models."""
+        return self._make
+
+    # --- the protocol (documented in slam.interfaces.Backend) ---
+
+    @one_blas_thread
+    def predict(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.Backend.predict`."""
+        self._commit()
+        stamps = self.records.path.stamps
+        if not np.isfinite(stamp) or (len(stamps) and stamp <= stamps[-1]):
+            last = f" after {stamps[-1]}" if len(stamps) else ""
+            raise MeasurementError(f"smoother: stamp {stamp}{last}: time must be finite and increase")
+        if not len(stamps):
+            self._graph.append_pose(stamp, self.models.initial_pose)
+            P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
+            T = self.models.initial_pose
+            return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
+        self._predicted = predict_pose(self.models, self.records.path, self._graph.window(), stamp)
+        return self._in_view(self._predicted)
+
+    @one_blas_thread
+    def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
+        """See `slam.interfaces.Backend.update`."""
+        self._require_started("update")
+        slots = self.records.landmarks.slots(observations.ids)
+        predicted = self._predicted
+        if predicted is None or not len(slots):
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        z = self._stereo.measure(observations)
+        points = self._points(predicted, slots)
+        T, used = self._solve_pose(predicted, points, slots, z, guess)
+        if not used.any():
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
+        solved = self._points(replace(predicted, T=T), slots[used])
+        step = log(inverse(predicted.T) @ T)
+        nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
+        self._predicted = None
+        failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
+        if failure:
+            return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
+        return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
+
+    @one_blas_thread
+    def add(self, observations: Observations) -> None:
+        """See `slam.interfaces.Backend.add`."""
+        self._require_started("add")
+        for i in observations.ids.tolist():
+            if i in self.records.landmarks:
+                raise MeasurementError(f"smoother: landmark {i} is in the map already")
+        if not len(observations):
+            return
+        z = self._stereo.measure(observations)
+        local = self._stereo.triangulate(z)
+        bad = ~np.isfinite(local).all(axis=1)
+        if bad.any():
+            raise MeasurementError(
+                f"smoother: landmark {observations.ids[bad][0]} has no right pixel or no positive depth"
+            )
+        self._commit()
+        self._graph.add_landmarks(observations.ids, z, local)
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
+        self._graph.remove_landmarks(self.records.landmarks.slots(np.unique(np.asarray(ids, np.int64))))
+
+    @one_blas_thread
+    def estimate(self, landmarks: bool = True) -> Estimate:
+        """See `slam.interfaces.Backend.estimate`."""
+        self._require_started("estimate")
+        window, marks = self._graph.window(), self.records.landmarks
+        slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
+        covariances = quadratic(self._graph.landmarks_by_window(slots), window.covariance) + marks.covariance[slots]
+        if self._predicted is not None:
+            stamp, T, P = self._predicted.stamp, self._predicted.T.copy(), self._predicted.covariance
+        else:
+            path = self.records.path
+            stamp, T, P = float(path.stamps[-1]), path.poses[-1].copy(), window.covariance[-6:, -6:].copy()
+        return Estimate(stamp, T, P, marks.ids[slots], marks.position[slots], covariances)
+
+    def positions(self, ids: IdArray) -> Array:
+        """See `slam.interfaces.Backend.positions`."""
+        marks = self.records.landmarks
+        return marks.position[marks.slots(ids)]
+
+    @one_blas_thread
+    def trajectory(self) -> Trajectory:
+        """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
+        self._commit()
+        return Trajectory(self.records.path.stamps.copy(), self._graph.settled_poses())
+
+    # --- parts ---
+
+    def _commit(self) -> None:
+        """Put a predicted pose without measurements into the graph."""
+        if self._predicted is not None:
+            stamp, T = self._predicted.stamp, self._predicted.T
+            self._predicted = None
+            self._graph.append_pose(stamp, T)
+
+    def _in_view(self, predicted: PredictedPose) -> Prediction:
+        """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
+        T, marks, rig = predicted.T, self.records.landmarks, self.rig
+        slots = marks.used()
+        slots = slots[rig.left.in_view((marks.position[slots] - T[:3, 3]) @ T[:3, :3])]
+        points = self._points(predicted, slots)
+        uv, J = rig.left.project_with_jacobian(points.local)
+        right = rig.right.project((points.local + rig.b) @ rig.R.T)
+        S = J @ points.covariance(predicted) @ np.swapaxes(J, 1, 2) + self.models.pixel_sigma**2 * np.eye(2)
+        return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
+
+    def _points(self, predicted: PredictedPose, slots: IndexArray) -> PredictedPoints:
+        marks, by_window = self.records.landmarks, self._graph.landmarks_by_window(slots)
+        return predict_points(predicted, marks.position[slots], marks.covariance[slots], by_window)
+
+    def _solve_pose(
+        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, z: Array, guess: Array | None
+    ) -> tuple[Array, BoolArray]:
+        """First value of the newest pose, and which measurements agree with it."""
+        _, J = self._stereo.project(points.local)
+        noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
+        information = np.linalg.inv(predicted.covariance_to_last)
+        problem = pose_only.PoseProblem(
+            self._stereo, self.records.landmarks.position[slots], z, noise, predicted.T, information,
+            self.models.gate_probability,
+        )  # fmt: skip
+        return pose_only.solve(problem, predicted.T if guess is None else guess)
+
+    def _require_started(self, what: str) -> None:
+        if not self.records.path.count:
+            raise MeasurementError(f"smoother: {what} before the first predict")

@@ -1,0 +1,62 @@
+"""Options of the smoother back end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from slam.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class SmootherConfig:
+    """Options of `SmootherBackend`.
+
+    Attributes:
+        track: observations after which a landmark's smart factor is finished; each landmark's own limit lies between
+            `track` and twice that, so that no frame finishes them all.
+        explicit: how many landmarks in view at most become variables of their own when their smart factor is finished;
+            they tie the trajectory together over any time. The others go on in a new smart factor.
+        relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately.
+        window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
+        lag: poses that stay variables; None for all.
+
+    Raises:
+        ConfigurationError: a value is out of its range.
+    """
+
+    track: int = 10
+    explicit: int = 300
+    relinearise: float = 0.1
+    window: int = 12
+    lag: int | None = None
+
+    def __post_init__(self) -> None:
+        _require_whole(self.track, "track", 2)
+        _require_whole(self.explicit, "explicit", 0)
+        _require_whole(self.window, "window", 2)
+        if self.lag is not None:
+            _require_whole(self.lag, "lag", self.window)
+        value = self.relinearise
+        if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0):
+            raise ConfigurationError(f"smoother: relinearise must be positive and finite, got {value!r}")
+
+    @classmethod
+    def from_options(cls, options: dict[str, Any]) -> SmootherConfig:
+        """The configuration of keyword options.
+
+        Raises:
+            ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
+        """
+        known = [f.name for f in fields(cls)]
+        unknown = sorted(set(options) - set(known))
+        if unknown:
+            raise ConfigurationError(f"smoother: unknown option {unknown[0]!r}; known: {', '.join(known)}")
+        return cls(**options)
+
+
+def _require_whole(value: object, name: str, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ConfigurationError(f"smoother: {name} must be an integer of at least {least}, got {value!r}")

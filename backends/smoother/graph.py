@@ -1,0 +1,93 @@
+"""Factors of the estimation problem, made of plain arrays: shared by the smoother and the batch solver."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import gtsam
+import gtsam_unstable
+import numpy as np
+
+from backends.smoother import motion
+from backends.smoother.stereo import RectifiedStereo
+from slam.models import EstimatorModels
+from slam.se3 import Array, nearest_rotation
+
+
+def to_pose3(T: Array) -> gtsam.Pose3:
+    """A gtsam pose of a matrix (4, 4) that is nearly rigid; gtsam itself would keep the error."""
+    return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
+
+
+class FactorMaker:
+    """Makes factors for one rig and one set of models.
+
+    Args:
+        stereo: the rectified twin's projection.
+        models: noise, priors and motion.
+    """
+
+    def __init__(self, stereo: RectifiedStereo, models: EstimatorModels) -> None:
+        self.stereo = stereo
+        self.models = models
+        self.sigma = models.pixel_sigma * stereo.scale
+        self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
+        self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
+        self._parameters = gtsam.SmartProjectionParams()
+        rectified = stereo.twin.original.is_rectified
+        self._sensor = () if rectified else (to_pose3(stereo.twin.T_left_rectified),)
+
+    @cached_property
+    def _mono(self) -> tuple[gtsam.Cal3_S2, gtsam.noiseModel.Base]:
+        s = self.stereo
+        return gtsam.Cal3_S2(s.f, s.f, 0.0, s.u0, s.v0), gtsam.noiseModel.Isotropic.Sigma(2, self.sigma)
+
+    def prior(self, key: int) -> gtsam.NonlinearFactor:
+        """The first pose."""
+        m = self.models
+        sigmas = np.repeat([m.initial_rotation_sigma, m.initial_position_sigma], 3)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        return gtsam.PriorFactorPose3(key, to_pose3(m.initial_pose), noise)
+
+    def first_motion(self, keys: tuple[int, int], dt: float) -> gtsam.NonlinearFactor:
+        """Between the first two poses: the prior of the velocity."""
+        noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.first_velocity_sigmas(self.models, dt))
+        return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise)
+
+    def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float, scale: float) -> gtsam.NonlinearFactor:
+        """Between three successive poses: constant velocity but for an impulse (see `motion`).
+
+        `scale` multiplies the impulse's standard deviation.
+        """
+
+        def error(_this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
+            poses = [values.atPose3(key) for key in keys]
+            R = tuple(pose.rotation().matrix() for pose in poses)
+            t = tuple(pose.translation() for pose in poses)
+            residual, J = motion.velocity_change(R, t, dt01, dt12)  # type: ignore[arg-type]
+            if jacobians is not None:
+                for i, Ji in enumerate(J):
+                    jacobians[i] = Ji
+            return residual
+
+        noise = gtsam.noiseModel.Diagonal.Sigmas(scale * motion.motion_sigmas(self.models, dt12))
+        return gtsam.CustomFactor(noise, list(keys), error)
+
+    def point(self, z: list[float]) -> gtsam.StereoPoint2:
+        """A measurement (uL, vL, uR); uR may be NaN."""
+        return gtsam.StereoPoint2(z[0], z[2], z[1])
+
+    def smart(self, points: list, keys: list[int]) -> gtsam.NonlinearFactor:
+        """A landmark eliminated from its measurements."""
+        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._parameters, *self._sensor)
+        factor.add(points, keys, self._K)
+        return factor
+
+    def explicit(self, point: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:
+        """One measurement of a landmark that is a variable."""
+        if np.isfinite(point.uR()):
+            return gtsam.GenericStereoFactor3D(point, self._noise, pose, landmark, self._K, *self._sensor)
+        K, noise = self._mono
+        uv = np.array([point.uL(), point.v()])
+        return gtsam.GenericProjectionFactorCal3_S2(uv, noise, pose, landmark, K, *self._sensor)

@@ -1,0 +1,81 @@
+"""The papers' motion model on poses alone: prediction, its Jacobians, and the residual of three successive poses.
+
+Paper B, section 2 prints ``r_k = r_{k−1} + (v_{k−1} + w_v) Δt``, ``v_k = v_{k−1} + w_v``, and the same for the angles:
+the velocity jumps at the start of the interval and then stays. So a velocity is the difference of two successive
+poses, exactly, and needs no variable of its own. What is left of the model is that two successive velocities differ
+by white noise w. As in the papers the linear velocity is one in world axes; the angular velocity is a body rate
+(rotation vectors instead of Euler angles: equal to first order, and without their singularity).
+
+Poses are ``T_world_left``; perturbations are on the right, [rotation, translation].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.models import EstimatorModels
+from slam.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
+
+
+def motion_sigmas(models: EstimatorModels, dt: float) -> Array:
+    """Standard deviations (6,) of w = [w_ω, w_v] over `dt` [s]."""
+    linear, angular = models.motion.velocity_variance(dt)
+    return np.sqrt(np.repeat([angular, linear], 3))
+
+
+def first_velocity_sigmas(models: EstimatorModels, dt: float) -> Array:
+    """Standard deviations (6,) of [ω, v] in the first interval: the prior of the velocity and its first jump."""
+    prior = np.repeat([models.initial_angular_velocity_sigma, models.initial_velocity_sigma], 3)
+    return np.hypot(prior, motion_sigmas(models, dt))
+
+
+def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:
+    """The pose after T1 at the velocity between T0 and T1.
+
+    Returns:
+        T2 (4, 4), its Jacobians (6, 6) by the perturbations of T0 and T1, and by w = [w_ω, w_v].
+    """
+    s = dt12 / dt01
+    R0, R1 = T0[:3, :3], T1[:3, :3]
+    a = so3_log(R0.T @ R1)
+    step = so3_exp(s * a)
+    R2 = R1 @ step
+    T2 = pose(R2, T1[:3, 3] + s * (T1[:3, 3] - T0[:3, 3]))
+    right = so3_left_jacobian(-s * a)  # the right Jacobian at s a
+    J0, J1, Jw = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    J0[:3, :3] = -s * right @ np.linalg.inv(so3_left_jacobian(a))
+    J1[:3, :3] = step.T + s * right @ np.linalg.inv(so3_left_jacobian(-a))
+    J0[3:, 3:] = -s * R2.T @ R0
+    J1[3:, 3:] = (1 + s) * R2.T @ R1
+    Jw[:3, :3] = dt12 * right
+    Jw[3:, 3:] = dt12 * R2.T
+    return T2, J0, J1, Jw
+
+
+def predict_from_rest(T0: Array, dt: float) -> tuple[Array, Array, Array]:
+    """The pose after the first one, whose velocity is unknown with mean zero.
+
+    Returns:
+        T1 (4, 4), its Jacobian (6, 6) by the perturbation of T0, and by the velocity [ω, v].
+    """
+    Jw = np.zeros((6, 6))
+    Jw[:3, :3] = dt * np.eye(3)
+    Jw[3:, 3:] = dt * T0[:3, :3].T
+    return T0.copy(), np.eye(6), Jw
+
+
+def velocity_change(
+    R: tuple[Array, Array, Array], t: tuple[Array, Array, Array], dt01: float, dt12: float
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Residual (6,) = [ω12 − ω01, v12 − v01] of three successive poses, and its Jacobians (6, 6) by each."""
+    a, b = so3_log(R[0].T @ R[1]), so3_log(R[1].T @ R[2])
+    residual = np.concatenate([b / dt12 - a / dt01, (t[2] - t[1]) / dt12 - (t[1] - t[0]) / dt01])
+    Ja = np.linalg.inv(so3_left_jacobian(np.stack([a, -a, b, -b])))
+    J = np.zeros((3, 6, 6))
+    J[0, :3, :3] = Ja[0] / dt01
+    J[1, :3, :3] = -Ja[1] / dt01 - Ja[2] / dt12
+    J[2, :3, :3] = Ja[3] / dt12
+    J[0, 3:, 3:] = R[0] / dt01
+    J[1, 3:, 3:] = -R[1] * (1 / dt01 + 1 / dt12)
+    J[2, 3:, 3:] = R[2] / dt12
+    return residual, (J[0], J[1], J[2])

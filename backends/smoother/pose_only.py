@@ -1,0 +1,105 @@
+"""The newest pose alone, by robust Gauss-Newton on reprojection errors: where the smoother starts from.
+
+ISAM2 takes one Gauss-Newton step for all variables together and has no defence against a poor start; so the new pose
+is brought close first, with the landmarks held where they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backends.smoother.stereo import RectifiedStereo, by_pose
+from slam.data import BoolArray
+from slam.gating import chi_square_gate
+from slam.se3 import Array, exp, inverse, log
+
+_STEPS = 12
+_HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
+_ROUNDS = 3  # of solving and gating
+_CONVERGED = 1e-5  # [rad, m]; the steps shrink quadratically, so what is left is far smaller
+
+
+@dataclass(frozen=True)
+class PoseProblem:
+    """Landmarks, what was measured of them, and what was predicted.
+
+    Attributes:
+        stereo: the projection.
+        points: landmark positions (M, 3) in world coordinates.
+        z: measurements (M, 3), NaN where missing.
+        noise: covariances (M, 3, 3) of the residuals for a known pose: pixel noise and landmark uncertainty [px²].
+        predicted: pose (4, 4).
+        information: of the predicted pose (6, 6).
+        probability: share of good measurements that the gate shall let pass.
+    """
+
+    stereo: RectifiedStereo
+    points: Array
+    z: Array
+    noise: Array
+    predicted: Array
+    information: Array
+    probability: float
+
+
+def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
+    """Pose (4, 4) and which measurements (M,) agree with it: first robust, then least squares on what agrees."""
+    whitener = _whiteners(problem.noise, problem.z)
+    T = _gauss_newton(problem, whitener, start, None)
+    used = _gate(problem, T)
+    for _ in range(_ROUNDS):
+        T = _gauss_newton(problem, whitener, T, used)
+        again = _gate(problem, T)
+        if (again == used).all():
+            break
+        used = again
+    return T, used
+
+
+def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
+    """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
+    local = (problem.points - T[:3, 3]) @ T[:3, :3]
+    h, J = problem.stereo.project(local)
+    return problem.z - h, by_pose(J, local)
+
+
+def _gate(problem: PoseProblem, T: Array) -> BoolArray:
+    """Which measurements agree with a pose."""
+    r, _ = residuals(problem, T)
+    return chi_square_gate(r, problem.noise, problem.probability)
+
+
+def _whiteners(noise: Array, z: Array) -> Array:
+    """Inverse Cholesky factors (M, 3, 3); the third row is zero where there is no right pixel."""
+    W = np.linalg.inv(np.linalg.cholesky(noise))
+    W[np.isnan(z[:, 2]), 2] = 0
+    return W
+
+
+def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: BoolArray | None) -> Array:
+    """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
+    T = start
+    information = problem.information
+    prior = log(inverse(problem.predicted) @ T)
+    for _ in range(_STEPS):
+        r, J = residuals(problem, T)
+        missing = np.isnan(r)
+        r[missing] = 0
+        J[missing] = 0
+        r, J = (whitener @ r[:, :, None])[:, :, 0], whitener @ J
+        weight = _huber(r) if used is None else used.astype(float)
+        J_w = (J * weight[:, None, None]).reshape(-1, 6).T
+        step = np.linalg.solve(information + J_w @ J.reshape(-1, 6), J_w @ r.reshape(-1) - information @ prior)
+        T = T @ exp(step)
+        prior = prior + step  # exact to first order: enough for a prior that only keeps few measurements in bounds
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return T
+
+
+def _huber(r: Array) -> Array:
+    """Weights (M,) of whitened residuals (M, 3)."""
+    size = np.sqrt((r * r).sum(axis=1))
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-12))

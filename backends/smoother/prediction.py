@@ -1,0 +1,137 @@
+"""What is predicted of the newest pose and of the landmarks before they are measured, and how well that fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backends.smoother import motion
+from backends.smoother.records import Path
+from backends.smoother.stereo import RectifiedStereo, by_pose
+from backends.smoother.uncertainty import PoseSet, quadratic
+from slam.data import BoolArray
+from slam.models import EstimatorModels
+from slam.se3 import Array, adjoint, hat, inverse
+
+
+@dataclass(frozen=True)
+class PredictedPose:
+    """The newest pose before its measurements.
+
+    Attributes:
+        stamp: time [s].
+        T: predicted pose (4, 4).
+        by_window: its Jacobian (6, 6 W) by the poses of the window.
+        noise: covariance (6, 6) of what the motion adds.
+        window: the poses it hangs on.
+    """
+
+    stamp: float
+    T: Array
+    by_window: Array
+    noise: Array
+    window: PoseSet
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6)."""
+        return self.by_window @ self.window.covariance @ self.by_window.T + self.noise
+
+    @property
+    def covariance_to_last(self) -> Array:
+        """Covariance (6, 6) where the last pose is known: what all poses have in common moves the landmarks too."""
+        J = self.by_window.copy()
+        J[:, -6:] -= adjoint(inverse(self.T) @ self.window.poses[-1])
+        return J @ self.window.covariance @ J.T + self.noise
+
+
+def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: float) -> PredictedPose:
+    """The next pose by the motion model."""
+    stamps, poses = path.stamps, path.poses
+    dt = stamp - stamps[-1]
+    J = np.zeros((6, 6 * len(window)))
+    if len(stamps) == 1:
+        T, J[:, -6:], Jw = motion.predict_from_rest(poses[-1], dt)
+        sigmas = motion.first_velocity_sigmas(models, dt)
+    else:
+        T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(poses[-2], poses[-1], stamps[-1] - stamps[-2], dt)
+        sigmas = motion.motion_sigmas(models, dt)
+    return PredictedPose(stamp, T, J, (Jw * sigmas**2) @ Jw.T, window)
+
+
+@dataclass(frozen=True)
+class PredictedPoints:
+    """Landmarks in the predicted camera's coordinates.
+
+    Attributes:
+        local: positions (M, 3).
+        by_window: their Jacobians (M, 3, 6 W) by the poses of the window.
+        by_camera: their Jacobians (M, 3, 6) by what the motion adds to the pose.
+        own: covariances (M, 3, 3) of the landmarks where all poses are known.
+    """
+
+    local: Array
+    by_window: Array
+    by_camera: Array
+    own: Array
+
+    def select(self, rows: BoolArray) -> PredictedPoints:
+        """Some of the landmarks."""
+        return PredictedPoints(self.local[rows], self.by_window[rows], self.by_camera[rows], self.own[rows])
+
+    def covariance(self, predicted: PredictedPose) -> Array:
+        """Covariances (M, 3, 3) of the positions."""
+        from_window = quadratic(self.by_window, predicted.window.covariance)
+        return from_window + quadratic(self.by_camera, predicted.noise) + self.own
+
+
+def predict_points(predicted: PredictedPose, points: Array, own: Array, by_window: Array) -> PredictedPoints:
+    """Landmarks as seen from the predicted pose.
+
+    Args:
+        predicted: the pose.
+        points: landmark positions (M, 3) in world coordinates.
+        own: their covariances (M, 3, 3) where all poses are known.
+        by_window: their Jacobians (M, 3, 6 W) by the poses of the window.
+    """
+    R, t = predicted.T[:3, :3], predicted.T[:3, 3]
+    local = (points - t) @ R
+    by_camera = np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
+    return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, R.T @ own @ R)
+
+
+def normalised_innovation(
+    stereo: RectifiedStereo, sigma: float, predicted: PredictedPose, points: PredictedPoints, z: Array, step: Array
+) -> tuple[float, int]:
+    """``νᵀ S⁻¹ ν`` of measurements (M, 3) taken together, and its degrees of freedom.
+
+    `points` are as seen from the solved pose, which lies `step` (6,) from the predicted one: the innovation is referred
+    to the prediction through a linearisation where the measurements agree, which holds over long steps too.
+
+    S is the innovations' joint covariance: what the poses of the window and the motion do to all, and each landmark's
+    own. It is inverted through the poses (Woodbury), which are fewer.
+    """
+    h, J = stereo.project(points.local)
+    r = z - h
+    missing = ~np.isfinite(r)
+    own = J @ points.own @ np.swapaxes(J, 1, 2) + sigma**2 * np.eye(3)
+    W = np.linalg.inv(np.linalg.cholesky(own))
+    W[missing[:, 2], 2] = 0
+    r = r + by_pose(J, points.local) @ step
+    r[missing] = 0
+    r = (W @ r[:, :, None]).reshape(-1)
+    G = W @ np.concatenate([J @ points.by_window, by_pose(J, points.local)], axis=2)
+    G[missing] = 0
+    n = 6 * len(predicted.window)
+    G = G.reshape(len(r), -1)
+    G[:, :n] = G[:, :n] @ _root(predicted.window.covariance)
+    G[:, n:] = G[:, n:] @ _root(predicted.noise)
+    b, M = G.T @ r, G.T @ G
+    M[np.diag_indices_from(M)] += 1
+    return float(r @ r - b @ np.linalg.solve(M, b)), int((~missing).sum())
+
+
+def _root(P: Array) -> Array:
+    """A lower triangular L with ``L Lᵀ = P``; a trace of noise keeps it real where P is all but singular."""
+    return np.linalg.cholesky(P + 1e-10 * np.diag(np.diag(P)))

@@ -1,0 +1,81 @@
+"""The whole problem once more from the records, solved by Levenberg-Marquardt; the way out when ISAM2 has failed."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from backends.smoother.graph import FactorMaker, to_pose3
+from backends.smoother.records import IndexArray, Path, Records, Track
+from backends.smoother.solver import FAILURES, Change, SolverError
+from backends.smoother.variables import pose_key
+from slam.se3 import Array
+
+_ITERATIONS = 30
+
+
+def whole_problem(make: FactorMaker, records: Records) -> tuple[Change, list[tuple[Track, int]]]:
+    """All factors and first values, and the tracks with the places of their smart factors."""
+    change = Change()
+    add_poses(change, make, records)
+    for rows in records.history.finished:
+        points = [make.point(z) for z in records.measurements.z[rows].tolist()]
+        change.factors.add(make.smart(points, pose_keys(records, rows)))
+    for key, all_rows in records.history.explicit.items():
+        add_landmark(change, make, records, key, np.array(all_rows), records.history.places[key])
+    places = []
+    for track in records.landmarks.tracks.values():
+        if track.informative:
+            places.append((track, change.factors.size()))
+            change.factors.add(make.smart(track.points, track.keys))
+    return change, places
+
+
+def add_poses(change: Change, make: FactorMaker, records: Records) -> None:
+    """All poses, with what ties them to each other and to the world."""
+    path = records.path
+    for i in range(path.count):
+        change.values.insert(pose_key(i), to_pose3(path.poses[i]))
+        change.factors.add(pose_factor(make, path, i, records.history.impulses[i]))
+
+
+def pose_factor(make: FactorMaker, path: Path, i: int, impulse: float) -> gtsam.NonlinearFactor:
+    """What ties the pose of frame `i` to those before it, or to the world."""
+    stamps = path.stamps
+    if i == 0:
+        return make.prior(pose_key(0))
+    if i == 1:
+        return make.first_motion((pose_key(0), pose_key(1)), stamps[1] - stamps[0])
+    keys = (pose_key(i - 2), pose_key(i - 1), pose_key(i))
+    return make.motion(keys, stamps[i - 1] - stamps[i - 2], stamps[i] - stamps[i - 1], impulse)
+
+
+def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:
+    """The values that fit all factors best, by Levenberg-Marquardt.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    try:
+        before = change.factors.error(change.values)
+        values = gtsam.LevenbergMarquardtOptimizer(change.factors, change.values, parameters).optimize()
+        after = change.factors.error(values)
+    except FAILURES as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
+    if not np.isfinite(after) or after > before:
+        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    return values
+
+
+def pose_keys(records: Records, rows: IndexArray) -> list[int]:
+    """Pose variables of measurements."""
+    return [pose_key(i) for i in records.measurements.frame[rows].tolist()]
+
+
+def add_landmark(change: Change, make: FactorMaker, records: Records, key: int, rows: IndexArray, place: Array) -> None:
+    """A landmark that is a variable, first placed at `place` (3,) in world coordinates."""
+    for z, pose in zip(records.measurements.z[rows].tolist(), pose_keys(records, rows)):
+        change.factors.add(make.explicit(make.point(z), pose, key))
+    change.values.insert(key, place)

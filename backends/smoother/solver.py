@@ -1,0 +1,170 @@
+"""The incremental solver: gtsam's ISAM2, its settings, and its failures as one exception."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import gtsam
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from backends.smoother.variables import ballast_key, size_of
+from slam.errors import SlamError
+from slam.se3 import Array
+
+_T = TypeVar("_T")
+
+#: What gtsam throws when it cannot solve.
+FAILURES = (RuntimeError, ValueError, IndexError)
+
+#: ISAM2 starts from scratch whenever over 65 % of all variables are touched, as they are in a small map. So many
+#: variables that nothing depends on keep it incremental from the start.
+_BALLAST = 2000
+
+
+class _SeenEnoughError(Exception):
+    """Ends a computation that has shown what was wanted of it."""
+
+
+class SolverError(SlamError):
+    """The solver failed; the message is gtsam's, in one line."""
+
+
+@dataclass
+class Change:
+    """What one update puts into the problem and takes out of it.
+
+    Attributes:
+        factors: new factors.
+        values: first values of new variables.
+        removed: slots of factors to take out.
+        late: variables to eliminate late, those of the first set before those of the second: what will be touched
+            again soon. Without it a landmark that was seen from many poses may be eliminated before them, and with it
+            in between everything is touched by everything.
+    """
+
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    removed: list[int] = field(default_factory=list)
+    late: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
+
+
+class Solver:
+    """ISAM2 with the settings that hold for smart stereo factors.
+
+    Args:
+        thresholds: how far each kind of variable may move before it is linearised anew.
+    """
+
+    def __init__(self, thresholds: gtsam.ISAM2ThresholdMap) -> None:
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(thresholds)
+        parameters.relinearizeSkip = 1
+        parameters.findUnusedFactorSlots = True
+        parameters.cacheLinearizedFactors = True
+        self._isam = gtsam.ISAM2(parameters)
+        self._guarded(lambda: self._isam.update(*_ballast()))
+
+    def update(self, change: Change) -> list[int]:
+        """One step; returns the slots of the new factors, in their order.
+
+        Raises:
+            SolverError: gtsam failed. The solver is then broken and has to be made anew.
+        """
+        parameters = gtsam.ISAM2UpdateParams()
+        parameters.removeFactorIndices = change.removed
+        if any(change.late):
+            parameters.constrainedKeys = _groups(change.late)
+        result = self._guarded(lambda: self._isam.update(change.factors, change.values, parameters))
+        return result.getNewFactorsIndices()
+
+    def poses(self, keys: Iterable[int]) -> Array:
+        """Pose variables (K, 4, 4)."""
+        isam = self._isam
+        return self._guarded(lambda: np.array([isam.calculateEstimatePose3(key).matrix() for key in keys]))
+
+    def points(self, keys: Iterable[int]) -> Array:
+        """Point variables (K, 3)."""
+        isam = self._isam
+        found = self._guarded(lambda: [isam.calculateEstimatePoint3(key) for key in keys])
+        return np.array(found).reshape(-1, 3)
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """Joint covariance of pose variables, in the order of `keys`; quick for those that were eliminated last.
+
+        Raises:
+            SolverError: gtsam failed.
+        """
+        root = self._guarded(lambda: _root_of(self._isam, keys[-1]))
+        if root is not None and set(keys) <= set(root[0]):
+            return _covariance_in(*root, keys)
+        if len(keys) == 1:
+            return self._guarded(lambda: self._isam.marginalCovariance(keys[0]))
+        return self._guarded(lambda: self._isam.jointMarginalCovariance(keys).fullMatrix())
+
+    def values(self) -> gtsam.Values:
+        """All variables, solved to the last."""
+        return self._guarded(self._isam.calculateBestEstimate)
+
+    @staticmethod
+    def _guarded(call: Callable[[], _T]) -> _T:
+        try:
+            return call()
+        except FAILURES as error:
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            raise SolverError("gtsam: " + (" ".join(lines[:3]) or type(error).__name__)) from error
+
+
+def _groups(late: tuple[set[int], set[int]]) -> gtsam.KeyGroupMap:
+    """The form in which gtsam takes `Change.late`."""
+    groups = gtsam.KeyGroupMap()
+    for number, keys in enumerate(late, start=1 if late[0] else 0):
+        for key in keys:
+            groups.insert2(key, number)
+    return groups
+
+
+def _root_of(isam: gtsam.ISAM2, key: int) -> tuple[list[int], Array] | None:
+    """The root of the Bayes tree, if `key` is in it: its variables, and its triangular matrix R with RᵀR = P⁻¹.
+
+    gtsam does not hand out the tree, but it hands the root's conditional to whatever function shall eliminate the
+    others from it. gtsam's own would square the matrix and factorise it again; it is triangular already, so what it
+    says of the variables that were eliminated last stands in its last rows.
+    """
+    found: list[tuple[list[int], Array]] = []
+
+    def look(graph: gtsam.GaussianFactorGraph, _: gtsam.Ordering) -> Any:
+        root = graph.at(0)
+        if graph.size() == 1 and isinstance(root, gtsam.GaussianConditional) and not root.S().size:
+            found.append((root.keys(), root.R()))
+        raise _SeenEnoughError
+
+    with suppress(_SeenEnoughError):
+        isam.marginalFactor(key, look)
+    return found[0] if found else None
+
+
+def _covariance_in(variables: list[int], R: Array, keys: list[int]) -> Array:
+    """Joint covariance of pose variables in the root."""
+    sizes = [size_of(v) for v in variables]
+    starts = dict(zip(variables, np.cumsum([0, *sizes]).tolist()))
+    columns = np.concatenate([np.arange(starts[key], starts[key] + 6) for key in keys])
+    first = int(columns.min())
+    unit = np.zeros((len(R) - first, len(columns)))
+    unit[columns - first, np.arange(len(columns))] = 1
+    half = solve_triangular(R[first:, first:], unit, trans="T")
+    return half.T @ half
+
+
+def _ballast() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Variables that nothing depends on, with their factors."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
+    for i in range(_BALLAST):
+        key = ballast_key(i)
+        values.insert(key, np.zeros(1))
+        graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
+    return graph, values

@@ -1,0 +1,107 @@
+"""How landmarks hang on the poses that saw them: refinement, covariances, and what is predicted of them.
+
+A landmark's position, given all poses, follows from its measurements alone: ``l = l(x_1, x_2, …) + e`` with
+``cov(e) = σ² (ΣEᵀE)⁻¹`` and ``∂l/∂x_j = −(ΣEᵀE)⁻¹ E_jᵀF_j``, where E and F are the measurements' Jacobians by the
+landmark and by the pose. A measurement depends on nothing but where the landmark stands in the camera, so
+``F_j = −E_j G_j``, where G_j is how a point moves that is fixed to pose j; thus ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j`` with the
+information ``I_j = E_jᵀE_j``: each pose carries the landmark along by its share of the information. With the joint
+covariance of the poses that gives every covariance asked for, with the correlations between poses and landmarks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backends.smoother.records import IndexArray, Landmarks, Measurements
+from backends.smoother.stereo import RectifiedStereo
+from slam.se3 import Array
+
+
+def linearise(
+    stereo: RectifiedStereo, sigma: float, poses: Array, measurements: Measurements, points: Array, rows: IndexArray
+) -> tuple[Array, Array]:
+    """Linearise the measurements `rows` (M, K), −1 for none, of the landmarks at `points` (M, 3).
+
+    Returns:
+        Jacobians E (M, K, 3, 3) by the landmarks and residuals (M, K, 3), measured less predicted, both in units of
+        the pixel noise; what is missing is zero.
+    """
+    shape = rows.shape
+    T = poses[measurements.frame[rows]].reshape(-1, 4, 4)
+    R = T[:, :3, :3]
+    offset = np.repeat(points, shape[1], axis=0) - T[:, :3, 3]
+    h, J = stereo.project((offset[:, None, :] @ R)[:, 0])
+    r = measurements.z[rows].reshape(-1, 3) - h
+    missing = ~np.isfinite(r) | (rows.reshape(-1, 1) < 0)
+    r[missing] = 0
+    J[missing] = 0
+    E = J @ np.swapaxes(R, 1, 2)
+    return E.reshape(*shape, 3, 3) / sigma, r.reshape(*shape, 3) / sigma
+
+
+def position_step(E: Array, r: Array, older: Array) -> tuple[Array, Array]:
+    """Gauss-Newton steps (M, 3) of the positions, and their covariances (M, 3, 3) where all poses are known.
+
+    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones.
+    """
+    count, width = r.shape[:2]
+    E = E.reshape(count, 3 * width, 3)
+    Et = np.swapaxes(E, 1, 2)
+    information = Et @ E + older
+    # Far points leave their depth nearly free: the little that is added keeps the inverse finite.
+    information += np.eye(3) * (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-12)
+    covariance = np.linalg.inv(information)
+    step = covariance @ (Et @ r.reshape(count, 3 * width, 1))
+    return step[:, :, 0], covariance
+
+
+@dataclass(frozen=True)
+class PoseSet:
+    """Poses with their joint covariance.
+
+    Attributes:
+        frames: their frames (W,), ascending.
+        poses: (W, 4, 4).
+        covariance: (6 W, 6 W).
+    """
+
+    frames: IndexArray
+    poses: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, slots: IndexArray) -> Array:
+    """Jacobians (M, 3, 6 W) of landmark positions by poses of the set.
+
+    A measurement from another pose counts for the pose of the set that comes next, as if the two were fixed to each
+    other; what is no longer among the recent measurements counts for the pose next to the oldest one that is.
+    """
+    rows, count, width = landmarks.recent[slots], len(slots), len(known)
+    frames = measurements.frame[rows]
+    place = np.minimum(np.searchsorted(known.frames, frames), width - 1)
+    share = (place[:, None, :] == np.arange(width)[None, :, None]).astype(float)
+    information = (share @ landmarks.information[slots].reshape(*rows.shape, 9)).reshape(count, width, 3, 3)
+    oldest = np.where(rows >= 0, place, width).min(axis=1)
+    information[np.arange(count), oldest] += landmarks.older[slots]
+    carried = landmarks.covariance[slots][:, None] @ information @ _carry(known.poses, landmarks.position[slots])
+    return np.swapaxes(carried, 1, 2).reshape(count, 3, 6 * width)
+
+
+def _carry(poses: Array, points: Array) -> Array:
+    """G (M, W, 3, 6): how points (M, 3) move that are fixed to poses (W, 4, 4), by the poses' perturbation."""
+    R = poses[None, :, :3, :3]
+    x, y, z = np.moveaxis(points[:, None] - poses[None, :, :3, 3], 2, 0)
+    zero = np.zeros_like(x)
+    turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=2).reshape(*x.shape, 3, 3)  # −hat of the offset
+    return np.concatenate([turn @ R, np.broadcast_to(R, turn.shape)], axis=3)
+
+
+def quadratic(A: Array, P: Array) -> Array:
+    """``A P Aᵀ`` (M, k, k) for A (M, k, n)."""
+    count, k, n = A.shape
+    return (A.reshape(count * k, n) @ P).reshape(count, k, n) @ np.swapaxes(A, 1, 2)

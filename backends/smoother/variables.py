@@ -1,0 +1,64 @@
+"""Names of the variables, and how far each may move before it is linearised anew.
+
+gtsam names a variable by a letter and a number, and takes one threshold per letter. A far landmark may move much
+further than a near one for the same error in the image; so landmarks have letters by how far they may move.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from backends.smoother.stereo import RectifiedStereo
+
+_POSE = "x"
+_BALLAST = "z"
+_LETTERS = "ABCDEFGHIJKLMNOP"
+_FINEST = 1e-3  # threshold of the first letter [m]; each next one's is twice as large
+
+#: Distance of near landmarks, in baselines; what is nearer is hardly seen by both cameras.
+_NEAR = 8.0
+
+
+def pose_key(frame: int) -> int:
+    """Variable of a frame's pose."""
+    return int(gtsam.symbol(_POSE, frame))
+
+
+def landmark_key(number: int, threshold: float = _FINEST) -> int:
+    """Variable of a landmark's position that may move by `threshold` [m], or by little less."""
+    letter = int(np.clip(np.floor(np.log2(threshold / _FINEST)), 0, len(_LETTERS) - 1))
+    return int(gtsam.symbol(_LETTERS[letter], number))
+
+
+def ballast_key(number: int) -> int:
+    """A variable that nothing depends on."""
+    return int(gtsam.symbol(_BALLAST, number))
+
+
+def size_of(key: int) -> int:
+    """Degrees of freedom of a pose or landmark."""
+    return 6 if gtsam.symbolChr(key) == ord(_POSE) else 3
+
+
+def landmark_threshold(stereo: RectifiedStereo, distance: float, error: float) -> float:
+    """How far a landmark may move along its ray before linearised pixels are off by `error` [px].
+
+    The disparity ``d = f b / z`` is off by ``d (δz / z)²``.
+    """
+    return distance * float(np.sqrt(error * distance / (stereo.f * stereo.baseline)))
+
+
+def thresholds(stereo: RectifiedStereo, error: float) -> gtsam.ISAM2ThresholdMap:
+    """How far each kind of variable may move before linearised pixels are off by about `error` [px].
+
+    A turn by δ moves pixels near the centre by f δ, to within f δ² / 2; a step by δ those at depth z to within f δ²/z².
+    """
+    turn = np.sqrt(2 * error / stereo.f)
+    step = _NEAR * stereo.baseline * np.sqrt(error / stereo.f)
+    table = gtsam.ISAM2ThresholdMap()
+    table.insert((_POSE, np.repeat([turn, step], 3)))
+    table.insert((_BALLAST, np.ones(1)))
+    for i, letter in enumerate(_LETTERS):
+        table.insert((letter, np.full(3, _FINEST * 2**i)))
+    return table

@@ -1,0 +1,403 @@
+"""The SURF front end against OpenCV's SIFT and ORB: speed, quality, stereo, start-up.
+
+``python benchmarks/surf.py``               all of it, as ratios of medians of CPU time in one run
+``python benchmarks/surf.py speed stereo``  some of: speed threads quality dimensions stereo points start threshold
+``--figure FILE``                           the curves over D_threshold as a picture
+
+Uses the images under the environment variable SLAM_DATA where it is set, else rendered ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import slam
+from benchmarks.plain_surf import plain_descriptors
+from frontends.surf import Keypoints, Surf, SurfFrontend
+from slam import se3
+from slam.config import SystemConfig
+from slam.rig import StereoRig
+
+SIZES = ((320, 240), (752, 480), (1241, 376))
+DATA = Path(os.environ["SLAM_DATA"]) if os.environ.get("SLAM_DATA") else None
+
+
+def medians(tasks: dict[str, Callable[[], object]], rounds: int = 21, clock: Callable[[], float] | None = None) -> dict:
+    """Median time of each task [ms], taken in turns in one run; CPU time of this thread unless a clock is given."""
+    clock = clock or time.thread_time
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    for k in range(rounds + 1):
+        for name, task in tasks.items():
+            start = clock()
+            task()
+            if k:
+                times[name].append(1e3 * (clock() - start))
+    return {name: float(np.median(row)) for name, row in times.items()}
+
+
+def test_image(width: int, height: int) -> np.ndarray:
+    """A bookshelf, or a street where the image is wide."""
+    if DATA and (width, height) != SIZES[2]:
+        with np.load(DATA / "surf_reference" / "surf_reference.npz") as file:
+            return file[f"shelf_{width}x{height}/image"]
+    name = "street" if width > 1000 else "aisle"
+    return slam.open_sequence(f"synthetic:{name}?frames=60&width={width}&height={height}").frame(30).left
+
+
+def with_features(image: np.ndarray, count: int = 800) -> float:
+    """The D_threshold that finds `count` features."""
+    response = Surf(0.0).detect(image).response
+    return float(response[min(count, len(response) - 1)])
+
+
+def speed() -> None:
+    """Detection and description by one thread, about 800 features."""
+    print("\n## Speed: CPU time of one thread, about 800 features\n")
+    print("| image | what | ms | SIFT(800) takes | ORB(1000) takes |\n| --- | --- | --- | --- | --- |")
+    for width, height in SIZES:
+        image = test_image(width, height)
+        threshold = with_features(image)
+        tasks: dict[str, Callable[[], object]] = {
+            "SIFT": lambda image=image: cv2.SIFT_create(800).detectAndCompute(image, None),
+            "ORB": lambda image=image: cv2.ORB_create(1000).detectAndCompute(image, None),
+        }
+        for descriptor in (64, 16):
+            for upright in (True, False):
+                surf = Surf(threshold, descriptor=descriptor, upright=upright)
+                name = f"{descriptor}-D {'upright' if upright else 'oriented'}"
+                tasks[name] = lambda surf=surf, image=image: surf.detect_and_describe(image)
+        tasks["detection alone"] = lambda surf=surf, image=image: surf.detect(image)
+        ms = medians(tasks)
+        for name in tasks:
+            ratios = f"{ms['SIFT'] / ms[name]:.1f} x | {ms['ORB'] / ms[name]:.2f} x"
+            print(f"| {width}x{height} ({len(surf.detect(image))}) | {name} | {ms[name]:.2f} | {ratios} |")
+
+
+def threads() -> None:
+    """Wall time of one thread and two."""
+    print("\n## Threads: wall time\n")
+    image = test_image(752, 480)
+    threshold = with_features(image)
+    surfs = {f"{n} threads": Surf(threshold, threads=n) for n in (1, 2)}
+    ms = medians({k: lambda s=s: s.detect_and_describe(image) for k, s in surfs.items()}, 41, time.perf_counter)
+    (a, da), (b, db) = (s.detect_and_describe(image) for s in surfs.values())
+    same = a.uv.tobytes() == b.uv.tobytes() and da.tobytes() == db.tobytes()
+    print(f"{ms}: two threads are {ms['1 threads'] / ms['2 threads']:.2f} times as fast; same bytes: {same}")
+
+
+def turned(degrees: float, factor: float, size: tuple[int, int]) -> np.ndarray:
+    """Homography (3, 3) that turns and zooms an image about its middle."""
+    return np.vstack([cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), degrees, factor), [0, 0, 1]])
+
+
+def seen_from_aside(degrees: float, size: tuple[int, int]) -> np.ndarray:
+    """Homography (3, 3) of a plane that turns about its vertical middle line, at a distance of its width."""
+    a, w = np.deg2rad(degrees), float(size[0])
+    K = np.array([[w, 0, size[0] / 2], [0, w, size[1] / 2], [0, 0, 1]])
+    P = np.array([[np.cos(a), 0, 0], [0, 1, 0], [-np.sin(a), 0, 1]])
+    return K @ P @ np.linalg.inv(K)
+
+
+def changes(size: tuple[int, int]) -> dict[str, tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
+    """Warps (3, 3), and what else happens to the image, by name."""
+
+    def plain(image: np.ndarray) -> np.ndarray:
+        return image
+
+    def noisy(image: np.ndarray) -> np.ndarray:
+        return np.clip(image + 8 * np.random.default_rng(0).standard_normal(image.shape), 0, 255).astype(np.uint8)
+
+    still = np.eye(3)
+    table = {f"turned {d}°": (turned(d, 1.0, size), plain) for d in (15, 45, 100)}
+    table |= {f"scale {f}": (turned(0, f, size), plain) for f in (0.5, 0.8, 1.25, 2.0)}
+    table |= {f"aside {d}°": (seen_from_aside(d, size), plain) for d in (20, 40)}
+    table["blur 1.5 px"] = (still, lambda image: cv2.GaussianBlur(image, (0, 0), 1.5))
+    table["noise 8"] = (still, noisy)
+    table["darker"] = (still, lambda image: (0.4 * image + 5).astype(np.uint8))
+    return table
+
+
+Found = tuple[np.ndarray, np.ndarray, np.ndarray]  # pixels (N, 2), sizes (N,), descriptors (N, D)
+
+
+def surf_method(
+    threshold: float, count: int, plain: bool = False, localise: bool = False, **options: object
+) -> Callable:
+    """Our features; with the reference's descriptors where `plain`."""
+    surf = Surf(threshold, **options)  # type: ignore[arg-type]
+
+    def run(image: np.ndarray) -> Found:
+        keypoints = surf.detect(image)
+        if localise:
+            keypoints = surf.localise(image, keypoints)
+        keypoints, descriptors = surf.describe(image, keypoints.select(np.arange(min(count, len(keypoints)))))
+        if plain:
+            descriptors = plain_descriptors(image, keypoints.uv, keypoints.size, keypoints.angle)
+        return keypoints.uv, keypoints.size, descriptors
+
+    return run
+
+
+def opencv_method(detector: cv2.Feature2D) -> Callable[[np.ndarray], Found]:
+    """OpenCV's features."""
+
+    def run(image: np.ndarray) -> Found:
+        keypoints, descriptors = detector.detectAndCompute(image, None)
+        if descriptors.dtype == np.uint8:  # Hamming distance is the squared distance of the bits
+            descriptors = np.unpackbits(descriptors, axis=1).astype(np.float32)
+        return np.array([k.pt for k in keypoints]), np.array([k.size for k in keypoints]), descriptors
+
+    return run
+
+
+def score(a: Found, b: Found, H: np.ndarray, shape: tuple[int, int]) -> tuple[float, float, float]:
+    """Repeatability, matching score, and median distance [px] of repeated features under the true warp.
+
+    A feature is repeated where one lies within 2.5 px of its true place, sizes alike; it is matched where its nearest
+    descriptor is that of such a one. Both as shares of the features whose place is inside the other image.
+    """
+    there = cv2.perspectiveTransform(a[0][None].astype(float), H)[0]
+    grown = cv2.perspectiveTransform((a[0] + (1, 0))[None].astype(float), H)[0]
+    height, width = shape
+    inside = ((there > 20) & (there < (width - 20, height - 20))).all(axis=1)
+    factor = np.linalg.norm(grown - there, axis=1)
+    distance = np.linalg.norm(there[:, None] - b[0][None], axis=2)
+    ratio = (a[1] * factor)[:, None] / b[1][None]
+    good = (distance < 2.5) & (np.abs(np.log(ratio)) < np.log(1.6))
+    repeated = good.any(axis=1) & inside
+    nearest = (-2 * a[2] @ b[2].T + (b[2] ** 2).sum(axis=1)).argmin(axis=1)
+    matched = good[np.arange(len(there)), nearest] & inside
+    off = np.where(good, distance, np.inf).min(axis=1)[repeated]
+    return repeated.sum() / inside.sum(), matched.sum() / inside.sum(), float(np.median(off)) if len(off) else np.nan
+
+
+def quality() -> None:
+    """Repeatability and matching score on warps."""
+    print("\n## Quality on warps: repeatability / matching score / median error [px], 500 features\n")
+    image = test_image(752, 480)
+    threshold = 100.0
+    methods = {
+        "64-D oriented": surf_method(threshold, 500, upright=False),
+        "reference": surf_method(threshold, 500, plain=True, upright=False),
+        "16-D oriented": surf_method(threshold, 500, upright=False, descriptor=16),
+        "64-D upright": surf_method(threshold, 500),
+        "16-D upright": surf_method(threshold, 500, descriptor=16),
+        "64-D oriented, localised": surf_method(threshold, 500, upright=False, localise=True),
+        "SIFT": opencv_method(cv2.SIFT_create(500)),
+        "ORB": opencv_method(cv2.ORB_create(500)),
+    }
+    print("| change | " + " | ".join(methods) + " |\n" + "| --- " * (len(methods) + 1) + "|")
+    size = image.shape[::-1]
+    first = {name: run(image) for name, run in methods.items()}
+    rows = []
+    for name, (H, change) in changes(size).items():
+        other = change(cv2.warpPerspective(image, H, size, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT))
+        row = [score(first[m], run(other), H, image.shape) for m, run in methods.items()]
+        rows.append(row)
+        print(f"| {name} | " + " | ".join(f"{r:.2f} / {m:.2f} / {e:.2f}" for r, m, e in row) + " |")
+    print("| mean | " + " | ".join(f"{r:.3f} / {m:.3f} / {e:.2f}" for r, m, e in np.mean(rows, axis=0)) + " |")
+
+
+def dimensions() -> None:
+    """Time of describing in 16 and in 64 dimensions."""
+    print("\n## 16-D against 64-D: CPU time of description (paper A, III.B: 45 % less for 100 to 800 features)\n")
+    image = test_image(752, 480)
+    everything = Surf(0.0).detect(image)
+    for count in (100, 400, 800):
+        keypoints: Keypoints = everything.select(np.arange(count))
+        surfs = {(d, u): Surf(descriptor=d, upright=u) for d in (16, 64) for u in (True, False)}
+        ms = medians({str(k): lambda s=s, k=keypoints: s.describe(image, k) for k, s in surfs.items()})
+        for upright in (True, False):
+            saved = 1 - ms[str((16, upright))] / ms[str((64, upright))]
+            print(f"{count} features, {'upright' if upright else 'oriented'}: {100 * saved:.0f} % saved")
+
+
+def disparity_errors(features: slam.StereoFeatures, truth: np.ndarray) -> np.ndarray:
+    """Disparity less the true one [px] of the matched features, by a table (H, W) with NaN where unknown."""
+    u, v = np.rint(features.uv_left).astype(int).T
+    errors = (features.uv_left - features.uv_right)[:, 0] - truth[v, u]
+    return errors[np.isfinite(errors)]
+
+
+def stereo() -> None:
+    """Stereo matches on pairs with known disparity, and the epipolar residual on recorded ones."""
+    print("\n## Stereo\n")
+    for world in ("aisle", "desk", "street"):
+        sequence = slam.open_sequence(f"synthetic:{world}?frames=60")
+        rig, frontend = sequence.rig, SurfFrontend(sequence.rig)
+        shares, errors = [], []
+        for k in range(0, 60, 10):
+            features = frontend.extract(sequence.frame(k))
+            with np.errstate(divide="ignore"):
+                truth = rig.left.fu * rig.baseline / sequence.depth(k)
+            shares.append(features.has_stereo.mean())
+            errors.append(np.abs(disparity_errors(features, np.where(np.isfinite(truth), truth, np.nan))))
+        off = np.concatenate(errors)
+        print(
+            f"rendered {world}: {np.mean(shares):.3f} of the features matched, {np.mean(off < 1):.3f} of them within "
+            f"1 px, median error {np.median(off):.3f} px"
+        )
+    if DATA:
+        middlebury(DATA / "middlebury_motorcycle")
+        kitti(DATA / "kitti_odometry" / "sequences" / "06")
+
+
+def middlebury(folder: Path) -> None:
+    """Motorcycle of the Middlebury 2014 set."""
+    left, right = (cv2.imread(str(folder / f"motorcycle_{side}.png")) for side in ("left", "right"))
+    with np.load(folder / "motorcycle_disp.npz") as file:
+        truth = file[file.files[0]].astype(float)
+    truth[~np.isfinite(truth)] = np.nan
+    height, width = truth.shape
+    rig = StereoRig.rectified_pair(994.978, 311.193, 254.877, 0.193001, width, height, doffs=31.086)
+    features = SurfFrontend(rig).extract(slam.StereoFrame(0, 0.0, left, right))
+    off = np.abs(disparity_errors(features, truth))
+    print(
+        f"Middlebury motorcycle: {features.has_stereo.mean():.3f} matched, {np.mean(off < 1):.3f} within 1 px, "
+        f"median error {np.median(off):.3f} px"
+    )
+
+
+def kitti(folder: Path) -> None:
+    """Distance from the epipolar line; the median is the data set's own rectification."""
+    sequence = slam.open_sequence(folder)
+    frontend = SurfFrontend(sequence.rig)
+    shares, rows = [], []
+    for frame in sequence:
+        features = frontend.extract(frame)
+        shares.append(features.has_stereo.mean())
+        rows.append((features.uv_right - features.uv_left)[features.has_stereo, 1])
+    off = np.concatenate(rows)
+    print(
+        f"KITTI 06: {np.mean(shares):.3f} matched, {np.mean(np.abs(off) < 1):.3f} within 1 px of the epipolar line "
+        f"(median {np.median(off):+.3f} px, deviation {1.48 * np.median(np.abs(off - np.median(off))):.3f} px)"
+    )
+
+
+def points() -> None:
+    """Paper A's first experiment: error of estimated points in EKF SLAM, with either descriptor."""
+    print("\n## Known points in EKF SLAM: error of the estimated positions, 16-D and 64-D\n")
+    for world in ("aisle?frames=150", "desk?frames=150"):
+        for descriptor in (16, 64):
+            sequence = slam.open_sequence(f"synthetic:{world}")
+            config = SystemConfig.for_kind(sequence.kind)
+            frontend = SurfFrontend(sequence.rig, descriptor=descriptor, features=400)
+            system = slam.StereoSlam(sequence.rig, frontend=frontend, backend="ekf", config=config)
+            for frame in sequence:
+                system.process(frame)
+            errors = point_errors(sequence, system, len(sequence) - 1)
+            print(
+                f"{world}, {descriptor}-D: {len(errors)} points in view at the end, median error "
+                f"{1e3 * np.median(errors):.1f} mm, 90 % below {1e3 * np.percentile(errors, 90):.1f} mm"
+            )
+
+
+def point_errors(sequence, system, last: int) -> np.ndarray:
+    """Distance (N,) [m] along the line of sight between the map's points and the true surface, in the last frame."""
+    truth = sequence.ground_truth.poses
+    T_left_first = se3.inverse(truth[last]) @ truth[0]  # the system's world is its first left camera
+    local = se3.transform(T_left_first, system.backend.estimate().positions)
+    uv = sequence.rig.left.project(local)
+    seen = sequence.rig.left.in_image(uv) & (local[:, 2] > 0)
+    u, v = np.rint(uv[seen]).astype(int).T
+    depth = sequence.depth(last)[v, u]
+    known = depth > 0
+    return np.abs(local[seen, 2][known] - depth[known])
+
+
+START = """
+import time; wall, cpu = time.perf_counter(), time.process_time()
+import numpy as np
+import frontends
+from slam.data import StereoFrame
+from slam.rig import StereoRig
+image = np.random.default_rng(0).integers(0, 255, (120, 188), np.uint8).repeat(4, 0).repeat(4, 1)
+frontend = frontends.create("surf", StereoRig.rectified_pair(450.0, 376.0, 240.0, 0.11, 752, 480))
+count = len(frontend.extract(StereoFrame(0, 0.0, image, image)))
+print(f"{time.perf_counter() - wall:.2f} s wall, {time.process_time() - cpu:.2f} s CPU to the first {count} features")
+"""
+
+
+def start() -> None:
+    """From the start of Python's imports to the first features, with nothing compiled and then from the cache."""
+    print("\n## Start\n")
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+        for name in ("cold", "warm", "warm"):
+            done = subprocess.run([sys.executable, "-c", START], env=environment, capture_output=True, text=True)
+            print(f"{name}: {done.stdout.strip()}   {done.stderr.strip()}")
+
+
+def threshold(figure: Path | None = None) -> None:
+    """Features and time over D_threshold and octave, and radius by octave (paper A, III.A)."""
+    print("\n## D_threshold: features, CPU time of detection [ms], median radius [px] by octave, 320x240\n")
+    image = test_image(320, 240)
+    print("| D_threshold | octave 1 | octave 2 | ms, one octave | ms, two octaves |\n" + "| --- " * 5 + "|")
+    rows = []
+    for limit in (0, 10, 100, 300, 1000, 3000, 10_000):
+        keypoints = Surf(limit).detect(image)
+        ms = medians({str(n): lambda n=n, limit=limit: Surf(limit, n).detect(image) for n in (1, 2)}, 15)
+        counts = [int((keypoints.octave == o).sum()) for o in (0, 1)]
+        rows.append((limit, *counts, *ms.values()))
+        print("| {} | {} | {} | {:.2f} | {:.2f} |".format(*rows[-1]))
+    everything = Surf(100).detect(image)
+    for octave in (0, 1):
+        radius = 0.5 * everything.size[everything.octave == octave]
+        print(f"octave {octave + 1}: radius {np.median(radius):.1f} px (of {radius.min():.1f} to {radius.max():.1f})")
+    if figure:
+        draw(np.array(rows), everything, figure)
+
+
+def draw(rows: np.ndarray, keypoints: Keypoints, figure: Path) -> None:
+    """Curves over D_threshold, and the radii, as a picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, (a, b, c) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+    x = np.maximum(rows[:, 0], 1)
+    a.stackplot(x, rows[:, 1], rows[:, 2], labels=["octave 1", "octave 2"], colors=["#4477aa", "#ccbb44"])
+    a.set(xscale="log", xlabel="D_threshold", ylabel="features", title="Features")
+    b.plot(x, rows[:, 3], "o-", x, rows[:, 4], "s-")
+    b.set(xscale="log", xlabel="D_threshold", ylabel="CPU time [ms]", ylim=(0, None), title="Detection")
+    b.legend(["one octave", "two octaves"])
+    radii = [0.5 * keypoints.size[keypoints.octave == o] for o in (0, 1)]
+    c.hist(radii, bins=np.arange(3, 30), stacked=True, color=["#4477aa", "#ccbb44"], label=["octave 1", "octave 2"])
+    c.set(xlabel="radius [px]", ylabel="features", title="Radius by octave")
+    for axis in (a, c):
+        axis.legend()
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(figure, dpi=110)
+
+
+SECTIONS = {f.__name__: f for f in (speed, threads, quality, dimensions, stereo, points, start, threshold)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sections", nargs="*", choices=[*SECTIONS, []], metavar="SECTION", help=", ".join(SECTIONS))
+    parser.add_argument("--figure", type=Path, help="write the curves over D_threshold here")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    for name in arguments.sections or SECTIONS:
+        if name == "threshold":
+            threshold(arguments.figure)
+        else:
+            SECTIONS[name]()
+
+
+if __name__ == "__main__":
+    main()
