@@ -119,7 +119,7 @@ def list_command() -> None:
 @app.command("demo")
 def demo_command(
     out: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("slam_demo"),
-    frames: Annotated[int, typer.Option(min=10, help="Number of frames.")] = 200,
+    frames: Annotated[int, typer.Option(min=10, help="Number of frames.")] = 150,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
 ) -> None:
     """Run both back ends on a built-in scene, compare them, and draw pictures."""

@@ -29,7 +29,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
     import matplotlib
 
     matplotlib.use("Agg")
-    world = f"synthetic:aisle?frames={frames}&box=1"
+    world = f"synthetic:aisle?frames={frames}&speed=2&box=1"
     summaries: list[dict[str, Any]] = []
     last = None
     for backend in BACKENDS:

@@ -79,8 +79,8 @@ def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> 
             )  # fmt: skip
             axis.add_collection(ellipses)
             axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
+        axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
         _draw_truth(axis, run.online, truth, (0, 2))
-        axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=1.5, label="path")
         axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
         _limit_to_most(axis, run)
     axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
