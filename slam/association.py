@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Prediction, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN
+from slam.models import FORBID_UNKNOWN, require_not_negative
 from slam.se3 import Array
 
 Descriptors = NDArray[np.float32]
@@ -58,6 +58,7 @@ class AssociationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
+        require_not_negative(self)
         if len(self.window_sigmas) != len(self.d_match) or not self.window_sigmas:
             raise ConfigurationError("association: window_sigmas and d_match must have the same number of values")
         if list(self.window_sigmas) != sorted(self.window_sigmas) or self.window_sigmas[0] <= 0:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +15,7 @@ import typer
 from slam.errors import SlamError
 
 if TYPE_CHECKING:
+    from slam.data import FrameResult
     from slam.sequences import Sequence
 
 app = typer.Typer(
@@ -50,12 +53,36 @@ def main() -> None:
         print(f"slam: {error}", file=sys.stderr)
         sys.exit(2)
     except _Stopped as stopped:
-        print(f"slam: stopped by {stopped}; the frames done so far are kept", file=sys.stderr)
+        print(f"slam: stopped by {stopped}; frames done so far are kept", file=sys.stderr)
         sys.exit(128 + stopped.number)
 
 
+_pending: list[int] = []  # a signal that waits for the end of a frame
+_in_frames = False
+
+
 def _stop(number: int, frame: object) -> None:
-    raise _Stopped(number)
+    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once."""
+    if not _in_frames or _pending:
+        raise _Stopped(number)
+    _pending.append(number)
+
+
+@contextmanager
+def _whole_frames(after_frame: Callable[[FrameResult], None]) -> Iterator[Callable[[FrameResult], None]]:
+    """A callback for the end of every frame, at which a signal that came meanwhile takes effect."""
+    global _in_frames
+
+    def end_of_frame(result: FrameResult) -> None:
+        after_frame(result)
+        if _pending:
+            raise _Stopped(_pending.pop())
+
+    _in_frames = True
+    try:
+        yield end_of_frame
+    finally:
+        _in_frames = False
 
 
 @app.command("run")
@@ -80,8 +107,9 @@ def run_command(
     start, stop = parse_frames(frames)
     config = SystemConfig.for_kind(kind or opened.kind, frontend).with_settings(settings or [])
     options = RunOptions(backend, frontend, config, out, start, stop)
-    with Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet) as progress:
-        summary = run(opened, options, progress.frame)
+    progress = Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet)
+    with progress, _whole_frames(progress.frame) as end_of_frame:
+        summary = run(opened, options, end_of_frame)
     if not quiet:
         print_summary([summary], out)
 

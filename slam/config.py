@@ -53,11 +53,8 @@ class SystemConfig:
         return cls(models=models, map=MAPS[kind], frontend=dict(FRONTENDS.get((kind, frontend), {})))
 
     def to_json(self) -> dict[str, Any]:
-        """The tree as plain types; arrays as lists."""
-        tree = asdict(self)
-        T = tree["models"]["T_world_left"]
-        tree["models"]["T_world_left"] = None if T is None else T.tolist()
-        return tree
+        """The tree as plain types."""
+        return asdict(self)
 
     def with_settings(self, settings: list[str]) -> SystemConfig:
         """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.

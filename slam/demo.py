@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from slam.config import SystemConfig
 from slam.display import Progress, print_summary
 from slam.figures import RunData, draw_errors, draw_features, draw_map_3d, draw_top_view
+from slam.outputs import write_json
 from slam.runner import RunOptions, run
 from slam.sequences import open_sequence
 
@@ -38,6 +38,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         with Progress(len(sequence), f"{sequence.name} · {backend}", quiet) as progress:
             summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), progress.frame))
             last = progress.last
+    write_json(out / "comparison.json", {"runs": summaries})
     runs = [RunData.read(out / backend, backend) for backend in BACKENDS]
     truth = open_sequence(world).ground_truth
     draw_top_view(runs, truth, out / "top_view.png")
@@ -48,7 +49,6 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         frame = next(iter(open_sequence(world).frames(frames - 1)))
         uv = last.features.uv_left
         draw_features(frame.left, uv[last.matched_features], uv[last.added_features], out / "frame.png")
-    (out / "comparison.json").write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     if not quiet:
         print_summary(summaries, out)
     return summaries

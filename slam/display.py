@@ -98,9 +98,11 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
         ("landmarks", [str(s.get("landmarks", 0)) for s in summaries]),
         ("path length [m]", [f"{s.get('path_length_m', 0.0):.2f}" for s in summaries]),
     ]
-    for when in ("online", "final"):
+    for when, wanted in (("online", None), ("final", ("ATE RMSE [m]", "GPS distance RMSE [m]"))):
         keys = {key: None for s in summaries for key in s.get("accuracy", {}).get(when, {})}
         for key in keys:
+            if key == "poses with truth" or (wanted and key not in wanted):
+                continue
             rows.append((f"{when} {key}", [_figure(s["accuracy"][when].get(key)) for s in summaries]))
     rows.append(("median per frame [ms]", [_figure(s.get("milliseconds", {}).get("median_total")) for s in summaries]))
     rows.append(("frames per second", [_figure(s.get("frames_per_second")) for s in summaries]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,20 +47,29 @@ class RunData:
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
         """Read the files of a finished run."""
-        landmarks = np.genfromtxt(folder / "landmarks.csv", delimiter=",", skip_header=1, ndmin=2).reshape(-1, 12)
-        frames = np.genfromtxt(folder / "frames.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-        upper = landmarks[:, 4:10]
-        covariances = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
+        upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
+        last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
         return cls(
             name,
             Trajectory.read_tum(folder / "trajectory.txt"),
             Trajectory.read_tum(folder / "trajectory_final.txt"),
-            landmarks[:, 1:4],
-            covariances,
-            landmarks[:, 11] == landmarks[:, 11].max(initial=0),
-            np.stack([frames["sd_x"], frames["sd_y"], frames["sd_z"]], axis=1),
-            [str(s) for s in np.atleast_1d(frames["status"])],
+            _numbers(landmarks, ("x", "y", "z")),
+            upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
+            last_seen == int(frames[-1]["frame"]),
+            _numbers(frames, ("sd_x", "sd_y", "sd_z")),
+            [row["status"] for row in frames],
         )
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
+    """Columns of a table as numbers (N, C)."""
+    return np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, len(columns))
 
 
 def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
@@ -96,7 +106,7 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     for i, run in enumerate(runs):
         axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
-        near = _near_rows(run)[:most]
+        near = _near_rows(run)[-most:]
         for row in near:
             values, vectors = np.linalg.eigh(run.covariances[row])
             shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]

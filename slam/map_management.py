@@ -11,7 +11,7 @@ from slam.association import crowded
 from slam.data import BoolArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.landmarks import LandmarkRows
-from slam.models import FORBID_UNKNOWN
+from slam.models import FORBID_UNKNOWN, require_not_negative
 from slam.rig import StereoRig
 from slam.se3 import Array
 
@@ -30,8 +30,8 @@ class MapConfig:
         erase_share: where it was measured in less than this share of the frames in view (judged from
             `erase_missed` frames on).
         restart_after: where no landmark was recognised for more frames than these, new ones are added all the same, and
-            the map goes on from the predicted pose.
-        max_landmarks: size of the map; beyond it, those out of view longest are erased.
+            the map goes on from the predicted pose; again after as many frames.
+        max_landmarks: size of the map; beyond it, those measured longest ago are erased.
     """
 
     target_in_view: int = 150
@@ -46,6 +46,7 @@ class MapConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
+        require_not_negative(self)
         if self.target_in_view < 3 or self.max_landmarks < self.target_in_view:
             raise ConfigurationError("map: 3 <= target_in_view <= max_landmarks is required")
         if min(self.grid) < 1 or self.separation < 0:
@@ -64,14 +65,17 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     return lost | rare
 
 
-def surplus_landmarks(landmarks: LandmarkRows, keep: BoolArray, config: MapConfig) -> BoolArray:
-    """Which of the kept landmarks (N,) to erase so that `max_landmarks` remain: those seen longest ago."""
-    surplus = int(keep.sum()) - config.max_landmarks
+def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) to erase so that `max_landmarks` remain: those measured longest ago.
+
+    Among those not measured now, the ones that were never recognised after their first sight go before all others.
+    """
     out = np.zeros(len(landmarks), bool)
+    surplus = len(landmarks) - config.max_landmarks
     if surplus > 0:
-        rows = np.flatnonzero(keep)
-        oldest = rows[np.argsort(landmarks.last_seen[rows], kind="stable")[:surplus]]
-        out[oldest] = True
+        now = landmarks.last_seen == landmarks.last_seen.max()
+        order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
+        out[order[:surplus]] = True
     return out
 
 

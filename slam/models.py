@@ -19,6 +19,15 @@ def _require_positive(config: object) -> None:
             raise ConfigurationError(f"{f.name} must be positive and finite, got {value}")
 
 
+def require_not_negative(config: object) -> None:
+    """Raise where a number of a configuration dataclass, or one in a tuple of it, is negative or not finite."""
+    for f in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, f.name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, (int, float)) and not (np.isfinite(number) and number >= 0):
+                raise ConfigurationError(f"{f.name} must be finite and not negative, got {value}")
+
+
 #: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
 FORBID_UNKNOWN = {"extra": "forbid"}
 
@@ -74,6 +83,15 @@ class EstimatorModels:
 
     def __post_init__(self) -> None:
         _require_positive(self)
+        if self.T_world_left is not None:
+            T = np.array(self.T_world_left, float)
+            if (
+                T.shape != (4, 4)
+                or not np.isfinite(T).all()
+                or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6
+            ):
+                raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
+            object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:
             raise ConfigurationError(f"gate_probability must lie between 0 and 1, got {self.gate_probability}")
 

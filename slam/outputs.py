@@ -87,8 +87,10 @@ class RunFiles:
         self._trajectory.flush()
         self._frames.flush()
 
-    def write_final(self, trajectory: Trajectory, estimate: Estimate, landmarks: LandmarkRows | None) -> None:
-        """Write trajectory_final.txt and landmarks.csv."""
+    def write_final(
+        self, trajectory: Trajectory, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]
+    ) -> None:
+        """Write trajectory_final.txt and landmarks.csv; `numbers` are the frames' numbers by step."""
         trajectory.write_tum(self.folder / "trajectory_final.txt")
         with self._open("landmarks.csv") as file:
             rows = csv.writer(file, lineterminator="\n")
@@ -98,15 +100,19 @@ class RunFiles:
             upper = np.triu_indices(3)
             for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
                 at = int(landmarks.rows(np.array([i]))[0])
-                numbers = (f"{x:.9g}" for x in (*position, *covariance[upper]))
-                rows.writerow([int(i), *numbers, int(landmarks.seen[at]), int(landmarks.last_seen[at])])
+                values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
+                rows.writerow([int(i), *values, int(landmarks.seen[at]), numbers[landmarks.last_seen[at]]])
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all."""
-        path = self.folder / name
-        temporary = path.with_suffix(".json.part")
-        temporary.write_text(json.dumps(_finite(tree), indent=2) + "\n", encoding="utf-8")
-        temporary.replace(path)
+        write_json(self.folder / name, tree)
+
+
+def write_json(path: Path, tree: dict[str, Any]) -> None:
+    """Write a JSON file at once or not at all; numbers that JSON cannot hold become null."""
+    temporary = path.with_suffix(".json.part")
+    temporary.write_text(json.dumps(_finite(tree), indent=2) + "\n", encoding="utf-8")
+    temporary.replace(path)
 
 
 def _deviations(estimate: Estimate) -> list[float]:

@@ -16,7 +16,7 @@ from slam.se3 import Array, exp, hat, inverse
 
 _MINIMAL = 3  # stereo points that fix a pose
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
-_CLEAR_MAJORITY = 0.7  # of the matches that agree with the guess: no other pose can have as many
+_CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5
 
 
@@ -43,8 +43,8 @@ def find_consensus(
 ) -> PoseConsensus:
     """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
 
-    The guess is tried first, and is enough where a clear majority agrees with it. Other hypotheses are rigid fits of
-    three triangulated points, refined on their reprojection errors.
+    The guess, refined on what agrees with it, is tried first, and is enough where a clear majority agrees. Other
+    hypotheses are rigid fits of three triangulated points, refined on their reprojection errors.
 
     Args:
         rig: the cameras.

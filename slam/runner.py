@@ -48,6 +48,7 @@ class RunOptions:
 class RunRecord:
     """What a run has gathered so far: the online path, frame by frame."""
 
+    numbers: list[int] = field(default_factory=list)
     stamps: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     statuses: list[str] = field(default_factory=list)
@@ -58,8 +59,9 @@ class RunRecord:
     nis: float = 0.0
     nis_dof: int = 0
 
-    def add(self, result: FrameResult) -> None:
-        """Take in one frame."""
+    def add(self, number: int, result: FrameResult) -> None:
+        """Take in one frame, `number` in its sequence."""
+        self.numbers.append(number)
         self.stamps.append(result.estimate.stamp)
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
@@ -104,7 +106,7 @@ def run(
             for frame, elapsed in _timed(frames):
                 result = system.process(frame)
                 result.milliseconds["read"] = elapsed  # type: ignore[index]
-                record.add(result)
+                record.add(frame.index, result)
                 files.write_frame(frame.index, result)
                 if on_frame is not None:
                     on_frame(result)
@@ -149,7 +151,7 @@ def _finish(
     }
     if record.stamps:
         final = system.trajectory()
-        files.write_final(final, system.estimate(), system.landmarks)
+        files.write_final(final, system.estimate(), system.landmarks, record.numbers)
         summary["path_length_m"] = record.trajectory.length
         summary["landmarks"] = 0 if system.landmarks is None else len(system.landmarks)
         summary["observations"] = {"used": record.used, "rejected": record.rejected}

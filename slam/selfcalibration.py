@@ -105,14 +105,13 @@ class SelfCalibration:
 
     @property
     def offset(self) -> float:
-        """Posterior mean of the offset [px]."""
+        """Posterior mean of the offset, with the chance that there is none [px]."""
         return self.probability * self._mean
 
     @property
     def sigma(self) -> float:
-        """Posterior standard deviation of the offset [px]."""
-        p = self.probability
-        return float(np.sqrt(p / self._information + p * (1 - p) * self._mean**2))
+        """Posterior standard deviation of the offset, given that there is one [px]."""
+        return float(self._information**-0.5)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with right pixels moved along the rectified row, so that disparities lose the offset."""

@@ -54,6 +54,8 @@ def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> Non
             raise ConfigurationError(f"setting {setting!r}: unknown section {key!r}; known: {', '.join(node)}")
         node = node[key]
     leaf = path[-1]
+    if isinstance(node.get(leaf), dict):
+        raise ConfigurationError(f"setting {setting!r}: {leaf!r} is a section; set {'.'.join(path)}.KEY=VALUE")
     if len(path) < 2 or (path[0] not in _FREE and leaf not in node):
         raise ConfigurationError(f"setting {setting!r}: unknown key {leaf!r}; known: {', '.join(node)}")
     node[leaf] = value

@@ -10,6 +10,7 @@ import numpy as np
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import (
+    BoolArray,
     Estimate,
     FrameResult,
     FrameStatus,
@@ -21,6 +22,7 @@ from slam.data import (
     UpdateReport,
     UpdateStatus,
 )
+from slam.errors import ConfigurationError
 from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.map_management import bad_landmarks, new_landmarks, surplus_landmarks
@@ -84,7 +86,7 @@ class StereoSlam:
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
         if self.frontend is None:
-            raise ValueError("this system has no front end: use process_features")
+            raise ConfigurationError("this system has no front end: use process_features")
         start = time.perf_counter()
         features = self.frontend.extract(frame)
         elapsed = 1e3 * (time.perf_counter() - start)
@@ -111,8 +113,9 @@ class StereoSlam:
         report = self.backend.update(_observations(features, found), found.T_world_left)
         clock.lap("update")
         landmarks = self._count(landmarks, prediction, features, found, report)
-        landmarks, erased = self._erase(landmarks)
+        landmarks, erased = self._erase(landmarks, bad_landmarks(landmarks, self.config.map))
         landmarks, added = self._add(landmarks, features, found)
+        landmarks, surplus = self._erase(landmarks, surplus_landmarks(landmarks, self.config.map))
         self.landmarks = landmarks
         clock.lap("manage")
         estimate = self.backend.estimate(landmarks=False)
@@ -130,7 +133,7 @@ class StereoSlam:
             matched_features=found.rows,
             added=added.ids,
             added_features=added.rows,
-            erased=erased,
+            erased=np.concatenate([erased, surplus]),
             map_size=len(landmarks),
             milliseconds=clock.laps,
         )
@@ -163,21 +166,19 @@ class StereoSlam:
         measured = np.isin(found.ids, report.used)
         return landmarks.after_frame(self._index, expected, found.ids[measured], features, found.rows[measured])
 
-    def _erase(self, landmarks: LandmarkRows) -> tuple[LandmarkRows, IdArray]:
-        """Drop bad landmarks, and the oldest beyond the map's size."""
-        bad = bad_landmarks(landmarks, self.config.map)
-        bad |= surplus_landmarks(landmarks, ~bad, self.config.map)
-        erased = landmarks.ids[bad]
+    def _erase(self, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
+        """Drop landmarks from the map and from the back end."""
+        erased = landmarks.ids[rows]
         if len(erased):
             self.backend.remove(erased)
-            landmarks = landmarks.select(~bad)
+            landmarks = landmarks.select(~rows)
         return landmarks, erased
 
     def _add(
         self, landmarks: LandmarkRows, features: StereoFeatures, found: Recognition
     ) -> tuple[LandmarkRows, Recognition]:
         """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew."""
-        if len(landmarks) and 0 < self._unrecognised <= self.config.map.restart_after:
+        if len(landmarks) and self._unrecognised % (self.config.map.restart_after + 1):
             return landmarks, Recognition.nothing()
         free = np.ones(len(features), bool)
         free[found.rows] = False

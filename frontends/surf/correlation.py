@@ -26,14 +26,13 @@ def patch_windows(spread: float = 0.4) -> NDArray[np.float32]:
 
 
 @vector_helper
-def _sample(image, x, y, half, rows, lanes, blend, out):
+def _sample(pixels, shape, x, y, half, rows, lanes, blend, out):
     """Bilinear samples (rows, lanes) with the first one at (x - half, y - half); False where they leave the image."""
     top, left = int(np.floor(y)) - half, int(np.floor(x)) - half
-    if top < 0 or left < 0 or top + rows + 1 > image.shape[0] or left + lanes + 1 > image.shape[1]:
+    if top < 0 or left < 0 or top + rows + 1 > shape[0] or left + lanes + 1 > shape[1]:
         return False
     a, b = np.float32(y - np.floor(y)), np.float32(x - np.floor(x))
-    pixels = image.reshape(-1)
-    stride = image.shape[1]
+    stride = shape[1]
     for r in range(rows):
         start = np.uint64((top + r) * stride + left)
         below = np.uint64(start + np.uint64(stride))
@@ -120,23 +119,27 @@ def refine(
         windows: see `patch_windows`.
     """
     out = np.full((len(uv), 2), np.nan)
-    _refine(left, right, uv, size, start, min_correlation, reach[0], reach[1], windows, out)
+    _refine(
+        left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, reach[0], reach[1], windows,
+        np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32),
+        np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros(32, np.float32), out,
+    )  # fmt: skip
     return out
 
 
 @kernel
-def _refine(left, right, uv, size, start, min_correlation, reach_x, reach_y, windows, out):
-    """The same into `out`."""
-    sampled, patch = np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32)
-    weighted, gx, gy = np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32)
-    blend = np.zeros(32, np.float32)
+def _refine(
+    left, right, shape, uv, size, start, min_correlation, reach_x, reach_y, windows, sampled, patch, weighted, gx, gy,
+    blend, out,
+):  # fmt: skip
+    """The same into `out`, on flat images and with work space."""
     for i in range(len(uv)):
         if np.isnan(start[i, 0]):
             continue
         k = 0 if size[i] < 24.0 else 1
         half = 7 if k == 0 else 11
         rows, lanes = 2 * half + 1, 2 * half + 2
-        if not _sample(left, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
+        if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
             continue
         mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
         det = xx * yy - xy * xy
@@ -144,7 +147,7 @@ def _refine(left, right, uv, size, start, min_correlation, reach_x, reach_y, win
             continue
         x, y = start[i, 0], start[i, 1]
         for _ in range(_ITERATIONS):
-            if not _sample(right, x, y, half, rows, lanes, blend, patch):
+            if not _sample(right, shape, x, y, half, rows, lanes, blend, patch):
                 break
             mean2, deviation2, both, px, py = _compare(patch, windows, k, rows, lanes, weighted, gx, gy)
             if deviation2 < 1e-3:

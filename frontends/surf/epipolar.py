@@ -37,14 +37,13 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
     small = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
     pixels = small.astype(np.float32) * np.float32(255.0 / full_scale)
     weight = np.zeros_like(pixels)
-    _weigh(pixels, weight)
+    _weigh(pixels, weight, np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32))
     return HalfImage(pixels, weight)
 
 
 @kernel
-def _weigh(pixels, weight):
-    """Weights of the patches about all pixels of an image."""
-    sums, squares = np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32)
+def _weigh(pixels, weight, sums, squares):
+    """Weights of the patches about all pixels of an image, with work space for a row."""
     for y in range(_HALF, pixels.shape[0] - _HALF):
         _column_sums(pixels, y, sums, squares)
         _row_weights(sums, squares, weight, y)
@@ -173,19 +172,22 @@ def search_rows(
         uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
     """
     out = np.full((len(uv), 2), np.nan)
+    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1], np.float32)
     _search_rows(
-        left.pixels, left.weight, right.pixels, right.weight, uv, 0.5 * low, 0.5 * high, band, min_correlation,
-        uniqueness, out,
+        left.pixels, left.weight, left.pixels.reshape(-1), left.weight.reshape(-1), right.pixels, right.weight,
+        right.pixels.reshape(-1), right.weight.reshape(-1), uv, 0.5 * low, 0.5 * high, band, min_correlation,
+        uniqueness, patch, scores, out,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _search_rows(left, left_weight, right, right_weight, uv, low, high, band, min_correlation, uniqueness, out):
-    """The same into `out`; disparities at half resolution."""
+def _search_rows(
+    left, left_weight, a, aw, right, right_weight, b, bw, uv, low, high, band, min_correlation, uniqueness, patch,
+    scores, out,
+):  # fmt: skip
+    """The same into `out`, at half resolution, with the images flat as well, and with work space."""
     height, width = left.shape
-    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(width, np.float32)
-    a, aw, b, bw = left.reshape(-1), left_weight.reshape(-1), right.reshape(-1), right_weight.reshape(-1)
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))

@@ -15,6 +15,7 @@ from frontends.surf.kernels import helper, kernel, vector_helper
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
 _SIZE_STEP = 0.3  # of those in size
 _ITERATIONS = 10
+_FOLLOWERS = 10  # features that repeated ones may lie apart, when sorted by x
 _CONVERGED = 0.05  # in units of the steps
 
 
@@ -121,21 +122,22 @@ def localise(
         maximum in reach, or where the filter would leave the image.
     """
     out = np.full((len(x), 4), np.nan)
-    _localise(integral, x, y, size, reach, out)
+    _localise(
+        integral.reshape(-1), integral.shape, x, y, size, reach, np.empty((2, 10), np.int64), np.empty((2, 10)),
+        np.empty(len(_PLACES)), np.empty((3, 3)), np.empty(3), out,
+    )  # fmt: skip
     return out
 
 
 @kernel
-def _localise(integral, x, y, size, reach, out):
-    """The same into `out`."""
-    pixels, stride = integral.reshape(-1), integral.shape[1]
-    whole, part = np.empty((2, 10), np.int64), np.empty((2, 10))
-    values, inverse, step = np.empty(len(_PLACES)), np.empty((3, 3)), np.empty(3)
+def _localise(pixels, shape, x, y, size, reach, whole, part, values, inverse, step, out):
+    """The same into `out`, on the flat integral image and with work space."""
+    rows, stride = shape
     for i in range(x.size):
         u, v, s = x[i], y[i], size[i]
         for k in range(_ITERATIONS):
             room = (0.5 * (1.0 + _SIZE_STEP) + _STEP) * s + 1.0
-            if not (room < u < integral.shape[1] - 2 - room and room < v < integral.shape[0] - 2 - room):
+            if not (room < u < stride - 2 - room and room < v < rows - 2 - room):
                 break
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
@@ -160,21 +162,16 @@ def _localise(integral, x, y, size, reach, out):
 
 
 def first_of_each(x: NDArray, y: NDArray, size: NDArray) -> NDArray[np.bool_]:
-    """Mark features (N,) that no earlier one equals: closer than a twentieth of the size, size within a tenth."""
-    keep = np.ones(len(x), np.bool_)
-    _drop_repeated(x, y, size, np.argsort(x, kind="stable"), keep)
+    """Mark features (N,) that no earlier one equals: closer than a twentieth of the size, size within a tenth.
+
+    Features are compared with those that follow them closely by x, where their equals are.
+    """
+    keep = np.ones(len(x), bool)
+    order = np.argsort(x, kind="stable")
+    for lag in range(1, min(_FOLLOWERS, len(x) - 1) + 1):
+        i, j = order[:-lag], order[lag:]
+        near = 0.05 * np.maximum(size[i], size[j])
+        same = np.hypot(x[i] - x[j], y[i] - y[j]) < near
+        same &= np.abs(size[i] - size[j]) < 2.0 * near
+        keep[np.maximum(i, j)[same]] = False
     return keep
-
-
-@kernel
-def _drop_repeated(x, y, size, order, keep):
-    """Unmark the features that an earlier one equals; `order` is their order by x."""
-    for a in range(x.size):
-        i = order[a]
-        for b in range(a + 1, x.size):
-            j = order[b]
-            near = 0.05 * max(size[i], size[j])
-            if x[j] - x[i] > near and x[j] - x[i] > 5.0:
-                break
-            if (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 < near * near and abs(size[i] - size[j]) < 2.0 * near:
-                keep[max(i, j)] = False

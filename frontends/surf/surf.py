@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.compilation import announce_compilation
-from frontends.surf.descriptor import describe, gaussian_weights
+from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
 from frontends.surf.detector import COLUMNS, detect_octave
 from frontends.surf.filters import Filters, layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
@@ -222,11 +222,10 @@ class Surf:
         oriented = Keypoints(
             keypoints.uv, keypoints.size, angle, keypoints.response, keypoints.laplacian, keypoints.octave
         )
+        box = UPRIGHT_BOX if self.upright else TURNED_BOX
         shares = self.workers.over(
             len(x),
-            lambda a, b: describe(
-                integral, x[a:b], y[a:b], size[a:b], None if self.upright else angle[a:b], self._weights
-            ),
+            lambda a, b: describe(integral, x[a:b], y[a:b], size[a:b], angle[a:b], box, self._weights),
         )
         return oriented, np.concatenate(shares)
 

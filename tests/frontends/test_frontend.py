@@ -170,6 +170,21 @@ def test_options_override_a_configuration():
     assert config.features == 50
 
 
+def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):
+    from frontends.surf import kernels
+
+    real = kernels.njit
+
+    def no_folder(**options):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return real(**options)
+
+    monkeypatch.setattr(kernels, "njit", no_folder)
+    assert kernels.kernel(lambda x: x + 1)(2) == 3
+    assert "set NUMBA_CACHE_DIR" in caplog.text
+
+
 FIRST_USE = """
 import numpy as np
 from frontends.surf import Surf

@@ -42,11 +42,23 @@ def test_json_and_back(kind):
         ("models.pixel_sigma=-1", "pixel_sigma must be positive"),
         ("models.pixel_sigma=NaN", "pixel_sigma must be positive and finite"),
         ("map.grid=[1]", "map.grid"),
+        ("map=3", "is a section"),
+        ("map.separation=NaN", "separation must be finite"),
+        ("association.d_match=[NaN, 0.2]", "d_match must be finite"),
+        ("association.consistency_sigmas=-3", "consistency_sigmas must be finite and not negative"),
+        ("models.T_world_left=[[1, 2], [3, 4]]", "T_world_left must be"),
     ],
 )
 def test_bad_settings(setting, message):
     with pytest.raises(ConfigurationError, match=message.replace("[", r"\[")):
         SystemConfig.for_kind("handheld").with_settings([setting])
+
+
+def test_a_first_pose_comes_through():
+    pose = "[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+    config = SystemConfig.for_kind("handheld").with_settings([f"models.T_world_left={pose}"])
+    assert config.models.initial_pose[0, 3] == 2
+    assert from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
 def test_unknown_kind():

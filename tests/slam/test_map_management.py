@@ -97,9 +97,14 @@ def test_counting_a_frame():
 
 def test_the_longest_unseen_give_way():
     config = MapConfig(target_in_view=3, max_landmarks=3)
-    rows = rows_with(last_seen=[5, 1, 9, 3, 7])
-    keep = np.array([True, True, True, True, False])
-    assert surplus_landmarks(rows, keep, config).tolist() == [False, True, False, False, False]
+    rows = rows_with(last_seen=[5, 1, 9, 3, 7], seen=[2, 2, 2, 2, 2])
+    assert surplus_landmarks(rows, config).tolist() == [False, True, False, True, False]
+
+
+def test_the_never_confirmed_give_way_first():
+    config = MapConfig(target_in_view=3, max_landmarks=3)
+    rows = rows_with(last_seen=[5, 1, 9, 3, 9], seen=[1, 4, 1, 4, 2])
+    assert surplus_landmarks(rows, config).tolist() == [True, True, False, False, False]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 from slam.config import SystemConfig
 from slam.data import StereoFrame
 from slam.errors import SequenceError, SlamError
+from slam.figures import RunData
 from slam.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.rig import StereoRig
 from slam.runner import RunOptions, parse_frames, run
@@ -123,6 +124,14 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
         assert f"stopped by {kill.name}" in errors
         assert "stopped" in json.loads((tmp_path / "summary.json").read_text())["ended"]
         assert (tmp_path / "landmarks.csv").exists()
+
+
+@pytest.mark.parametrize("world", ["synthetic:desk?frames=1", "synthetic:desk?frames=3&black=0:3"])
+def test_pictures_of_short_and_empty_runs(tmp_path, world):
+    run(open_sequence(world), options(tmp_path))
+    data = RunData.read(tmp_path, "short")
+    assert len(data.online) == len(data.status) == len(data.deviations)
+    assert data.positions.shape == (len(data.covariances), 3)
 
 
 def test_a_missing_right_image_is_no_error(tmp_path):
