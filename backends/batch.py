@@ -128,9 +128,10 @@ class _Solution:
         add_poses(change, make, records)
         self.landmarks: set[int] = set()
         for serial, rows in _by_landmark(records.measurements.landmark):
-            first = int(rows[0])  # with a right pixel: the landmark was triangulated from it
-            local = make.stereo.triangulate(records.measurements.z[first : first + 1])
-            T = records.path.poses[records.measurements.frame[first]]
+            z = records.measurements.z[rows]
+            nearest = int(np.nanargmax(z[:, 0] - z[:, 2]))  # its depth is known best
+            local = make.stereo.triangulate(z[nearest : nearest + 1])
+            T = records.path.poses[records.measurements.frame[rows[nearest]]]
             add_landmark(change, make, records, landmark_key(serial), rows, transform(T, local)[0])
             self.landmarks.add(serial)
         self._factors = change.factors

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -345,12 +346,13 @@ def threshold(figure: Path | None = None) -> None:
     print("\n## D_threshold: features, CPU time of detection [ms], median radius [px] by octave, 320x240\n")
     image = test_image(320, 240)
     print("| D_threshold | octave 1 | octave 2 | ms, one octave | ms, two octaves |\n" + "| --- " * 5 + "|")
+    limits = (0, 10, 100, 300, 1000, 3000, 10_000)
+    tasks = {f"{limit} {n}": partial(Surf(limit, n).detect, image) for limit in limits for n in (1, 2)}
+    ms = medians(tasks, 41)
     rows = []
-    for limit in (0, 10, 100, 300, 1000, 3000, 10_000):
-        keypoints = Surf(limit).detect(image)
-        ms = medians({str(n): lambda n=n, limit=limit: Surf(limit, n).detect(image) for n in (1, 2)}, 15)
-        counts = [int((keypoints.octave == o).sum()) for o in (0, 1)]
-        rows.append((limit, *counts, *ms.values()))
+    for limit in limits:
+        octave = Surf(limit).detect(image).octave
+        rows.append((limit, (octave == 0).sum(), (octave == 1).sum(), ms[f"{limit} 1"], ms[f"{limit} 2"]))
         print("| {} | {} | {} | {:.2f} | {:.2f} |".format(*rows[-1]))
     everything = Surf(100).detect(image)
     for octave in (0, 1):

@@ -11,12 +11,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import MeasurementError
 from slam.se3 import Array
+
+if TYPE_CHECKING:
+    from slam.objects.data import MovingObject
 
 IdArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -218,6 +222,7 @@ class FrameStatus(str, Enum):
 
     STARTED = "started"  #: first frame, or the first one with anything to see: the map begins
     TRACKED = "tracked"  #: the pose was measured against the map
+    LOST = "lost"  #: nothing was recognised for several frames: the pose is the motion model's, and far off perhaps
     PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
     FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
 
@@ -241,6 +246,8 @@ class FrameResult:
         erased: ids of landmarks that left the map.
         map_size: number of landmarks in the map.
         milliseconds: wall time per stage.
+        moving_features: rows of features that are judged to move (V,); they never become landmarks.
+        objects: the moving bodies, by ascending id.
     """
 
     index: int
@@ -257,3 +264,5 @@ class FrameResult:
     erased: IdArray
     map_size: int
     milliseconds: Mapping[str, float] = field(default_factory=dict)
+    moving_features: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    objects: tuple[MovingObject, ...] = ()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from slam.data import Estimate, IdArray, Observations, Prediction, StereoFeatures, StereoFrame, UpdateReport
+from slam.objects.data import ObjectEstimate, ObjectObservations
 from slam.se3 import Array
 from slam.trajectory import Trajectory
 
@@ -90,4 +91,47 @@ class Backend(Protocol):
 
     def trajectory(self) -> Trajectory:
         """The left camera's pose at every stamp predicted so far; a smoother's is revised, a filter's is not."""
+        ...
+
+
+@runtime_checkable
+class ObjectBackend(Protocol):
+    """What a back end offers besides, where it estimates moving objects; those that do not are given none.
+
+    Called in every step after `Backend.update`, at the same stamp.
+    """
+
+    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
+        """Advance all bodies to the current stamp, correct those that are observed, and start those with a new id.
+
+        The prior is a constant velocity with an impulse between frames, as for the camera; it goes on through frames
+        in which a body is not observed. New points of a known body join it.
+
+        Returns:
+            estimates of all bodies, observed or not, by ascending id.
+
+        Raises:
+            MeasurementError: a new body has fewer than three points with a right pixel.
+        """
+        ...
+
+    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
+        """Forget bodies.
+
+        Raises:
+            MeasurementError: an id is unknown.
+        """
+        ...
+
+
+@runtime_checkable
+class MapBackend(Protocol):
+    """What a back end offers besides, where it can start in a map that is known beforehand."""
+
+    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+        """Add landmarks with known positions (N, 3) [m] and covariances (N, 3, 3) [m²], independent of the pose.
+
+        Raises:
+            MeasurementError: an id is in the map already, or a covariance is not symmetric and positive definite.
+        """
         ...

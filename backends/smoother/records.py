@@ -211,7 +211,7 @@ class Landmarks:
     def add(self, ids: IdArray, position: Array, frame: int, limits: Sequence[int]) -> IndexArray:
         """Take in landmarks that have not been measured yet; returns their slots."""
         if len(self._free) < len(ids):
-            self._grow()
+            self._grow(len(ids))
         slots = np.array([self._free.pop() for _ in ids], np.intp)
         self.ids[slots], self.position[slots], self.last[slots] = ids, position, frame
         self.serial[slots] = np.arange(self._added, self._added + len(slots))
@@ -239,12 +239,13 @@ class Landmarks:
             self._free.append(slot)
         self.ids[slots] = self.variable[slots] = -1
 
-    def _grow(self) -> None:
+    def _grow(self, needed: int) -> None:
+        """Room for at least `needed` more landmarks."""
         old = len(self.ids)
         for name in (
             "ids", "serial", "position", "covariance", "information", "older", "recent", "seen", "last", "variable"
         ):  # fmt: skip
-            setattr(self, name, grown(getattr(self, name), 2 * old))
+            setattr(self, name, grown(getattr(self, name), old + needed))
         self.ids[old:] = self.variable[old:] = -1
         self._free = list(range(len(self.ids) - 1, old - 1, -1)) + self._free
 

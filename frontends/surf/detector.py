@@ -94,11 +94,12 @@ def _response_row(phases, shape, filters, layer, y0, buffer, count, out, to):
 
 
 @vector_helper
-def _mark_peaks(above, before, row, after, below, threshold, mask):
-    """Mark the columns that exceed the threshold and their four neighbours in the layer."""
+def _mark_peaks(above, before, row, after, below, rival, threshold, mask):
+    """Mark the columns that exceed the threshold, their four neighbours in the layer, and the one in another layer."""
     for j in range(mask.size):
         v = row[j]
-        mask[j] = (v > threshold) & (v > before[j]) & (v > after[j]) & (v > above[j]) & (v > below[j])
+        peak = (v > before[j]) & (v > after[j]) & (v > above[j]) & (v > below[j])
+        mask[j] = (v > threshold) & (v > rival[j]) & peak
 
 
 @helper
@@ -238,12 +239,12 @@ def _scan(
             if row < first_row or not margin <= row < rows - margin:
                 continue
             a, b = margin, columns - margin
-            here = ring[layer - 1, slots[1]]
+            here, rival = ring[layer - 1, slots[1]], ring[layer if layer < inner else layer - 2, slots[1], a:b]
             mask[:a] = 0
             mask[b:] = 0
             _mark_peaks(
                 ring[layer - 1, slots[0], a:b], here[a - 1 :], here[a:b], here[a + 1 :], ring[layer - 1, slots[2], a:b],
-                threshold, mask[a:b],
+                rival, threshold, mask[a:b],
             )  # fmt: skip
             found = _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube, offset, out, found)
     return found

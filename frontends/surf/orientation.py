@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +13,33 @@ RADIUS = 6  # of the sampled disc, in units of the feature's scale s
 _SIGMA = 2.5  # of the Gaussian weight, in the same units
 
 
-def _disc() -> NDArray[np.float32]:
-    """Samples of the disc (113, 3): numbers of their column and row, from 0, and their Gaussian weights."""
-    weight = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * _SIGMA**2))
+_BINS = 144  # two for each five degrees: the degree 5k alone, and the four after it
+_WINDOW = 23  # bins in 60 degrees, the ends left out
+
+
+class Disc(NamedTuple):
+    """Samples of the disc, and the bins of whole degrees.
+
+    Attributes:
+        places: numbers of the samples' columns and rows (113, 2), from 0.
+        weights: their Gaussian weights (113,).
+        bins: bin of each degree 0..360 (361,), counted from the first window's first one.
+    """
+
+    places: NDArray[np.uint64]
+    weights: NDArray[np.float32]
+    bins: NDArray[np.uint64]
+
+
+def _disc() -> Disc:
+    """The tables."""
+    line = np.arange(-RADIUS, RADIUS + 1)
+    weight = np.exp(-(line**2) / (2 * _SIGMA**2))
     weight /= weight.sum()
-    span = range(-RADIUS, RADIUS + 1)
-    inside = [(x, y) for x in span for y in span if x * x + y * y <= RADIUS**2]
-    rows = [(x + RADIUS, y + RADIUS, weight[x + RADIUS] * weight[y + RADIUS]) for x, y in inside]
-    return np.array(rows, np.float32)
+    places = np.argwhere(line[:, None] ** 2 + line[None] ** 2 <= RADIUS**2)
+    degrees = np.arange(361) % 360
+    bins = (2 * (degrees // 5) + (degrees % 5 > 0) + _WINDOW // 2) % _BINS
+    return Disc(places.astype(np.uint64), weight[places].prod(axis=1).astype(np.float32), bins.astype(np.uint64))
 
 
 DISC = _disc()
@@ -55,8 +76,8 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, lefts, tops, gx, gy):
     h, e = np.uint64(half), np.uint64(side)
     centre, bottom = np.uint64(half * stride), np.uint64(side * stride)
     n = 0
-    for k in range(disc.shape[0]):
-        left, top = lefts[int(disc[k, 0])], tops[int(disc[k, 1])]
+    for k in range(disc.weights.size):
+        left, top = lefts[disc.places[k, 0]], tops[disc.places[k, 1]]
         if left < 0 or top < 0:
             continue
         a = np.uint64(top + left)
@@ -65,7 +86,7 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, lefts, tops, gx, gy):
         left_half = np.int32(np.int32(pixels[g + h] - pixels[g]) - np.int32(pixels[a + h] - pixels[a]))
         m = a + centre
         upper_half = np.int32(np.int32(pixels[m + e] - pixels[m]) - np.int32(pixels[a + e] - pixels[a]))
-        weight = disc[k, 2]
+        weight = disc.weights[k]
         gx[n] = np.float32(np.int32(square - 2 * left_half)) * weight
         gy[n] = np.float32(np.int32(2 * upper_half - square)) * weight
         n += 1
@@ -73,53 +94,59 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, lefts, tops, gx, gy):
 
 
 @helper
-def _strongest_window(gx, gy, degrees, n, sums):
+def _strongest_window(gx, gy, degrees, n, bins, sums):
     """Direction [rad] of the largest sum of gradients within a window of 60°, moved in steps of 5°; first one wins.
 
-    A window holds the whole degrees less than 30 from its centre. Gradients are summed by fives of degrees first:
-    bin 2k holds the degree 5k alone, bin 2k+1 the four degrees after it; a window is then 23 neighbouring bins, the
-    difference of two running sums. Bins run on beyond 360 degrees by a window's width.
+    A window holds the whole degrees less than 30 from its centre. Gradients are summed by bins first; a window is
+    then the difference of two running sums, which go on beyond the full circle by a window's width.
     """
     sums[:] = 0.0
     for i in range(n):
-        d = degrees[i] if degrees[i] < 360 else degrees[i] - 360
-        fifth = d // 5
-        k = 2 * fifth + (1 if d > 5 * fifth else 0) + 1
-        sums[k, 0] += gx[i]
-        sums[k, 1] += gy[i]
-    for k in range(1, 145):
-        sums[k, 0] += sums[k - 1, 0]
-        sums[k, 1] += sums[k - 1, 1]
+        k = bins[degrees[i]] + np.uint64(1)
+        sums[0, k] += gx[i]
+        sums[1, k] += gy[i]
+    for k in range(_WINDOW):
+        sums[0, _BINS + 1 + k], sums[1, _BINS + 1 + k] = sums[0, 1 + k], sums[1, 1 + k]
+    sx, sy = 0.0, 0.0
+    for k in range(sums.shape[1]):
+        sx, sy = sx + sums[0, k], sy + sums[1, k]
+        sums[0, k], sums[1, k] = sx, sy
     best, bx, by = 0.0, 0.0, 0.0
-    for centre in range(0, 144, 2):
-        first, after = centre - 11, centre + 12
-        sx, sy = 0.0, 0.0
-        if first < 0:
-            sx, sy = sums[144, 0] - sums[first + 144, 0], sums[144, 1] - sums[first + 144, 1]
-            first = 0
-        elif after > 144:
-            sx, sy = sums[after - 144, 0], sums[after - 144, 1]
-            after = 144
-        sx += sums[after, 0] - sums[first, 0]
-        sy += sums[after, 1] - sums[first, 1]
+    for k in range(0, _BINS, 2):
+        sx, sy = sums[0, k + _WINDOW] - sums[0, k], sums[1, k + _WINDOW] - sums[1, k]
         if sx * sx + sy * sy > best:
             best, bx, by = sx * sx + sy * sy, sx, sy
     angle = np.arctan2(-by, bx)
     return angle if angle >= 0 else angle + 2 * np.pi
 
 
-@kernel
-def orientations(integral, x, y, size, disc):
-    """Angles (N,) [rad], y down, in 0..2π, of features; NaN where no wavelet fits into the image."""
-    n = x.size
-    out = np.empty(n)
-    gx, gy = np.empty(disc.shape[0], np.float32), np.empty(disc.shape[0], np.float32)
-    degrees = np.empty(disc.shape[0], np.int32)
-    sums = np.empty((145, 2))
-    lefts, tops = np.empty(2 * RADIUS + 1, np.int64), np.empty(2 * RADIUS + 1, np.int64)
-    pixels, (rows, stride) = integral.reshape(-1), integral.shape
-    for i in range(n):
-        count = _sample_gradients(pixels, rows, stride, x[i], y[i], size[i] * (1.2 / 9.0), disc, lefts, tops, gx, gy)
-        _degrees(gx, gy, degrees, count)
-        out[i] = _strongest_window(gx, gy, degrees, count, sums) if count else np.nan
+def orientations(
+    integral: NDArray[np.int32], x: NDArray[np.float64], y: NDArray[np.float64], size: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Angles (N,) [rad], y down, in 0..2π, of features; NaN where no wavelet fits into the image.
+
+    Args:
+        integral: see `integral_image`.
+        x: columns of the features (N,) [px].
+        y: their rows (N,) [px].
+        size: their sizes (N,) [px].
+    """
+    out = np.full(len(x), np.nan)
+    samples = len(DISC.weights)
+    _orientations(
+        integral.reshape(-1), integral.shape, x, y, size, DISC, np.empty(2 * RADIUS + 1, np.int64),
+        np.empty(2 * RADIUS + 1, np.int64), np.empty(samples, np.float32), np.empty(samples, np.float32),
+        np.empty(samples, np.int32), np.empty((2, _BINS + _WINDOW + 1)), out,
+    )  # fmt: skip
     return out
+
+
+@kernel
+def _orientations(pixels, shape, x, y, size, disc, lefts, tops, gx, gy, degrees, sums, out):
+    """The same into `out`, on the flat integral image and with work space."""
+    for i in range(x.size):
+        s = size[i] * (1.2 / 9.0)
+        count = _sample_gradients(pixels, shape[0], shape[1], x[i], y[i], s, disc, lefts, tops, gx, gy)
+        _degrees(gx, gy, degrees, count)
+        if count > 0:
+            out[i] = _strongest_window(gx, gy, degrees, count, disc.bins, sums)

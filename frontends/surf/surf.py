@@ -18,8 +18,8 @@ from frontends.surf.filters import Filters, layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
 from frontends.surf.integral import column_phases, integral_image
 from frontends.surf.localisation import first_of_each, localise
-from frontends.surf.orientation import DISC, orientations
-from frontends.surf.workers import Workers
+from frontends.surf.orientation import orientations
+from frontends.surf.workers import Once, Workers
 from slam.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -175,14 +175,8 @@ class Surf:
         height, width = integral.shape[0] - 1, integral.shape[1] - 1
         usable = [o for o in range(self.octaves) if min(width, height) >= layer_sizes(o, self.layers)[2]]
         bank = [make_filters(o, self.layers, 255.0 / full_scale, width + 1) for o in usable]
-        phases = [partial(column_phases, integral, 1 << o) for o in usable[1:]]
-        first = self.workers.run(
-            phases + [task for f in bank[:1] for task in self._scans(integral, integral[None], f, 0, limit)]
-        )
-        rest = self.workers.run(
-            [task for o, p, f in zip(usable[1:], first, bank[1:]) for task in self._scans(integral, p, f, o, limit)]
-        )
-        rows = np.concatenate([np.zeros((0, COLUMNS)), *first[len(phases) :], *rest])
+        tasks = [task for o, f in zip(usable, bank) for task in self._scans(integral, f, o, limit)]
+        rows = np.concatenate([np.zeros((0, COLUMNS)), *self.workers.run(tasks)])
         if mask is not None:
             rows = rows[_mostly_inside(rows, mask)]
         return _as_keypoints(rows[np.argsort(-rows[:, 3], kind="stable")])
@@ -211,32 +205,35 @@ class Surf:
         """`describe` on an integral image."""
         x, y = np.ascontiguousarray(keypoints.uv.T)
         size = np.ascontiguousarray(keypoints.size)
-        if self.upright:
-            angle = np.full(len(x), UPRIGHT_ANGLE)
-        else:
-            shares = self.workers.over(len(x), lambda a, b: orientations(integral, x[a:b], y[a:b], size[a:b], DISC))
-            angle = np.concatenate(shares)
-            good = np.isfinite(angle)
-            if not good.all():
-                return self.describe_in(integral, keypoints.select(good))
-        oriented = Keypoints(
-            keypoints.uv, keypoints.size, angle, keypoints.response, keypoints.laplacian, keypoints.octave
-        )
         box = UPRIGHT_BOX if self.upright else TURNED_BOX
-        shares = self.workers.over(
-            len(x),
-            lambda a, b: describe(integral, x[a:b], y[a:b], size[a:b], angle[a:b], box, self._weights),
+
+        def orient_and_describe(a: int, b: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+            """Angles and descriptors of some of the features."""
+            upright = np.full(b - a, UPRIGHT_ANGLE)
+            angle = upright if self.upright else orientations(integral, x[a:b], y[a:b], size[a:b])
+            return angle, describe(integral, x[a:b], y[a:b], size[a:b], np.nan_to_num(angle), box, self._weights)
+
+        angles, descriptors = (np.concatenate(parts) for parts in zip(*self.workers.over(len(x), orient_and_describe)))
+        oriented = Keypoints(
+            keypoints.uv, keypoints.size, angles, keypoints.response, keypoints.laplacian, keypoints.octave
         )
-        return oriented, np.concatenate(shares)
+        good = np.isfinite(angles)
+        return (oriented, descriptors) if good.all() else (oriented.select(good), descriptors[good])
 
     def _scans(
-        self, integral: NDArray[np.int32], phases: NDArray[np.int32], filters: Filters, octave: int, limit: float
+        self, integral: NDArray[np.int32], filters: Filters, octave: int, limit: float
     ) -> list[Callable[[], NDArray[np.float64]]]:
-        """Searches of an octave, stripe by stripe; more than threads, as they do not take equally long."""
-        rows, threads = (integral.shape[0] - 1) >> octave, self.workers.threads
-        count = 1 if threads == 1 else max(1, min(2 * threads, rows // 32))
+        """Searches of an octave, a stripe of rows for each thread."""
+        rows = (integral.shape[0] - 1) >> octave
+        count = max(1, min(self.workers.threads, rows // 32))
+        phases = Once(partial(column_phases, integral, 1 << octave) if octave else lambda: integral[None])
+
+        def scan(first: int, last: int) -> NDArray[np.float64]:
+            """Candidates in a range of rows."""
+            return detect_octave(integral, phases(), filters, octave, limit, first, last)
+
         edges = [rows * k // count for k in range(count + 1)]
-        return [partial(detect_octave, integral, phases, filters, octave, limit, a, b) for a, b in pairwise(edges)]
+        return [partial(scan, a, b) for a, b in pairwise(edges)]
 
 
 def _as_keypoints(rows: NDArray[np.float64]) -> Keypoints:

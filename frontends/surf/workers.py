@@ -6,9 +6,30 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 _SMALLEST_SHARE = 32  # items that are worth a thread
+
+
+class Once:
+    """A value that several tasks need: the first that asks for it computes it, the others wait.
+
+    Args:
+        function: computes the value.
+    """
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+        self._lock = Lock()
+        self._values: list[Any] = []
+
+    def __call__(self) -> Any:
+        """The value."""
+        with self._lock:
+            if not self._values:
+                self._values.append(self._function())
+            return self._values[0]
 
 
 class Workers:
