@@ -5,7 +5,7 @@ Every landmark is a variable and every accepted measurement a factor of its own;
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from backends.smoother import SmootherBackend
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
 from backends.smoother.records import IndexArray
-from backends.smoother.solver import Change
+from backends.smoother.solver import FAILURES, Change
 from backends.smoother.threads import one_blas_thread
 from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
@@ -31,6 +31,8 @@ _ITERATIONS = 100
 
 class BatchBackend:
     """Levenberg-Marquardt over all poses and landmarks.
+
+    `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
     A smoother runs along: it predicts, gates and gives the first values. The problem is solved when the trajectory or
     the landmarks are asked for; with ``online=True`` whenever the pose is, which costs more with every frame.
@@ -76,6 +78,16 @@ class BatchBackend:
         self._smoother.add(observations)
         self._solution = None
 
+    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.insert`."""
+        self._smoother.insert(ids, positions, covariances)
+        self._solution = None
+
+    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.place`."""
+        self._smoother.place(ids, local, covariances)
+        self._solution = None
+
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
         self._smoother.remove(ids)
@@ -93,8 +105,8 @@ class BatchBackend:
         for row, serial in enumerate(marks.serial[slots].tolist()):
             if serial in solution.landmarks:
                 positions[row] = solution.values.atPoint3(landmark_key(serial))
-                covariances[row] = solution.covariance(landmark_key(serial))
-        P = solution.covariance(pose_key(len(solution.poses) - 1))
+                covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
+        P = solution.covariance(pose_key(len(solution.poses) - 1), rough.covariance)
         return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -127,7 +139,14 @@ class _Solution:
         make, records = smoother.factor_maker, smoother.records
         add_poses(change, make, records)
         self.landmarks: set[int] = set()
-        for serial, rows in _by_landmark(records.measurements.landmark):
+        for serial, rows in _by_landmark(records.measurements.landmark, records.history.known):
+            known = records.history.known.get(serial)
+            if known is not None:
+                T = np.eye(4) if known.frame is None else records.path.poses[known.frame]
+                add_landmark(change, make, records, landmark_key(serial), rows, transform(T, known.position[None])[0])
+                change.factors.add(make.known(landmark_key(serial), known))
+                self.landmarks.add(serial)
+                continue
             z = records.measurements.z[rows]
             nearest = int(np.nanargmax(z[:, 0] - z[:, 2]))  # its depth is known best
             local = make.stereo.triangulate(z[nearest : nearest + 1])
@@ -139,18 +158,26 @@ class _Solution:
         self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(records.path.count)])
 
     @cached_property
-    def _marginals(self) -> gtsam.Marginals:
-        return gtsam.Marginals(self._factors, self.values)
+    def _marginals(self) -> gtsam.Marginals | None:
+        try:
+            return gtsam.Marginals(self._factors, self.values)
+        except FAILURES:
+            return None
 
-    def covariance(self, key: int) -> Array:
-        """Marginal covariance of a variable."""
-        return np.asarray(self._marginals.marginalCovariance(key))
+    def covariance(self, key: int, otherwise: Array) -> Array:
+        """Marginal covariance of a variable; `otherwise` where the problem leaves one open."""
+        if self._marginals is None:
+            return otherwise
+        try:
+            return np.asarray(self._marginals.marginalCovariance(key))
+        except FAILURES:
+            return otherwise
 
 
-def _by_landmark(landmark: NDArray[np.int32]) -> Iterator[tuple[int, IndexArray]]:
-    """Serial numbers of landmarks measured at least twice, each with its measurements' rows."""
+def _by_landmark(landmark: NDArray[np.int32], known: Container[int]) -> Iterator[tuple[int, IndexArray]]:
+    """Serial numbers of landmarks measured at least twice, or once and `known`, each with its measurements' rows."""
     order = np.argsort(landmark, kind="stable")
     serials, starts = np.unique(landmark[order], return_index=True)
     for serial, rows in zip(serials.tolist(), np.split(order, starts[1:])):
-        if serial >= 0 and len(rows) > 1:
+        if serial >= 0 and (len(rows) > 1 or serial in known):
             yield serial, rows

@@ -31,7 +31,9 @@ HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", 
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
     target = out / name.replace(" ", "_").replace(",", "") / backend
-    return run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), target, 0, frames))
+    return run(
+        sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind, "surf", backend), target, 0, frames)
+    )
 
 
 def row(name: str, summary: dict[str, Any]) -> list[str]:

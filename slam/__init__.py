@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from slam.rig import StereoRig as StereoRig
+    from slam.saved_map import SavedMap as SavedMap
+    from slam.saved_map import load_map as load_map
+    from slam.saved_map import save_map as save_map
     from slam.sequences import open_sequence as open_sequence
     from slam.system import StereoSlam as StereoSlam
     from slam.trajectory import Trajectory as Trajectory
@@ -23,13 +26,16 @@ _PUBLIC = {
     "FrameResult": "slam.data",
     "Observations": "slam.data",
     "PinholeCamera": "slam.camera",
+    "SavedMap": "slam.saved_map",
     "SlamError": "slam.errors",
     "StereoFeatures": "slam.data",
     "StereoFrame": "slam.data",
     "StereoRig": "slam.rig",
     "StereoSlam": "slam.system",
     "Trajectory": "slam.trajectory",
+    "load_map": "slam.saved_map",
     "open_sequence": "slam.sequences",
+    "save_map": "slam.saved_map",
 }
 
 __all__ = sorted(_PUBLIC)

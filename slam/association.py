@@ -20,6 +20,8 @@ from slam.se3 import Array
 Descriptors = NDArray[np.float32]
 
 _NONE = np.float32(np.inf)
+_BAND = 16.0  # height of the bands that features are sorted into [px]
+_LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
 
 
 @dataclass(frozen=True)
@@ -27,42 +29,57 @@ class AssociationConfig:
     """Settings of the association.
 
     Attributes:
-        window_sigmas: half sizes of the search windows, smallest first, in standard deviations of the innovation.
-        window_min, window_max: bounds of a window's half axes [px].
+        windows: kind of the search windows: ``"covariance"``, ellipses by the innovation's covariance, or ``"fixed"``,
+            squares of fixed sizes as in paper A, Fig. 4.
+        window_sigmas: half sizes of covariance windows, smallest first, in standard deviations of the innovation.
+        window_min, window_max: bounds of the half axes of the smallest covariance window [px].
+        window_sizes: half sizes of fixed windows, smallest first [px].
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
         wide_d_match, wide_ratio: the same for matching against the whole map without windows.
+        wide_share: where nothing was recognised in the last frame, a pose found by matching against the whole map must
+            show again at least this share of the landmarks (or of the features, if fewer) in view from there.
         minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
         consistency_sigmas: reprojection error up to which a match agrees with a pose, in units of the pixel noise.
         hypotheses, wide_hypotheses: number of poses tried in the geometric check, of matches in windows and of matches
             against the whole map.
         tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
             matches suffice, and no second search is made.
+        max_jump: landmarks that agree on a pose further than this from the prediction, in its standard deviations, are
+            not believed yet: a camera that was carried off is found again when the prediction has become vague enough.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
     """
 
+    windows: str = "covariance"
     window_sigmas: tuple[float, ...] = (2.5, 5.0)
     window_min: float = 4.0
     window_max: float = 400.0
+    window_sizes: tuple[float, ...] = (10.0, 30.0)
     d_match: tuple[float, ...] = (0.55, 0.4)
     ratio: float = 0.8
     wide_d_match: float = 0.4
     wide_ratio: float = 0.9
+    wide_share: float = 0.1
     minimum_consistent: int = 8
     consistency_sigmas: float = 5.0
     hypotheses: int = 100
     wide_hypotheses: int = 1000
     tight_window: float = 12.0
+    max_jump: float = 15.0
     refined_window: float = 3.0
 
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         require_not_negative(self)
-        if len(self.window_sigmas) != len(self.d_match) or not self.window_sigmas:
-            raise ConfigurationError("association: window_sigmas and d_match must have the same number of values")
-        if list(self.window_sigmas) != sorted(self.window_sigmas) or self.window_sigmas[0] <= 0:
-            raise ConfigurationError("association: window_sigmas must be positive and ascending")
+        if self.windows not in ("covariance", "fixed"):
+            raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
+        name = "window_sizes" if self.windows == "fixed" else "window_sigmas"
+        sizes = getattr(self, name)
+        if len(sizes) != len(self.d_match) or not sizes:
+            raise ConfigurationError(f"association: {name} and d_match must have the same number of values")
+        if list(sizes) != sorted(sizes) or sizes[0] <= 0:
+            raise ConfigurationError(f"association: {name} must be positive and ascending")
         if not 0 < self.window_min <= self.window_max:
             raise ConfigurationError("association: 0 < window_min <= window_max is required")
         if not (0 < self.ratio <= 1 and 0 < self.wide_ratio <= 1):
@@ -109,20 +126,19 @@ def match_in_windows(
     """
     if not len(prediction.ids) or not len(features):
         return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
-    distance = _descriptor_distances(descriptors, laplacian, features)
-    deviation = _deviations(prediction, features.uv_left, config)
-    free_landmarks = np.ones(len(prediction.ids), bool)
-    free_features = np.ones(len(features), bool)
-    landmarks, taken = [], []
-    for sigmas, d_match in zip(config.window_sigmas, config.d_match):
-        allowed = deviation <= sigmas * sigmas
-        allowed &= free_landmarks[:, None] & free_features[None, :]
-        rows, columns = _mutual_best(np.where(allowed, distance, _NONE), d_match, config.ratio)
-        landmarks.append(rows)
-        taken.append(columns)
-        free_landmarks[rows] = False
-        free_features[columns] = False
-    return Matches(np.concatenate(landmarks), np.concatenate(taken))
+    windows = search_windows(prediction, config)
+    if windows.are_large(features.uv_left):
+        limit = max(config.d_match) / config.ratio  # beyond that no feature is the nearest, nor near enough to doubt it
+        rows, columns = _alike(descriptors, laplacian, features, limit)
+    else:
+        rows, columns = pairs_in_boxes(prediction.uv_left, windows.reach, features.uv_left)
+        same = laplacian[rows] == features.laplacian[columns]
+        rows, columns = rows[same], columns[same]
+    level = windows.level(rows, (features.uv_left[columns] - prediction.uv_left[rows]).astype(np.float32))
+    inside = level < len(config.d_match)
+    rows, columns, level = rows[inside], columns[inside], level[inside]
+    distance = _distances(descriptors, features.descriptors, rows, columns)
+    return _by_levels(_Pairs(rows, columns, distance), level, (len(prediction.ids), len(features)), config)
 
 
 def match_everywhere(
@@ -131,50 +147,156 @@ def match_everywhere(
     """Match landmarks (M, D) to features by descriptor alone, wherever they lie in the image."""
     if not len(descriptors) or not len(features):
         return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
-    distance = _descriptor_distances(descriptors, laplacian, features)
-    return Matches(*_mutual_best(distance, config.wide_d_match, config.wide_ratio))
+    rows, columns = _alike(descriptors, laplacian, features, config.wide_d_match / config.wide_ratio)
+    pairs = _Pairs(rows, columns, _distances(descriptors, features.descriptors, rows, columns))
+    best = pairs.mutual_best(config.wide_d_match, config.wide_ratio, len(features))
+    return Matches(pairs.rows[best], pairs.columns[best])
 
 
-def _descriptor_distances(
-    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures
-) -> NDArray[np.float32]:
-    """Euclidean distances (M, N) of unit descriptors (paper A, Eq. 12); infinite where the Laplacian signs differ."""
-    distance = 2 - 2 * (descriptors @ features.descriptors.T)
-    np.maximum(distance, 0, out=distance)
-    np.sqrt(distance, out=distance)
-    distance[laplacian[:, None] != features.laplacian[None, :]] = _NONE
-    return distance
+@dataclass(frozen=True)
+class SearchWindows:
+    """Where landmarks (M) are looked for: nested windows around their predicted pixels.
 
-
-def _deviations(prediction: Prediction, uv: Array, config: AssociationConfig) -> NDArray[np.float32]:
-    """Squared distances (M, N) of features from predicted pixels, in units of the innovation's deviation.
-
-    The half axes of the unit ellipse are bounded, so that a window is never smaller than `window_min` nor larger than
-    `window_max` at its first level.
+    Attributes:
+        sizes: of the windows, smallest first: in the unit of `shape`.
+        reach: half sizes (M, 2) [px] of the boxes around the largest windows.
+        shape: ellipses' information matrices (M, 3) as (uu, uv, vv) [1/px²] where the windows are ellipses, whose
+            `sizes` are in standard deviations; None where they are squares of half `sizes` [px].
     """
-    lower = (config.window_min / config.window_sigmas[0]) ** 2
-    upper = (config.window_max / config.window_sigmas[0]) ** 2
-    values, vectors = np.linalg.eigh(prediction.innovation)
-    values = np.clip(values, lower, upper)
-    information = np.einsum("mij,mj,mkj->mik", vectors, 1 / values, vectors).astype(np.float32)
-    du = (uv[None, :, 0] - prediction.uv_left[:, None, 0]).astype(np.float32)
-    dv = (uv[None, :, 1] - prediction.uv_left[:, None, 1]).astype(np.float32)
-    a, b, c = (information[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-    return a * du * du + (2 * b) * du * dv + c * dv * dv
+
+    sizes: tuple[float, ...]
+    reach: Array
+    shape: NDArray[np.float32] | None
+
+    def are_large(self, uv: Array) -> bool:
+        """Whether the boxes around the largest windows hold a good part of the pixels (N, 2), on average."""
+        extent = np.ptp(uv, axis=0) + 1.0
+        return bool((np.minimum(2 * self.reach, extent) / extent).prod(axis=1).mean() > _LARGE)
+
+    def level(self, rows: NDArray[np.intp], offset: NDArray[np.float32]) -> NDArray[np.intp]:
+        """The smallest window (P,) of the landmarks `rows` (P,) that holds a pixel this far off (P, 2)."""
+        du, dv = offset[:, 0], offset[:, 1]
+        if self.shape is None:
+            return np.searchsorted(self.sizes, np.maximum(np.abs(du), np.abs(dv)))
+        uu, uv, vv = self.shape[rows].T
+        return np.searchsorted(np.square(self.sizes), uu * du * du + 2 * uv * du * dv + vv * dv * dv)
 
 
-def _mutual_best(
-    distance: NDArray[np.float32], d_match: float, ratio: float
+def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchWindows:
+    """The windows of the predicted landmarks, of the kind that `config.windows` names."""
+    if config.windows == "fixed":
+        sizes = config.window_sizes
+        return SearchWindows(sizes, np.full((len(prediction.ids), 2), sizes[-1]), None)
+    smallest, largest = config.window_sigmas[0], config.window_sigmas[-1]
+    S = prediction.innovation
+    # Eigenvalues and axes of the symmetric 2x2 matrices in closed form; half axes bounded as the settings say.
+    mean, half = 0.5 * (S[:, 0, 0] + S[:, 1, 1]), 0.5 * (S[:, 0, 0] - S[:, 1, 1])
+    radius = np.hypot(half, S[:, 0, 1])
+    angle = 0.5 * np.arctan2(S[:, 0, 1], half)
+    low, high = (config.window_min / smallest) ** 2, (config.window_max / smallest) ** 2
+    long, short = np.clip(mean + radius, low, high), np.clip(mean - radius, low, high)
+    c2, s2, cs = np.cos(angle) ** 2, np.sin(angle) ** 2, np.cos(angle) * np.sin(angle)
+    shape = np.stack([c2 / long + s2 / short, cs / long - cs / short, s2 / long + c2 / short], axis=1)
+    reach = largest * np.sqrt(np.stack([c2 * long + s2 * short, s2 * long + c2 * short], axis=1))
+    return SearchWindows(config.window_sigmas, reach, shape.astype(np.float32))
+
+
+def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending row of the centres.
+
+    Pixels are sorted into bands of rows, by column within each, so that few pairs have to be looked at.
+    """
+    first = int(np.floor(uv[:, 1].min() / _BAND))
+    bands = int(np.floor(uv[:, 1].max() / _BAND)) - first + 1
+    stride = float(uv[:, 0].max() - uv[:, 0].min()) + 1.0
+    left = float(uv[:, 0].min())
+    key = (np.floor(uv[:, 1] / _BAND) - first) * stride + uv[:, 0] - left
+    order = np.argsort(key)
+    top = np.clip(np.floor((centres[:, 1] - reach[:, 1]) / _BAND) - first, 0, bands).astype(int)
+    bottom = np.clip(np.floor((centres[:, 1] + reach[:, 1]) / _BAND) - first, -1, bands - 1).astype(int)
+    rows, band = _expand(top, bottom + 1)
+    low = np.clip(centres[rows, 0] - reach[rows, 0] - left, 0, stride)
+    high = np.clip(centres[rows, 0] + reach[rows, 0] - left, -1e-9, stride - 1e-9)
+    begin = np.searchsorted(key[order], band * stride + low)
+    end = np.searchsorted(key[order], band * stride + high, side="right")
+    which, member = _expand(begin, end)
+    rows, columns = rows[which], order[member]
+    near = np.abs(uv[columns, 1] - centres[rows, 1]) <= reach[rows, 1]
+    return rows[near], columns[near]
+
+
+def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which range and which number: all numbers of the ranges [first, last) (M,), one range after the other."""
+    count = np.maximum(last - first, 0)
+    which = np.repeat(np.arange(len(count)), count)
+    return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
+
+
+def _alike(
+    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, limit: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns that are each other's nearest, nearer than `d_match`, and clearly nearer than the second."""
-    rows = np.arange(len(distance))
-    best = np.argmin(distance, axis=1)
-    nearest = distance[rows, best]
-    good = (nearest < d_match) & (np.argmin(distance, axis=0)[best] == rows)
-    if distance.shape[1] > 1:
-        second = np.partition(distance, 1, axis=1)[:, 1]
-        good &= nearest < ratio * second
-    return rows[good], best[good]
+    """Rows of landmarks and of features with the same Laplacian sign whose descriptors are less than `limit` apart."""
+    near = descriptors @ features.descriptors.T > np.float32(1 - 0.5 * limit * limit)
+    near &= laplacian[:, None] == features.laplacian[None, :]
+    rows, columns = np.nonzero(near)
+    return rows, columns
+
+
+def _distances(
+    a: Descriptors, b: Descriptors, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Euclidean distances (P,) of unit descriptors a[rows] and b[columns] (paper A, Eq. 12)."""
+    product = np.einsum("pd,pd->p", a[rows], b[columns])
+    return np.asarray(np.sqrt(np.maximum(2 - 2 * product, 0)))
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of a landmark and a feature that may belong together, by ascending landmark.
+
+    Attributes:
+        rows: of landmarks (P,).
+        columns: rows of features (P,).
+        distance: of their descriptors (P,).
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    distance: NDArray[np.float32]
+
+    def select(self, keep: BoolArray) -> _Pairs:
+        """Some of the pairs."""
+        return _Pairs(self.rows[keep], self.columns[keep], self.distance[keep])
+
+    def mutual_best(self, d_match: float, ratio: float, features: int) -> NDArray[np.intp]:
+        """Pairs that are each other's nearest, nearer than `d_match`, and clearly nearer than the landmark's second."""
+        if not len(self.rows):
+            return np.zeros(0, np.intp)
+        starts = np.flatnonzero(np.diff(self.rows, prepend=-1))
+        count = np.diff(starts, append=len(self.rows))
+        nearest = np.repeat(np.minimum.reduceat(self.distance, starts), count)
+        is_nearest = self.distance == nearest
+        others = np.where(is_nearest, _NONE, self.distance)
+        second = np.where(np.add.reduceat(is_nearest, starts, dtype=int) > 1, 0, np.minimum.reduceat(others, starts))
+        of_feature = np.full(features, _NONE)
+        np.minimum.at(of_feature, self.columns, self.distance)
+        good = is_nearest & (self.distance < d_match) & (self.distance <= of_feature[self.columns])
+        good &= self.distance < ratio * np.repeat(second, count)
+        return np.flatnonzero(good)
+
+
+def _by_levels(pairs: _Pairs, level: NDArray[np.intp], size: tuple[int, int], config: AssociationConfig) -> Matches:
+    """Matches in the smallest windows first, then in larger ones, of what is free still (paper A, Fig. 4)."""
+    free_landmarks, free_features = np.ones(size[0], bool), np.ones(size[1], bool)
+    landmarks, taken = [], []
+    for number, d_match in enumerate(config.d_match):
+        allowed = pairs.select((level <= number) & free_landmarks[pairs.rows] & free_features[pairs.columns])
+        best = allowed.mutual_best(d_match, config.ratio, size[1])
+        landmarks.append(allowed.rows[best])
+        taken.append(allowed.columns[best])
+        free_landmarks[landmarks[-1]] = False
+        free_features[taken[-1]] = False
+    return Matches(np.concatenate(landmarks), np.concatenate(taken))
 
 
 def crowded(uv: Array, others: Array, radius: float) -> BoolArray:

@@ -6,13 +6,13 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slam.errors import SlamError
+from slam.errors import ConfigurationError, SlamError
 
 if TYPE_CHECKING:
     from slam.data import FrameResult
@@ -95,6 +95,17 @@ def run_command(
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
     kind: Annotated[str | None, typer.Option(help="handheld or driving; default: the sequence's own.")] = None,
     format: Annotated[str | None, typer.Option(help="Format; default: found out from the folder.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
+    ] = None,
+    known_map: Annotated[
+        Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")
+    ] = None,
+    save_map: Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")] = None,
+    mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a known map.")] = False,
+    viewer: Annotated[
+        str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
 ) -> None:
     """Run one sequence through one back end."""
@@ -105,13 +116,77 @@ def run_command(
 
     opened = open_sequence(sequence, format=format)
     start, stop = parse_frames(frames)
-    config = SystemConfig.for_kind(kind or opened.kind, frontend).with_settings(settings or [])
-    options = RunOptions(backend, frontend, config, out, start, stop)
+    mono_settings = ["map.monocular=true"] if mono else []
+    default = SystemConfig.for_kind(kind or opened.kind, frontend, backend)
+    config = default.with_settings([*mono_settings, *(settings or [])])
+    if mono and known_map is None:
+        raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
+    options = RunOptions(backend, frontend, config, out, start, stop, record, known_map, save_map, mono)
     progress = Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet)
-    with progress, _whole_frames(progress.frame) as end_of_frame:
-        summary = run(opened, options, end_of_frame)
+    with ExitStack() as stack:
+        watch = None
+        if viewer is not None:
+            from slam.viewer import Viewer
+
+            watch = stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show
+        end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame))
+        summary = run(opened, options, end_of_frame, watch=watch)
     if not quiet:
         print_summary([summary], out)
+
+
+@app.command("replay")
+def replay_command(
+    recording: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Made by `slam run --record`.")],
+    out: OutOption,
+    backend: Annotated[str, typer.Option(help="Back end by name, see `slam list`.")] = "ekf",
+    settings: SetOption = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+) -> None:
+    """Give a back end the same measurements that another one was given."""
+    from slam.config import SystemConfig
+    from slam.display import Progress, print_summary
+    from slam.recording_file import load_recording
+    from slam.runner import RunOptions, run_recording
+
+    loaded = load_recording(recording)
+    config = SystemConfig(models=loaded.models).with_settings(settings or [])
+    progress = Progress(len(loaded), f"{loaded.name} · {backend}", quiet)
+    with progress, _whole_frames(progress.frame) as end_of_frame:
+        summary = run_recording(loaded, RunOptions(backend, "recording", config, out), end_of_frame)
+    if not quiet:
+        print_summary([summary], out)
+
+
+@app.command("compare")
+def compare_command(
+    sequences: Annotated[
+        list[str], typer.Argument(metavar="SEQUENCE…", help="Folders, or synthetic:NAME?key=value.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder; a comparison that was stopped in it goes on.")],
+    backends: Annotated[str, typer.Option(help="Names with commas; the first is the reference.")] = "ekf,smoother",
+    frontends: Annotated[str, typer.Option(help="Names; simulated: a world's own features, no images.")] = "",
+    variant: Annotated[
+        list[str] | None, typer.Option(metavar="NAME:FRONTEND:KEY=VALUE:…", help="A front end with settings.")
+    ] = None,
+    settings: SetOption = None,
+    trials: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, … of every synthetic world.")] = 1,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
+    replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
+    workers: Annotated[int | None, typer.Option(help="Processes; default: the number of cores.")] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no conclusions.")] = False,
+) -> None:
+    """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
+    from slam.compare import command
+    from slam.compare.plan import Plan
+    from slam.runner import parse_frames
+
+    names = [[word for word in text.split(",") if word] for text in (backends, frontends)]
+    variants = command.variants_of(names[1], variant or [], settings or [])
+    plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
+    command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
 
 
 @app.command("render")
@@ -126,14 +201,25 @@ def render_command(
     from slam.display import counting
     from slam.runner import parse_frames
     from slam.sequences import open_sequence
-    from slam.worlds.export import write_euroc
+    from slam.worlds.export import require_world, write_euroc
 
-    opened = open_sequence(sequence)
+    opened = require_world(open_sequence(sequence))
     start, stop = parse_frames(frames)
     with counting(_frame_count(opened, start, stop), f"{opened.name} · render", quiet) as progress:
         root = write_euroc(opened, out, start, stop, progress, truth_images)
     if not quiet:
         print(f"Files: {root}")
+
+
+@app.command("view")
+def view_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
+    target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
+) -> None:
+    """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
+    from slam.viewer import view_run
+
+    view_run(folder, target)
 
 
 @app.command("list")

@@ -248,6 +248,7 @@ class FrameResult:
         milliseconds: wall time per stage.
         moving_features: rows of features that are judged to move (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
+        located: False where the camera has not been found yet in the map that it was started with: its pose is none.
     """
 
     index: int
@@ -266,3 +267,4 @@ class FrameResult:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     moving_features: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     objects: tuple[MovingObject, ...] = ()
+    located: bool = True

@@ -13,8 +13,7 @@ from slam.se3 import Array
 
 def rotation(phi: Array) -> Array:
     """Rotation matrix (3, 3) of the angles (3,): ``R_C^W`` of paper B, below Eq. 2."""
-    sx, sy, sz = np.sin(phi)
-    cx, cy, cz = np.cos(phi)
+    (sx, sy, sz), (cx, cy, cz) = np.sin(phi).tolist(), np.cos(phi).tolist()  # Python's floats are the faster ones
     return np.array(
         [
             [cy * cz, sx * sy * cz - cx * sz, cx * sy * cz + sx * sz],
@@ -50,6 +49,5 @@ def angles(R: Array) -> Array:
 
 def body_rate_matrix(phi: Array) -> Array:
     """``E(φ)`` (3, 3) with body angular rate ``ω = E(φ) φ̇``; singular at φy = ±π/2."""
-    sx, sy, _ = np.sin(phi)
-    cx, cy, _ = np.cos(phi)
+    (sx, sy, _), (cx, cy, _) = np.sin(phi).tolist(), np.cos(phi).tolist()
     return np.array([[1, 0, -sy], [0, cx, sx * cy], [0, -sx, cx * cy]])

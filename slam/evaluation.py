@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from slam.errors import TrajectoryError
@@ -16,13 +18,21 @@ from slam.metrics import (
     segment_errors,
 )
 from slam.se3 import Array, inverse, rotation_angle
-from slam.sequences import Sequence
 from slam.trajectory import Trajectory
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 
 
-def evaluate(estimate: Trajectory, sequence: Sequence) -> dict[str, float]:
+class WithTruth(Protocol):
+    """What is asked of a sequence or a recording."""
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The left camera's true path; None where it is not known."""
+        ...
+
+
+def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     """Errors of an estimated path against the sequence's truth; empty where fewer than 3 poses have any."""
     figures: dict[str, float] = {}
     pairs = _common(estimate, sequence.ground_truth)
@@ -72,7 +82,7 @@ def _against_truth(own: Trajectory, true: Trajectory) -> dict[str, float]:
     }
 
 
-def consistency(estimate: Trajectory, covariances: Array, sequence: Sequence) -> dict[str, float]:
+def consistency(estimate: Trajectory, covariances: Array, sequence: WithTruth) -> dict[str, float]:
     """How honest the pose covariances are: mean NEES over the path and its 95 % band; empty without truth.
 
     The estimate's world is the first left camera, so the truth is taken relative to its first pose. One run's errors

@@ -93,6 +93,7 @@ def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> 
         _draw_truth(axis, run.online, truth, (0, 2))
         axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
         _limit_to_most(axis, run)
+        _draw_end(axis, run.online, truth)
     axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
     _save(figure, path)
 
@@ -113,7 +114,10 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
             colour = _SEEN if run.seen_last[row] else _UNSEEN
             axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
         p = run.online.positions
-        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5)
+        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5, label="path")
+        for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
+            axis.plot([], [], [], color=colour, lw=1, label=label)
+        axis.legend(loc="upper left", fontsize=8, frameon=False)
         axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
         axis.set_aspect("equal")
         axis.view_init(elev=25, azim=-65)
@@ -163,6 +167,23 @@ def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, compon
     own, true = associate(online, truth, 0.02, interpolated=True)
     aligned = align(true, own).apply_trajectory(true)
     axis.plot(*aligned.positions[:, list(components)].T, "--", color=_TRUTH, lw=1.2, label="true path")
+
+
+def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
+    """The end of the path in an inset, large enough to tell it from the true path."""
+    if truth is None or len(online) < 3:
+        return
+    extent = max(float(np.ptp(online.positions, axis=0).max()), 1e-3)
+    own, true = associate(online, truth, 0.02, interpolated=True)
+    error = float(np.linalg.norm((align(true, own).apply_trajectory(true).positions - own.positions)[-1]))
+    end, half = own.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
+    inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
+    inset.plot(*online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6)
+    _draw_truth(inset, online, truth, (0, 2))
+    inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
+    inset.set(xticks=[], yticks=[])
+    inset.set_title(f"end of the path, {200 * half:.2g} cm wide", fontsize=7)
+    axis.indicate_inset_zoom(inset, edgecolor="0.5")
 
 
 def _near_rows(run: RunData) -> np.ndarray:

@@ -131,7 +131,23 @@ class MapBackend(Protocol):
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """Add landmarks with known positions (N, 3) [m] and covariances (N, 3, 3) [m²], independent of the pose.
 
+        At any time, before the first `predict` as well. The landmarks are in the world frame; how well the camera's
+        place in it is known is what the models' `initial_pose` and its sigmas say. Correlations between the landmarks
+        are taken to be none.
+
         Raises:
             MeasurementError: an id is in the map already, or a covariance is not symmetric and positive definite.
+        """
+        ...
+
+    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+        """Add landmarks at `local` (N, 3) [m] in the newest camera's coordinates, with covariances (N, 3, 3) [m²].
+
+        As `Backend.add`, but for landmarks whose place before the camera comes from elsewhere than a stereo pair: the
+        covariances say how well it is known, and the landmarks hang on the camera's pose as it was when they came.
+
+        Raises:
+            MeasurementError: before the first `predict`; an id is in the map already, or a covariance is not symmetric
+                and positive definite.
         """
         ...

@@ -16,10 +16,10 @@ class LandmarkRows:
 
     Attributes:
         ids: landmark ids (N,).
-        descriptors: as last seen (N, D) float32.
+        descriptors: what it looks like (N, D) float32.
         laplacian: signs of the Laplacian (N,) int8.
         seen: number of frames in which it was measured (N,).
-        in_view: number of frames in which it was predicted in the angle of view (N,).
+        in_view: number of frames in which it should have been detected or was (N,).
         missed: number of such frames since it was last measured (N,).
         first_seen, last_seen: frame indices (N,).
     """
@@ -47,19 +47,30 @@ class LandmarkRows:
         return np.searchsorted(self.ids, ids)
 
     def after_frame(
-        self, frame: int, in_view: IdArray, measured: IdArray, features: StereoFeatures, feature_rows: NDArray[np.intp]
+        self,
+        frame: int,
+        in_view: IdArray,
+        measured: IdArray,
+        features: StereoFeatures,
+        feature_rows: NDArray[np.intp],
+        renewal: float = 1.0,
     ) -> LandmarkRows:
-        """Count what one frame showed: which ids were in view, which were measured, by which features."""
+        """Count what one frame showed: which ids were in view, which were measured, by which features.
+
+        `renewal` is the weight of the measured features' descriptors against the landmarks': 1 for the last look, 0 for
+        the first.
+        """
         view, hit = self.rows(in_view), self.rows(measured)
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
         views[view] += 1
         missed[view] += 1
-        views[np.setdiff1d(hit, view)] += 1  # recognised although predicted out of view
+        views[np.setdiff1d(hit, view)] += 1  # measured although not expected
         seen[hit] += 1
         missed[hit] = 0
         last_seen[hit] = frame
         descriptors = self.descriptors.copy()
-        descriptors[hit] = features.descriptors[feature_rows]
+        look = (1 - renewal) * descriptors[hit] + renewal * features.descriptors[feature_rows]
+        descriptors[hit] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
         return replace(self, seen=seen, in_view=views, missed=missed, last_seen=last_seen, descriptors=descriptors)
 
     def with_new(

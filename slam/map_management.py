@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.association import crowded
+from slam.association import crowded, pairs_in_boxes
 from slam.data import BoolArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.landmarks import LandmarkRows
 from slam.models import FORBID_UNKNOWN, require_not_negative
 from slam.rig import StereoRig
 from slam.se3 import Array
+from slam.visibility import MapView
+
+_SIGMAS = 3.0
+_SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 
 
 @dataclass(frozen=True)
@@ -28,10 +32,21 @@ class MapConfig:
         erase_missed: a landmark is erased after so many frames in view without being measured ("not continuously
             detected"), and
         erase_share: where it was measured in less than this share of the frames in view (judged from
-            `erase_missed` frames on).
-        restart_after: where no landmark was recognised for more frames than these, new ones are added all the same, and
-            the map goes on from the predicted pose; again after as many frames.
+            `erase_missed` frames on). Frames in which it may be hidden, or lies near the image's border, do not count.
+        confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
+        forget_after: landmarks not measured for so many frames are erased wherever they are, so that nothing is seen
+            again; 0 for never: the map lasts.
+        view_margin: distance from the border [px] within which a landmark is not sure to be detected.
+        occlusion_radius: a landmark is taken to be hidden where most features so near to it [px] are nearer to the
+            camera; 0 for never.
+        same_distance: landmarks so near to each other [m], or nearer than stereo can tell apart,
+        same_descriptor: with descriptors so near, are one and the same.
+        renewal: weight of a landmark's newest descriptor against the one kept; 1 keeps the last, 0 the first.
+        lost_after: where no landmark was recognised for so many frames and the prediction is vague, the camera is lost.
+        restart_after: where nothing was recognised in so many frames that showed enough features for it, the place is
+            taken for an unknown one: new landmarks are added from the predicted pose; again after as many frames.
         max_landmarks: size of the map; beyond it, those measured longest ago are erased.
+        monocular: features without a stereo match become landmarks too, when two views give their depth (paper B, 2.2).
     """
 
     target_in_view: int = 150
@@ -40,8 +55,17 @@ class MapConfig:
     max_depth_error: float = 0.2
     erase_missed: int = 5
     erase_share: float = 0.3
-    restart_after: int = 3
+    confirmed: int = 6
+    forget_after: int = 0
+    view_margin: float = 16.0
+    occlusion_radius: float = 12.0
+    same_distance: float = 0.02
+    same_descriptor: float = 0.4
+    renewal: float = 0.0
+    lost_after: int = 5
+    restart_after: int = 30
     max_landmarks: int = 1000
+    monocular: bool = False
 
     __pydantic_config__ = FORBID_UNKNOWN
 
@@ -53,8 +77,10 @@ class MapConfig:
             raise ConfigurationError("map: grid cells must be at least 1 and separation not negative")
         if not (0 < self.max_depth_error < 1 and 0 <= self.erase_share < 1):
             raise ConfigurationError("map: max_depth_error or erase_share is out of range")
-        if self.erase_missed < 1 or self.restart_after < 0:
-            raise ConfigurationError("map: erase_missed >= 1 and restart_after >= 0 are required")
+        if min(self.erase_missed, self.lost_after, self.restart_after) < 1 or self.renewal > 1:
+            raise ConfigurationError(
+                "map: erase_missed, lost_after and restart_after >= 1 and renewal <= 1 are required"
+            )
 
 
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
@@ -62,7 +88,12 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     lost = landmarks.missed >= config.erase_missed
     judged = landmarks.in_view > config.erase_missed
     rare = judged & (landmarks.seen < config.erase_share * landmarks.in_view)
-    return lost | rare
+    times = np.unique(landmarks.last_seen)  # frames in which nothing was seen do not count
+    later = len(times) - 1 - np.searchsorted(times, landmarks.last_seen)
+    unconfirmed = (landmarks.seen < config.confirmed) & (later > config.erase_missed)
+    unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
+    forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
+    return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
 def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
@@ -77,6 +108,58 @@ def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
         order = np.lexsort((landmarks.last_seen, landmarks.seen > 1, now))
         out[order[:surplus]] = True
     return out
+
+
+def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, config: MapConfig) -> BoolArray:
+    """Which features (F,) are landmarks although they were not recognised: the same place and the same looks.
+
+    The place is the same within `same_distance`, or within what the depth's uncertainty allows along the line of sight.
+    """
+    out = np.zeros(len(features), bool)
+    feature, rows = _near_landmarks(features.uv_left, view, config)
+    offset = view.points[feature] - view.local[rows]
+    along = np.abs(offset[:, 2]) < _SIGMAS * view.depth_sigma[feature]
+    same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
+    same &= _alike(landmarks, rows, features.descriptors[feature], features.laplacian[feature], config)
+    out[feature[same]] = True
+    return out
+
+
+def doubled_landmarks(view: MapView, landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+    """Which landmarks in view (N,) are the same as another that was seen more often (or is older)."""
+    out = np.zeros(len(landmarks), bool)
+    shown = np.flatnonzero(view.in_image)
+    one, other = _near_landmarks(view.uv_left[shown], view, config)
+    one = shown[one]
+    less = (landmarks.seen[one] < landmarks.seen[other]) | (
+        (landmarks.seen[one] == landmarks.seen[other]) & (one > other)
+    )
+    one, other = one[less], other[less]
+    same = np.linalg.norm(view.positions[one] - view.positions[other], axis=1) < config.same_distance
+    same &= _alike(landmarks, one, landmarks.descriptors[other], landmarks.laplacian[other], config)
+    out[one[same]] = True
+    return out
+
+
+def _near_landmarks(uv: Array, view: MapView, config: MapConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of pixels (P, 2) and of landmarks in view that lie near each other in the image."""
+    shown = np.flatnonzero(view.in_image)
+    if not len(uv) or not len(shown):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _SAME_PIXELS), view.uv_left[shown])
+    return at, shown[which]
+
+
+def _alike(
+    landmarks: LandmarkRows,
+    rows: NDArray[np.intp],
+    descriptors: NDArray[np.float32],
+    laplacian: NDArray[np.int8],
+    config: MapConfig,
+) -> BoolArray:
+    """Whether landmarks look like these descriptors (P, D) and signs of the Laplacian (P,)."""
+    distance = np.linalg.norm(landmarks.descriptors[rows] - descriptors, axis=1)
+    return np.asarray((distance < config.same_descriptor) & (landmarks.laplacian[rows] == laplacian))
 
 
 def new_landmarks(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from slam.errors import ConfigurationError
+from slam.objects.models import ObjectModels
 from slam.se3 import Array
 
 
@@ -68,6 +69,7 @@ class EstimatorModels:
         initial_position_sigma, initial_rotation_sigma: of the first pose [m], [rad]; tiny where it defines the world.
         initial_velocity_sigma, initial_angular_velocity_sigma: of the first velocities [m/s], [rad/s].
         T_world_left: first pose (4, 4); None for the identity.
+        objects: how moving bodies move.
     """
 
     motion: MotionModel = field(default_factory=MotionModel)
@@ -78,6 +80,7 @@ class EstimatorModels:
     initial_velocity_sigma: float = 1.0
     initial_angular_velocity_sigma: float = 1.0
     T_world_left: Sequence[Sequence[float]] | None = None
+    objects: ObjectModels = field(default_factory=ObjectModels)
 
     __pydantic_config__ = FORBID_UNKNOWN
 
@@ -105,7 +108,7 @@ class EstimatorModels:
 KINDS = {
     "handheld": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=1.0),
-        pixel_sigma=0.7,
+        pixel_sigma=0.3,
         initial_velocity_sigma=1.0,
         initial_angular_velocity_sigma=1.0,
     ),
@@ -114,6 +117,12 @@ KINDS = {
         pixel_sigma=0.7,
         initial_velocity_sigma=15.0,
         initial_angular_velocity_sigma=0.3,
+        objects=ObjectModels(
+            acceleration=2.0,
+            angular_acceleration=0.5,
+            initial_velocity_sigma=15.0,
+            initial_angular_velocity_sigma=0.5,
+        ),
     ),
 }
 

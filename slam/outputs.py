@@ -12,11 +12,14 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
+from slam.euler import angles
 from slam.landmarks import LandmarkRows
+from slam.objects.data import MovingObject
+from slam.se3 import Array
 from slam.trajectory import Trajectory, tum_line
 
 #: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
-STAGES = ("read", "extract", "predict", "associate", "update", "manage", "estimate")
+STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage")
 
 FRAME_COLUMNS = (
     "frame", "stamp", "status", "reason", "features", "stereo", "predicted", "matched", "used", "rejected",
@@ -57,7 +60,8 @@ class RunFiles:
             raise SlamError(f"cannot write to {folder}: {error.strerror or error}") from error
         self._frame_rows = csv.writer(self._frames, lineterminator="\n")
         self._frame_rows.writerow(FRAME_COLUMNS)
-        csv.writer(self._objects, lineterminator="\n").writerow(OBJECT_COLUMNS)
+        self._object_rows = csv.writer(self._objects, lineterminator="\n")
+        self._object_rows.writerow(OBJECT_COLUMNS)
         self._objects.flush()
 
     def __enter__(self) -> RunFiles:
@@ -73,19 +77,22 @@ class RunFiles:
         return (self.folder / name).open("w", encoding="utf-8", newline="")
 
     def write_frame(self, number: int, result: FrameResult) -> None:
-        """Append one frame, `number` in its sequence, to trajectory.txt and frames.csv."""
+        """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv."""
         e, r = result.estimate, result.report
-        self._trajectory.write(tum_line(e.stamp, e.T_world_left))
+        if result.located:
+            self._trajectory.write(tum_line(e.stamp, e.T_world_left))
         row: list[Any] = [number, f"{e.stamp:.9f}", result.status.value, result.reason]
         features = result.features
         row += [len(features), int(features.has_stereo.sum()), result.predicted]
         row += [len(result.matched), len(r.used), len(r.rejected)]
         row += [len(result.added), len(result.erased), result.map_size]
-        row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, _deviations(e))]
+        deviations = _deviations(e) if result.located else [float("nan")] * 4
+        row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         self._frame_rows.writerow(row)
-        self._trajectory.flush()
-        self._frames.flush()
+        self._object_rows.writerows(_object_row(thing) for thing in result.objects)
+        for file in (self._trajectory, self._frames, self._objects):
+            file.flush()
 
     def write_final(
         self, trajectory: Trajectory, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]
@@ -101,7 +108,9 @@ class RunFiles:
             for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
                 at = int(landmarks.rows(np.array([i]))[0])
                 values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
-                rows.writerow([int(i), *values, int(landmarks.seen[at]), numbers[landmarks.last_seen[at]]])
+                step = int(landmarks.last_seen[at])
+                last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
+                rows.writerow([int(i), *values, int(landmarks.seen[at]), last])
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all."""
@@ -113,6 +122,18 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
     temporary = path.with_suffix(".json.part")
     temporary.write_text(json.dumps(_finite(tree), indent=2) + "\n", encoding="utf-8")
     temporary.replace(path)
+
+
+def _object_row(thing: MovingObject) -> list[Any]:
+    """Pose, motion since the previous frame in world coordinates, and the pose covariance's upper triangle."""
+    e = thing.estimate
+    numbers = [*_pose_numbers(e.T_world_object), *_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
+    return [f"{e.stamp:.9f}", thing.id, *(f"{x:.9g}" for x in numbers)]
+
+
+def _pose_numbers(T: Array) -> list[float]:
+    """x, y, z [m], roll, pitch, yaw [rad]."""
+    return [*map(float, T[:3, 3]), *map(float, angles(T[:3, :3]))]
 
 
 def _deviations(estimate: Estimate) -> list[float]:

@@ -18,6 +18,10 @@ _MINIMAL = 3  # stereo points that fix a pose
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5
+_BATCH = 50  # hypotheses tried at once
+_APPROACHES = 3
+_ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
+_CONVERGED = 1e-6  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
 
 
 @dataclass(frozen=True)
@@ -43,8 +47,9 @@ def find_consensus(
 ) -> PoseConsensus:
     """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
 
-    The guess, refined on what agrees with it, is tried first, and is enough where a clear majority agrees. Other
-    hypotheses are rigid fits of three triangulated points, refined on their reprojection errors.
+    The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
+    a clear majority agrees. Other hypotheses are rigid fits of three triangulated points, refined on their reprojection
+    errors.
 
     Args:
         rig: the cameras.
@@ -55,18 +60,49 @@ def find_consensus(
         hypotheses: how many minimal sets are tried.
         seed: of the random choice.
     """
+    clear = _CLEAR_MAJORITY * len(points)
     first = _polish(rig, points, measured, inverse(guess), threshold)
-    if first.inliers.sum() >= _CLEAR_MAJORITY * len(points):
+    if first.inliers.sum() >= clear:
         return first
+    nearer = _polish(rig, points, measured, _approach(rig, points, measured, inverse(guess)), threshold)
+    if nearer.inliers.sum() >= max(clear, first.inliers.sum()):
+        return nearer
     stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
     if len(stereo) < _MINIMAL:
         return first
-    poses = _minimal_poses(rig, points, measured, stereo, hypotheses, seed)
-    if not len(poses):
+    T_left_world = _best_hypothesis(rig, points, measured, stereo, threshold, hypotheses, seed)
+    if T_left_world is None:
         return first
-    support = _agreement(rig, points, measured, poses, threshold).sum(axis=1)
-    best = _polish(rig, points, measured, poses[int(np.argmax(support))], threshold)
+    best = _polish(rig, points, measured, T_left_world, threshold)
     return best if best.inliers.sum() > first.inliers.sum() else first
+
+
+def _best_hypothesis(
+    rig: StereoRig,
+    points: Array,
+    measured: Array,
+    stereo: NDArray[np.intp],
+    threshold: float,
+    hypotheses: int,
+    seed: int,
+) -> Array | None:
+    """The pose T_left_world (4, 4) from three stereo matches with which most matches agree; None where there is none.
+
+    Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
+    """
+    rng = np.random.default_rng(seed)
+    best, most, tried = None, 0, 0
+    while tried < hypotheses:
+        poses = _minimal_poses(rig, points, measured, stereo, min(_BATCH, hypotheses - tried), rng)
+        tried += _BATCH
+        if not len(poses):
+            continue
+        support = _agreement(rig, points, measured, poses, threshold).sum(axis=1)
+        if support.max() > most:
+            best, most = poses[int(np.argmax(support))], int(support.max())
+        if (1 - (most / len(points)) ** _MINIMAL) ** tried < 0.01:
+            break
+    return best
 
 
 def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> PoseConsensus:
@@ -75,7 +111,8 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array,
     for _ in range(_POLISHING_ROUNDS):
         if inliers.sum() < _MINIMAL:
             break
-        better = refine_pose(rig, points[inliers], measured[inliers], T_left_world)
+        rows = _some(inliers)
+        better = refine_pose(rig, points[rows], measured[rows], T_left_world)
         again = _agreement(rig, points, measured, better[None], threshold)[0]
         if again.sum() < inliers.sum():
             break
@@ -86,6 +123,26 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array,
     return PoseConsensus(inverse(T_left_world), inliers)
 
 
+def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """A pose T_left_world (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
+    for _ in range(_APPROACHES):
+        error = _errors(rig, points, measured, T_left_world[None])[0]
+        good = np.isfinite(error)
+        if good.sum() < _MINIMAL:
+            break
+        rows = _some(good & (error <= np.median(error[good])))
+        T_left_world = refine_pose(rig, points[rows], measured[rows], T_left_world, steps=2)
+    return T_left_world
+
+
+def _some(mask: BoolArray) -> NDArray[np.intp]:
+    """Rows of a mask; evenly chosen ones where they are more than a pose needs."""
+    rows = np.flatnonzero(mask)
+    if len(rows) <= _ENOUGH:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
+
+
 def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = 10) -> Array:
     """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
     T = T_left_world
@@ -93,16 +150,15 @@ def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Ar
         residual, J = _reprojection(rig, points, measured, T[None])
         delta = _gauss_newton_step(residual, J)[0]
         T = exp(delta) @ T
-        if np.abs(delta).max() < 1e-8:
+        if np.abs(delta).max() < _CONVERGED:
             break
     return T
 
 
 def _minimal_poses(
-    rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, seed: int
+    rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, rng: np.random.Generator
 ) -> Array:
     """Poses T_left_world (H, 4, 4) from random triples of stereo matches."""
-    rng = np.random.default_rng(seed)
     triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :_MINIMAL]]
     uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
     local = rig.triangulate(measured[:, :2], uv_right)
@@ -159,9 +215,15 @@ def _gauss_newton_step(residual: Array, J: Array) -> Array:
 
 def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:
     """Which matches (H, M) reproject within `threshold` [px] under each pose."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(_errors(rig, points, measured, T_left_world) < threshold)
+
+
+def _errors(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
     left, right = rig.project(local.reshape(-1, 3))
     z = np.concatenate([left, right[:, :1]], axis=1).reshape(*local.shape[:2], 3)
     error = np.abs(measured - z)
     error[..., 2] = np.where(np.isfinite(measured[:, 2]), error[..., 2], 0.0)
-    return np.asarray((error < threshold).all(axis=-1))  # NaN (behind the camera) compares false
+    return np.asarray(error.max(axis=-1))

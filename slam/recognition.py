@@ -15,7 +15,9 @@ from slam.data import IdArray, Prediction, StereoFeatures
 from slam.landmarks import LandmarkRows
 from slam.pose_solver import PoseConsensus, find_consensus, measurement_rows
 from slam.rig import StereoRig
-from slam.se3 import Array, inverse, transform
+from slam.se3 import Array, inverse, log, transform
+
+_TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,11 @@ class Recognition:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def without(self, ids: IdArray) -> Recognition:
+        """The same but for some landmarks."""
+        keep = ~np.isin(self.ids, ids)
+        return Recognition(self.ids[keep], self.rows[keep], self.T_world_left)
 
     @classmethod
     def nothing(cls) -> Recognition:
@@ -56,7 +63,13 @@ class Recogniser:
         self.pixel_sigma = pixel_sigma
 
     def recognise(
-        self, prediction: Prediction, landmarks: LandmarkRows, positions: Array, features: StereoFeatures, seed: int
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkRows,
+        positions: Array,
+        features: StereoFeatures,
+        seed: int,
+        doubtful: bool = False,
     ) -> Recognition:
         """Landmarks whose features agree with one camera pose.
 
@@ -70,22 +83,28 @@ class Recogniser:
             positions: the landmarks' positions (N, 3) in world coordinates.
             features: of the frame.
             seed: of the random choice in the geometric check.
+            doubtful: nothing was recognised in the last frame: the whole map must say more, see `wide_share`.
         """
         if not len(landmarks) or not len(features):
             return Recognition.nothing()
         rows = landmarks.rows(prediction.ids)
         matches = self._in_windows(prediction, landmarks, rows, features)
         consensus = self._consensus(matches, positions, features, prediction.T_world_left, seed)
-        tight = _median_deviation(prediction) <= self.config.tight_window
+        tight = median_deviation(prediction) <= self.config.tight_window
+        least = 0.0
         if consensus.inliers.sum() < self.config.minimum_consistent:
             matches_wide = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, self.config)
             wide = self._consensus(matches_wide, positions, features, prediction.T_world_left, seed, wide=True)
             if wide.inliers.sum() >= self.config.minimum_consistent:
                 matches, consensus, tight = matches_wide, wide, False
+                least = self.config.wide_share if doubtful else 0.0
             elif not tight:
                 return Recognition.nothing()
         if not tight:
-            matches, consensus = self._again(consensus, matches, prediction, landmarks, positions, features, seed)
+            expected = self._expected(consensus.T_world_left, prediction, landmarks, positions)
+            matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
+            if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):
+                return Recognition.nothing()
         return _recognition(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
 
     def _in_windows(
@@ -102,44 +121,59 @@ class Recogniser:
     ) -> PoseConsensus:
         measured = measurement_rows(features.uv_left[matches.features], features.uv_right[matches.features])
         threshold = self.config.consistency_sigmas * self.pixel_sigma
+        if wide and len(matches) < self.config.minimum_consistent:
+            return PoseConsensus(guess, np.zeros(len(matches), bool))
         hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
         return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
+
+    def _expected(
+        self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkRows, positions: Array
+    ) -> Prediction:
+        """What would be seen from another pose, in small windows."""
+        left, right = self.rig.project(transform(inverse(T_world_left), positions))
+        view = np.flatnonzero(self.rig.left.in_image(left))
+        innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
+        return replace(
+            prediction,
+            T_world_left=T_world_left,
+            ids=landmarks.ids[view],
+            uv_left=left[view],
+            uv_right=right[view],
+            innovation=innovation,
+        )
 
     def _again(
         self,
         consensus: PoseConsensus,
         matches: Matches,
-        prediction: Prediction,
+        expected: Prediction,
         landmarks: LandmarkRows,
         positions: Array,
         features: StereoFeatures,
         seed: int,
     ) -> tuple[Matches, PoseConsensus]:
         """Search once more in small windows around what the consensus pose predicts; the better of both comes back."""
-        local = transform(inverse(consensus.T_world_left), positions)
-        left, right = self.rig.project(local)
-        view = np.flatnonzero(self.rig.left.in_image(left))
-        innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
-        anew = replace(
-            prediction,
-            T_world_left=consensus.T_world_left,
-            ids=landmarks.ids[view],
-            uv_left=left[view],
-            uv_right=right[view],
-            innovation=innovation,
-        )
-        matches_anew = self._in_windows(anew, landmarks, view, features)
+        matches_anew = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
         consensus_anew = self._consensus(matches_anew, positions, features, consensus.T_world_left, seed)
         if consensus_anew.inliers.sum() < consensus.inliers.sum():
             return matches, consensus
         return matches_anew, consensus_anew
 
 
-def _median_deviation(prediction: Prediction) -> float:
+def jump(prediction: Prediction, T_world_left: Array) -> float:
+    """How far a pose (4, 4) lies from the predicted one, in standard deviations of the prediction."""
+    step = log(inverse(prediction.T_world_left) @ T_world_left)
+    squared = step @ np.linalg.solve(prediction.covariance + _TINY * np.eye(6), step)
+    return float(np.sqrt(max(float(squared), 0.0)))
+
+
+def median_deviation(prediction: Prediction) -> float:
     """Median over landmarks of the larger standard deviation of the innovation [px]."""
     if not len(prediction.ids):
         return float("inf")
-    return float(np.median(np.sqrt(np.linalg.eigvalsh(prediction.innovation)[:, -1])))
+    S = prediction.innovation
+    largest = 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
+    return float(np.sqrt(np.median(largest)))
 
 
 def _recognition(landmarks: LandmarkRows, matches: Matches, T_world_left: Array) -> Recognition:

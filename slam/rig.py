@@ -119,16 +119,35 @@ class StereoRig:
         """Left and right pixels (N, 2) of points (N, 3) [m] in left-camera coordinates; NaN behind a camera."""
         return self.left.project(points), self.right.project((points + self.b) @ self.R.T)
 
-    def project_stereo(self, points: Array) -> tuple[Array, Array]:
+    def project_stereo(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
         """Stereo measurements ``(uL, vL, uR)`` (N, 3) and Jacobian (N, 3, 3) by points (N, 3) in left coordinates.
 
         The right image's row adds nothing but the epipolar check (paper A uses only its x, Eq. 8), so it is no
-        part of the measurement.
+        part of the measurement. Rows of points behind a camera are NaN. Without `jacobian` it has no rows.
         """
-        left, J_left = self.left.project_with_jacobian(points)
-        right, J_right = self.right.project_with_jacobian((points + self.b) @ self.R.T)
+        if self.is_rectified:
+            return self._project_rectified(points, jacobian)
+        left, J_left = self.left.project_with_jacobian(points, jacobian)
+        right, J_right = self.right.project_with_jacobian((points + self.b) @ self.R.T, jacobian)
         z = np.concatenate([left, right[:, :1]], axis=1)
         return z, np.concatenate([J_left, (J_right @ self.R)[:, :1]], axis=1)
+
+    def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
+        """`project_stereo` of a rectified rig, where one division serves all."""
+        a, c = self.left, self.right
+        centre = np.array([a.u0, a.v0, c.u0])
+        inverse = 1 / np.where(points[:, 2] > 1e-9, points[:, 2], np.nan)
+        z = np.empty((len(points), 3))
+        z[:, 0], z[:, 1], z[:, 2] = points[:, 0], points[:, 1], points[:, 0] + self.b[0]
+        z *= np.array([a.fu, a.fv, c.fu]) * inverse[:, None]
+        if not jacobian:
+            return z + centre, np.empty((0, 3, 3))
+        J = np.zeros((len(points), 3, 3))
+        J[:, 0, 0] = a.fu * inverse
+        J[:, 1, 1] = a.fv * inverse
+        J[:, 2, 0] = c.fu * inverse
+        J[:, :, 2] = -z * inverse[:, None]
+        return z + centre, J
 
     def triangulate(self, uv_left: Array, uv_right: Array) -> Array:
         """Points (N, 3) [m] in left-camera coordinates by paper A, Eqs. (8)-(9).

@@ -23,13 +23,21 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import ConfigurationError
-from slam.interfaces import Backend, Frontend
+from slam.interfaces import Backend, Frontend, MapBackend
+from slam.known_map import MapSearch
 from slam.landmarks import LandmarkRows
-from slam.map_management import bad_landmarks, new_landmarks, surplus_landmarks
-from slam.recognition import Recogniser, Recognition
+from slam.map_management import bad_landmarks, doubled_landmarks, known_features, new_landmarks, surplus_landmarks
+from slam.monocular import MonocularDepth, unclaimed
+from slam.objects.data import Judgement
+from slam.objects.modes import ObjectDetector, detector_for
+from slam.recognition import Recogniser, Recognition, jump, median_deviation
 from slam.rig import StereoRig
+from slam.saved_map import FIRST_FRAME, SavedMap
+from slam.se3 import Array
 from slam.selfcalibration import SelfCalibration
+from slam.tracking import Tracking
 from slam.trajectory import Trajectory
+from slam.visibility import MapView, expected_landmarks
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
 
@@ -44,10 +52,13 @@ class StereoSlam:
         backend: a name (see ``backends.names()``) or an object with `Backend`'s methods.
         kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
         config: all settings; overrides `kind`.
+        known_map: a map to start in (see `slam.load_map`). The world is then the map's; frames are lost until the
+            camera is found in it. The back end must be given by its name.
 
     Raises:
         UnknownNameError: no front end or back end of this name.
         ConfigurationError: a setting is unknown or out of range.
+        SlamError: the map is of another front end.
 
     Example:
         >>> import slam
@@ -64,9 +75,12 @@ class StereoSlam:
         *,
         kind: str = "handheld",
         config: SystemConfig | None = None,
+        known_map: SavedMap | None = None,
     ) -> None:
         self.rig = rig
-        self.config = config or SystemConfig.for_kind(kind, frontend if isinstance(frontend, str) else None)
+        names = (name if isinstance(name, str) else None for name in (frontend, backend))
+        default = SystemConfig.for_kind(kind, *names)
+        self.config = config or default
         c = self.config
         self.frontend: Frontend | None = (
             registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
@@ -78,10 +92,21 @@ class StereoSlam:
         )
         self.landmarks: LandmarkRows | None = None
         self.calibration = SelfCalibration(rig, c.self_calibration)
+        self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self._recogniser = Recogniser(rig, c.association, c.models.pixel_sigma)
         self._index = -1
         self._next_id = 0
-        self._unrecognised = 0  # frames since a landmark was last recognised
+        self._tracking = Tracking()
+        self.frontend_name = frontend if isinstance(frontend, str) else ""
+        self.world_frame = FIRST_FRAME
+        self._monocular: MonocularDepth | None = None
+        if c.map.monocular:
+            if not isinstance(self.backend, MapBackend):
+                raise ConfigurationError("map.monocular: this back end cannot place landmarks")
+            self._monocular = MonocularDepth(rig, c.models.pixel_sigma, c.map.max_depth_error)
+        self._search: MapSearch | None = None
+        if known_map is not None:
+            self._search_in(known_map, backend)
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
@@ -102,25 +127,29 @@ class StereoSlam:
             MeasurementError: time does not increase.
         """
         clock = _Clock()
+        if self._search is not None and not self._located(self._search, features):
+            self._index += 1
+            return self._search.lost(self._index, features)
         prediction = self.backend.predict(features.stamp)
         self._index += 1
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         clock.lap("predict")
         measured, features = features, self.calibration.correct(features)
-        found = self._recognise(prediction, landmarks, features)
+        found = self._recognise(prediction, landmarks, features).without(self.objects.suspects)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
         report = self.backend.update(_observations(features, found), found.T_world_left)
         clock.lap("update")
-        landmarks = self._count(landmarks, prediction, features, found, report)
-        landmarks, erased = self._erase(landmarks, bad_landmarks(landmarks, self.config.map))
-        landmarks, added = self._add(landmarks, features, found)
-        landmarks, surplus = self._erase(landmarks, surplus_landmarks(landmarks, self.config.map))
-        self.landmarks = landmarks
-        clock.lap("manage")
+        self._tracking = self._tracked(prediction, features, found, report)
         estimate = self.backend.estimate(landmarks=False)
-        status, reason = self._status(report, len(added))
         clock.lap("estimate")
+        judged = self._judge(features, estimate, found, report)
+        objects = self.objects.update(self.backend, features)
+        clock.lap("objects")
+        landmarks, added, erased = self._keep(landmarks, estimate, features, found, report, judged)
+        self.landmarks = landmarks
+        status, reason = self._status(report, len(added))
+        clock.lap("manage")
         return FrameResult(
             index=self._index,
             status=status,
@@ -133,38 +162,125 @@ class StereoSlam:
             matched_features=found.rows,
             added=added.ids,
             added_features=added.rows,
-            erased=np.concatenate([erased, surplus]),
+            erased=erased,
             map_size=len(landmarks),
             milliseconds=clock.laps,
+            moving_features=judged.moving,
+            objects=objects,
         )
 
+    @property
+    def unlocated_map(self) -> SavedMap | None:
+        """The map that the system was started with, as long as the camera has not been found in it."""
+        return None if self._search is None else self._search.known
+
     def trajectory(self) -> Trajectory:
-        """The left camera's path: the back end's last word on every frame."""
+        """The left camera's path: the back end's last word on every frame (in a known map, from when it was found)."""
         return self.backend.trajectory()
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
-        return self.backend.estimate()
+        return self.backend.estimate() if self._search is None else self._search.estimate(float("nan"))
+
+    def _search_in(self, known_map: SavedMap, backend: str | Backend) -> None:
+        """Start in a known map."""
+        if not isinstance(backend, str):
+            raise ConfigurationError("a system that starts in a known map needs its back end by name")
+        known_map.require_fits(self.frontend_name)
+        self._backend_name = backend
+        self._search = MapSearch(known_map, self.rig, self._recogniser, self.config.models.initial_pose)
+        self._search.fill(self.backend)
+        self.landmarks = known_map.rows
+        self.world_frame = known_map.world_frame
+
+    def _located(self, search: MapSearch, features: StereoFeatures) -> bool:
+        """Look for the camera in the known map; where it is found, the back end begins there, with the map."""
+        T = search.locate(features, self._index + 1)
+        if T is None:
+            return False
+        c = self.config
+        models = search.models_at(c.models, T)
+        self.backend = registry.create("backends", self._backend_name, self.rig, models=models, **c.backend)
+        search.fill(self.backend)
+        self._next_id = int(search.known.ids.max(initial=-1)) + 1
+        self._search = None
+        return True
 
     def _recognise(self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures) -> Recognition:
         """Landmarks in this frame (paper A, III and IV)."""
         positions = self.backend.positions(landmarks.ids)
-        return self._recogniser.recognise(prediction, landmarks, positions, features, seed=self._index)
+        doubtful = self._tracking.unrecognised > 0
+        found = self._recogniser.recognise(prediction, landmarks, positions, features, self._index, doubtful)
+        if found.T_world_left is not None and jump(prediction, found.T_world_left) > self.config.association.max_jump:
+            return Recognition.nothing()
+        return found
+
+    def _judge(
+        self, features: StereoFeatures, estimate: Estimate, found: Recognition, report: UpdateReport
+    ) -> Judgement:
+        """Which features move; before any of them becomes a landmark."""
+        landmark = np.full(len(features), -1, np.int64)
+        landmark[found.rows] = found.ids
+        return self.objects.judge(features, estimate, landmark, found.rows[np.isin(found.ids, report.used)])
+
+    def _tracked(
+        self, prediction: Prediction, features: StereoFeatures, found: Recognition, report: UpdateReport
+    ) -> Tracking:
+        """Whether the pose was measured; a lost camera must recognise more than a tracked one.
+
+        Where the back end uses only the smaller part of the landmarks that agree with each other, it does not agree.
+        """
+        c = self.config
+        least = c.association.minimum_consistent if self._tracking.lost else _MINIMUM_TRACKED
+        vague = median_deviation(prediction) > c.association.tight_window
+        recognised = len(report.used) >= least and 2 * len(report.used) >= len(found)
+        return self._tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
+
+    def _view(self, estimate: Estimate, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
+        """The map from the pose after the update."""
+        return self._view_from(estimate.T_world_left, landmarks, features)
+
+    def _view_from(self, T_world_left: Array, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
+        positions = self.backend.positions(landmarks.ids)
+        return MapView.of(self.rig, T_world_left, positions, features, self.config.models.pixel_sigma)
+
+    def _keep(
+        self,
+        landmarks: LandmarkRows,
+        estimate: Estimate,
+        features: StereoFeatures,
+        found: Recognition,
+        report: UpdateReport,
+        judged: Judgement,
+    ) -> tuple[LandmarkRows, Recognition, IdArray]:
+        """The map after this frame: count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
+        view = self._view(estimate, landmarks, features)
+        landmarks = self._count(landmarks, view, features, found, report)
+        bad = bad_landmarks(landmarks, self.config.map) | np.isin(landmarks.ids, judged.landmarks)
+        bad |= doubled_landmarks(view, landmarks, self.config.map)
+        known = known_features(view, landmarks, features, self.config.map)
+        landmarks, erased = self._erase(landmarks, bad)
+        landmarks, added = self._add(landmarks, features, found, known, judged)
+        landmarks, surplus = self._erase(landmarks, surplus_landmarks(landmarks, self.config.map))
+        return landmarks, added, np.concatenate([erased, surplus])
 
     def _count(
         self,
         landmarks: LandmarkRows,
-        prediction: Prediction,
+        view: MapView,
         features: StereoFeatures,
         found: Recognition,
         report: UpdateReport,
     ) -> LandmarkRows:
         """Count what was seen and missed; a frame in which nothing is recognised says nothing of single landmarks."""
-        tracked = len(report.used) >= _MINIMUM_TRACKED
-        self._unrecognised = 0 if tracked else self._unrecognised + 1
-        expected = prediction.ids if tracked else prediction.ids[:0]
+        m = self.config.map
         measured = np.isin(found.ids, report.used)
-        return landmarks.after_frame(self._index, expected, found.ids[measured], features, found.rows[measured])
+        expected = landmarks.ids[:0]
+        if not self._tracking.unrecognised:
+            size = (self.rig.width, self.rig.height)
+            expected = landmarks.ids[expected_landmarks(view, features, size, m.view_margin, m.occlusion_radius)]
+        ids, rows = found.ids[measured], found.rows[measured]
+        return landmarks.after_frame(self._index, expected, ids, features, rows, m.renewal)
 
     def _erase(self, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
         """Drop landmarks from the map and from the back end."""
@@ -175,31 +291,75 @@ class StereoSlam:
         return landmarks, erased
 
     def _add(
-        self, landmarks: LandmarkRows, features: StereoFeatures, found: Recognition
+        self,
+        landmarks: LandmarkRows,
+        features: StereoFeatures,
+        found: Recognition,
+        known: BoolArray,
+        judged: Judgement,
     ) -> tuple[LandmarkRows, Recognition]:
-        """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew."""
-        if len(landmarks) and self._unrecognised % (self.config.map.restart_after + 1):
+        """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew.
+
+        What moves, or lies on a body that moves, becomes none. What has not been judged yet waits, unless most of
+        the landmarks themselves could not be judged: then the frames lie too far apart to follow anything.
+        """
+        if len(landmarks) and not self._tracking.may_add(self.config.map):
             return landmarks, Recognition.nothing()
-        free = np.ones(len(features), bool)
-        free[found.rows] = False
+        free = ~known
+        free[found.rows] = free[judged.moving] = False
+        still = free.copy()
+        unjudged = np.isin(found.rows, judged.undecided).sum()
+        if len(found) >= max(self.config.objects.enough, 2 * unjudged):
+            still[judged.undecided] = False
         occupied = features.uv_left[found.rows]
-        rows = new_landmarks(features, free, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
+        rows = new_landmarks(features, still, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
         ids = np.arange(self._next_id, self._next_id + len(rows), dtype=np.int64)
         added = Recognition(ids, rows)
         if len(added):
             self.backend.add(_observations(features, added))
             landmarks = landmarks.with_new(self._index, ids, features, rows)
             self._next_id += len(added)
+        if self._monocular is not None:
+            return self._add_monocular(self._monocular, landmarks, features, found, added, free)
         return landmarks, added
+
+    def _add_monocular(
+        self,
+        monocular: MonocularDepth,
+        landmarks: LandmarkRows,
+        features: StereoFeatures,
+        found: Recognition,
+        added: Recognition,
+        free: BoolArray,
+    ) -> tuple[LandmarkRows, Recognition]:
+        """Make landmarks of features without a stereo match that two views give a depth (paper B, 2.2)."""
+        if len(found) < _MINIMUM_TRACKED:
+            return landmarks, added
+        estimate = self.backend.estimate(landmarks=False)
+        view = self._view_from(estimate.T_world_left, landmarks, features)
+        rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
+        covariance = monocular.pose_covariance(estimate, view, landmarks, features, found)
+        new = monocular.step(features, rows, estimate.T_world_left, covariance, self._index)
+        wanted = max(self.config.map.target_in_view - len(found) - len(added), 0)
+        best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
+        if not len(best):
+            return landmarks, added
+        ids = np.arange(self._next_id, self._next_id + len(best), dtype=np.int64)
+        self.backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
+        landmarks = landmarks.with_new(self._index, ids, features, new.rows[best])
+        self._next_id += len(ids)
+        both = Recognition(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
+        return landmarks, both
 
     def _status(self, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
         if report.status is UpdateStatus.FAILED:
             return FrameStatus.FAILED, report.reason
-        if len(report.used) >= _MINIMUM_TRACKED:
+        if not self._tracking.unrecognised:
             return FrameStatus.TRACKED, ""
         if self._next_id == added:
             return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
-        return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks recognised"
+        reason = report.reason or f"only {len(report.used)} landmarks recognised"
+        return (FrameStatus.LOST if self._tracking.lost else FrameStatus.PREDICTED), reason
 
 
 def _observations(features: StereoFeatures, found: Recognition) -> Observations:

@@ -15,7 +15,9 @@ EUROC = "euroc/V1_01_keyframes_a"
 
 def run_defaults(folder, backend, out, stop=None):
     sequence = open_sequence(folder)
-    return run(sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind), out, 0, stop))
+    return run(
+        sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind, "surf", backend), out, 0, stop)
+    )
 
 
 @pytest.mark.parametrize(("backend", "bar"), [("ekf", 0.15), ("smoother", 0.15)])

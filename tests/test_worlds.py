@@ -1,9 +1,11 @@
 """Short forms of every built-in world through both back ends, with bands around the accuracy measured.
 
-Two levels: simulated observations (``sigma=0.7``, which is what the default settings assume), and rendered images.
+Two levels: simulated observations (``sigma=0.7``, and so the settings say), and rendered images.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,7 +35,9 @@ RENDERED = {"aisle?frames=20": 0.005, "desk?frames=20": 0.005, "box?frames=20": 
 @pytest.mark.parametrize("world", OBSERVED)
 def test_observed_world(world, backend):
     sequence = open_sequence(f"synthetic:{world}")
-    system = StereoSlam(sequence.rig, None, backend, kind=sequence.kind)
+    config = SystemConfig.for_kind(sequence.kind)
+    config = replace(config, models=replace(config.models, pixel_sigma=0.7))
+    system = StereoSlam(sequence.rig, None, backend, config=config)
     results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
     assert {r.status.value for r in results[1:]} == {"tracked"}
     estimates = [r.estimate for r in results]

@@ -8,6 +8,7 @@ from typing import Any
 from slam.errors import ConfigurationError
 
 MEASUREMENTS = ("stereo", "left")
+LANDMARKS = ("inverse_depth", "euclidean")
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,10 @@ class EkfConfig:
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
+        landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
+            ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
+
+    The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -25,10 +30,13 @@ class EkfConfig:
 
     measurement: str = "stereo"
     iterations: int = 5
+    landmarks: str = "inverse_depth"
 
     def __post_init__(self) -> None:
         if self.measurement not in MEASUREMENTS:
             raise ConfigurationError(f"ekf: measurement must be one of {MEASUREMENTS}, got {self.measurement!r}")
+        if self.landmarks not in LANDMARKS:
+            raise ConfigurationError(f"ekf: landmarks must be one of {LANDMARKS}, got {self.landmarks!r}")
         if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
             raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
 

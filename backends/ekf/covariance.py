@@ -18,6 +18,8 @@ POSE = 6  #: its part [r, φ] that measurements depend on
 
 SlotArray = NDArray[np.intp]
 
+_LOWER = np.tri(CAMERA)
+
 
 class Covariance:
     """Covariance of ``[camera (12), landmark 0 (3), landmark 1 (3), ...]``; landmarks are named by their slot.
@@ -70,11 +72,11 @@ class Covariance:
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
-        P, rates = self._P, slice(POSE, CAMERA)
-        P[CAMERA:, :POSE] += dt * P[CAMERA:, rates]
-        A = np.eye(CAMERA)
-        A[:POSE, rates] = dt * np.eye(POSE)
-        P[:CAMERA, :CAMERA] = np.tril(A @ self.camera @ A.T + noise)
+        P, camera = self._P, self.camera
+        P[CAMERA:, :POSE] += dt * P[CAMERA:, POSE:CAMERA]
+        camera[:POSE] += dt * camera[POSE:]
+        camera[:, :POSE] += dt * camera[:, POSE:]
+        P[:CAMERA, :CAMERA] = (camera + noise) * _LOWER
 
     def transform_camera(self, J: Array) -> None:
         """``P ← J P Jᵀ`` for a change of the camera's state (12, 12)."""
@@ -119,17 +121,36 @@ class Covariance:
         self._P[new, new] = np.tril(own)
         self.count += len(J)
 
-    def drop(self, slot: int) -> None:
-        """Take a landmark out; the last one moves into its slot."""
-        P, last, to = self._P, CAMERA + 3 * (self.count - 1), CAMERA + 3 * slot
-        if to != last:
-            P[to : to + 3, :to] = P[last : last + 3, :to]
-            P[to + 3 : last, to : to + 3] = P[last : last + 3, to + 3 : last].T
-            P[to : to + 3, to : to + 3] = P[last : last + 3, last : last + 3]
-        P[last : last + 3, : last + 3] = 0.0
-        self.count -= 1
-        if len(P) > self.size + 4 * _spare(self.size):
+    def drop(self, slots: SlotArray) -> tuple[SlotArray, SlotArray]:
+        """Take landmarks out; the last ones move into their slots.
+
+        Moving a landmark costs its rows alone, so that only where most of a map goes would copying the rest be faster.
+
+        Args:
+            slots: of the landmarks (M,), each once.
+
+        Returns:
+            the slots filled anew and the slots that they were filled from; all others keep their place.
+        """
+        left = self.count - len(slots)
+        gone = np.zeros(self.count, bool)
+        gone[slots] = True
+        holes, movers = np.flatnonzero(gone[:left]), left + np.flatnonzero(~gone[left:])
+        for hole, mover in zip(holes.tolist(), movers.tolist()):
+            self._move(CAMERA + 3 * hole, CAMERA + 3 * mover)
+        self._P[CAMERA + 3 * left : self.size] = 0.0
+        self.count = left
+        if len(self._P) > self.size + 4 * _spare(self.size):
             self._resize(self.size)
+        return holes, movers
+
+    def _move(self, to: int, row: int) -> None:
+        """Copy a landmark's rows and columns, which start at `row`, to `to` < `row`."""
+        P = self._P
+        P[to : to + 3, :to] = P[row : row + 3, :to]
+        P[to + 3 : row, to : to + 3] = P[row : row + 3, to + 3 : row].T
+        P[row + 3 : self.size, to : to + 3] = P[row + 3 : self.size, row : row + 3]
+        P[to : to + 3, to : to + 3] = P[row : row + 3, row : row + 3]
 
     def _resize(self, rows: int) -> None:
         """Make the buffer hold `rows` rows, with a little room to grow."""
@@ -140,13 +161,12 @@ class Covariance:
 
 
 def _spare(rows: int) -> int:
-    """Spare rows: few, as BLAS works through them, but enough that growing seldom copies the matrix."""
-    return max(24, rows // 40)
+    """Spare rows: few, as BLAS works through them, but a share of all, so that growing seldom copies the matrix."""
+    return max(24, rows // 24)
 
 
 def _mirrored(lower: Array) -> Array:
     """The symmetric matrix of a lower triangle with zeros above."""
     full = lower + lower.T
-    diagonal = np.arange(len(lower))
-    full[diagonal, diagonal] = lower[diagonal, diagonal]
+    np.fill_diagonal(full, lower.diagonal())
     return full

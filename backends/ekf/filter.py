@@ -13,14 +13,19 @@ from threadpoolctl import ThreadpoolController
 
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import CAMERA, POSE, Covariance
-from backends.ekf.measurement import chained, innovation_covariances, linearise
+from backends.ekf.covariance import CAMERA, POSE, Covariance, SlotArray
+from backends.ekf.landmarks import COORDINATES, Landmarks, far_charts
+from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
+from backends.ekf.objects import ObjectFilter
+from backends.ekf.objects_body import CameraBelief
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam import se3
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.euler import angles, body_rate_matrix
+from slam.known_landmarks import require_known
 from slam.models import EstimatorModels
+from slam.objects.data import ObjectEstimate, ObjectObservations
 from slam.rig import StereoRig
 from slam.se3 import Array
 from slam.trajectory import Trajectory
@@ -53,7 +58,7 @@ class EkfBackend:
     """Extended Kalman filter over the camera's motion and the landmarks, the papers' state estimator.
 
     The state is ``[r, φ, v, ω]`` (12), world position, Euler angles, world velocity and angle rates (paper B, section
-    2), then three world coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
+    2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
     the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10). See
     `backends.ekf.angles` for the angles' world and for what the Euler model costs.
 
@@ -72,12 +77,11 @@ class EkfBackend:
         self.config = EkfConfig.from_options(options)
         self._stamps: list[float] = []
         self._poses: list[Array] = []
-        self._ids = np.zeros(0, np.int64)  # by slot
-        self._slots: dict[int, int] = {}
-        self._points = np.zeros((0, 3))  # by slot
+        self._landmarks = Landmarks(COORDINATES[self.config.landmarks])
         self._R_world_angles, phi = anchor(models.initial_pose[:3, :3])
         self._camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self._covariance = Covariance(self._initial_covariance())
+        self._objects = ObjectFilter(rig, models, self.config.iterations)
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -97,7 +101,7 @@ class EkfBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
-        slots = self._slots_of(observations.ids)
+        slots = self._landmarks.slots(observations.ids)
         if not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         G = self._covariance.gather(slots)
@@ -106,7 +110,7 @@ class EkfBackend:
             problem, gated, surprise = self._gated(problem)
             solution = solve(problem, gated)
             if solution is not None:
-                self._correct(G, solution, surprise)
+                self._correct(slots, G, solution, surprise)
         except UnsolvableError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
         if solution is None:
@@ -119,56 +123,93 @@ class EkfBackend:
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._require_started("add")
-        for i in observations.ids.tolist():
-            if i in self._slots:
-                raise MeasurementError(f"ekf: landmark {i} is in the map already")
+        self._landmarks.require_new(observations.ids)
         if not len(observations):
             return
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
         bad = ~np.isfinite(h).all(axis=1)
         if bad.any():
             raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
-        R, E = self._rotation(), body_rate_matrix(self._camera[3:6])
-        J = np.tile(np.eye(3, POSE), (len(h), 1, 1))
-        J[:, :, 3:] = -R @ se3.hat(h) @ E  # turning by δθ = E δφ about the camera's axes moves h by δθ × h
-        noise = R @ self.rig.triangulation_covariance(h, self.models.pixel_sigma) @ R.T
-        self._covariance.append(J, noise)
-        self._points = np.concatenate([self._points, self._camera[:3] + h @ R.T])  # paper A, Eq. (10)
-        self._slots.update(zip(observations.ids.tolist(), range(len(self._ids), len(self._ids) + len(h))))
-        self._ids = np.concatenate([self._ids, observations.ids])
+        self._place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
         ids = np.unique(np.asarray(ids, np.int64))
-        self._slots_of(ids)
-        count = len(self._ids)
-        for i in ids.tolist():
-            slot, count = self._slots.pop(i), count - 1
-            self._covariance.drop(slot)
-            if slot != count:
-                self._ids[slot], self._points[slot] = self._ids[count], self._points[count]
-                self._slots[int(self._ids[slot])] = slot
-        self._ids, self._points = self._ids[:count], self._points[:count]
+        holes, movers = self._covariance.drop(self._landmarks.slots(ids))
+        self._landmarks.remove(ids, holes, movers)
+        self._objects.landmarks_dropped(holes, movers, len(self._landmarks))
 
     @_one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
-        slots = np.argsort(self._ids) if landmarks else np.zeros(0, np.intp)
+        marks = self._landmarks
+        slots = np.argsort(marks.ids) if landmarks else np.zeros(0, np.intp)
+        D = marks.jacobian(slots)
         return Estimate(
             self._stamps[-1], self._poses[-1].copy(), self._pose_covariance(),
-            self._ids[slots], self._points[slots], self._covariance.blocks(slots),
+            marks.ids[slots], marks.points[slots], D @ self._covariance.blocks(slots) @ D.transpose(0, 2, 1),
         )  # fmt: skip
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        return self._points[self._slots_of(ids)]
+        return self._landmarks.points[self._landmarks.slots(ids)]
 
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
         return Trajectory(np.array(self._stamps), np.array(self._poses).reshape(-1, 4, 4))
 
+    # --- a map that is known (documented in slam.interfaces.MapBackend) ---
+
+    @_one_blas_thread
+    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.insert`."""
+        require_known("ekf", ids, positions, covariances)
+        self._landmarks.require_new(ids)
+        if len(ids):
+            D = self._landmarks.append(ids, far_charts(positions, covariances), positions)
+            self._append(np.zeros((len(ids), 3, POSE)), D @ covariances @ D.transpose(0, 2, 1))
+
+    @_one_blas_thread
+    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.place`."""
+        self._require_started("place")
+        require_known("ekf", ids, local, covariances)
+        self._landmarks.require_new(ids)
+        if len(ids):
+            self._place(ids, local, covariances)
+
+    # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
+
+    @_one_blas_thread
+    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
+        """See `slam.interfaces.ObjectBackend.update_objects`."""
+        self._require_started("update_objects")
+        T, covariance = self._poses[-1], self._covariance
+        columns = covariance.gather(np.zeros(0, np.intp))[: covariance.size]
+        camera = CameraBelief(T, pose_jacobian(T[:3, :3], self._camera[3:6]), columns)
+        return self._objects.update(observations, self._stamps[-1], camera)
+
+    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.ObjectBackend.remove_objects`."""
+        self._objects.remove(ids)
+
     # --- the filter's parts ---
+
+    def _place(self, ids: IdArray, h: Array, covariances: Array) -> None:
+        """Landmarks at h (M, 3) in the camera's coordinates with covariances (M, 3, 3) (paper A, Eq. 10)."""
+        R, E = self._rotation(), body_rate_matrix(self._camera[3:6])
+        J = np.tile(np.eye(3, POSE), (len(h), 1, 1))
+        J[:, :, 3:] = -R @ se3.hat(h) @ E  # turning by δθ = E δφ about the camera's axes moves h by δθ × h
+        noise = R @ covariances @ R.T
+        charts = np.tile(self._pose()[:3], (len(h), 1, 1))
+        D = self._landmarks.append(ids, charts, self._camera[:3] + h @ R.T)
+        self._append(D @ J, D @ noise @ D.transpose(0, 2, 1))
+
+    def _append(self, J: Array, noise: Array) -> None:
+        """Landmarks join with derivatives (M, 3, 6) by [r, φ] and covariances (M, 3, 3) of what does not hang on it."""
+        self._covariance.append(J, noise)
+        self._objects.landmarks_appended(J)
 
     def _initial_covariance(self) -> Array:
         """The camera's prior (12, 12): isotropic in body axes, hence through the angles' rate matrix."""
@@ -193,12 +234,14 @@ class EkfBackend:
         """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W."""
         self._camera[:POSE] += dt * self._camera[POSE:]
         self._covariance.move_camera(dt, self._motion_noise(dt))
+        self._objects.camera_moved(dt)
 
     def _motion_noise(self, dt: float) -> Array:
         """``W Q Wᵀ`` (12, 12)."""
-        W = np.concatenate([dt * np.eye(6), np.eye(6)])
-        linear, angular = self.models.motion.velocity_variance(dt)
-        return W @ np.diag([linear] * 3 + [angular] * 3) @ W.T
+        noise, each = np.zeros((2, POSE, 2, POSE)), np.arange(POSE)
+        variances = np.repeat(self.models.motion.velocity_variance(dt), 3)
+        noise[:, each, :, each] = variances[:, None, None] * np.array([[dt * dt, dt], [dt, 1.0]])
+        return noise.reshape(CAMERA, CAMERA)
 
     def _reanchor_if_needed(self) -> None:
         """Choose a new angles' world where φy comes near its singularity."""
@@ -208,6 +251,7 @@ class EkfBackend:
     def _reanchor(self) -> None:
         self._R_world_angles, self._camera, J = reanchor(self._R_world_angles, self._camera)
         self._covariance.transform_camera(J)
+        self._objects.camera_transformed(J)
 
     def _rotation(self) -> Array:
         return attitude(self._R_world_angles, self._camera[3:6])
@@ -221,29 +265,32 @@ class EkfBackend:
 
     def _prediction(self) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
-        T, covariance = self._poses[-1].copy(), self._covariance
-        R, phi = T[:3, :3], self._camera[3:6]
-        h = (self._points - T[:3, 3]) @ R
+        T, covariance, marks = self._poses[-1].copy(), self._covariance, self._landmarks
+        R = T[:3, :3]
+        h = (marks.points - T[:3, 3]) @ R
         slots = np.flatnonzero(self.rig.left.in_view(h))
         h = h[slots]
-        line = chained(*self.rig.left.project_with_jacobian(h), h, R, phi)
-        right = self.rig.right.project((h + self.rig.b) @ self.rig.R.T)
+        line = chained(*self.rig.project_stereo(h), h, R, self._camera[3:6])
+        left = line.z[:, :2]
+        right = line.z[:, [2, 1]] if self.rig.is_rectified else self.rig.project(h)[1]
+        D = marks.jacobian(slots)
         S = innovation_covariances(
-            line, covariance.pose, covariance.cross(slots), covariance.blocks(slots), self.models.pixel_sigma
-        )
-        return Prediction(self._stamps[-1], T, self._pose_covariance(), self._ids[slots], line.z, right, S)
+            line.by_relative[:, :2], covariance.pose, D @ covariance.cross(slots),
+            D @ covariance.blocks(slots) @ D.transpose(0, 2, 1), self.models.pixel_sigma,
+        )  # fmt: skip
+        return Prediction(self._stamps[-1], T, self._pose_covariance(), marks.ids[slots], left, right, S)
 
-    def _problem(self, observations: Observations, slots: Array, G: Array, guess: Array | None) -> Problem:
+    def _problem(self, observations: Observations, slots: SlotArray, G: Array, guess: Array | None) -> Problem:
         """The update in the coordinates [r, φ, measured landmarks]; G are their columns of the covariance."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
         rows = np.concatenate([np.arange(POSE), (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)])
-        prior = np.concatenate([self._camera[:POSE], self._points[slots].reshape(-1)])
-        R = self._R_world_angles
+        marks = self._landmarks
+        prior = np.concatenate([self._camera[:POSE], marks.state[slots].reshape(-1)])
+        model = StereoMeasurement(self.rig, self._R_world_angles, marks.coordinates, marks.charts[slots])
         return Problem(
-            prior, G[rows], z, self.models.pixel_sigma,
-            lambda x: linearise(self.rig, R, x[:POSE], x[POSE:].reshape(-1, 3)),
+            prior, G[rows], z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
             None if guess is None else self._change_to(guess),
         )  # fmt: skip
@@ -270,10 +317,12 @@ class EkfBackend:
         """
         first = gate(problem)
         most = max(_ENOUGH, (len(problem.z) + 1) // 2)
-        if len(problem.z) < most or first.used.sum() >= most or len(self._stamps) < 2:
+        if len(problem.z) < most or first.used.sum() >= most:
             return problem, first, None
-        for factor in (0.0, *_SURPRISES):
-            noise = factor**2 * self._motion_noise(self._stamps[-1] - self._stamps[-2])
+        started = len(self._stamps) > 1
+        dt = self._stamps[-1] - self._stamps[-2] if started else 0.0
+        for factor in (0.0, *_SURPRISES) if started else (0.0,):
+            noise = factor**2 * self._motion_noise(dt)
             covariance = problem.covariance.copy()
             covariance[:POSE, :POSE] += noise[:POSE, :POSE]
             wider = replace(problem, covariance=covariance)
@@ -283,7 +332,7 @@ class EkfBackend:
                     return wider, gated, noise
         return problem, first, None
 
-    def _correct(self, G: Array, solution: Solution, surprise: Array | None) -> None:
+    def _correct(self, slots: SlotArray, G: Array, solution: Solution, surprise: Array | None) -> None:
         """Change the whole state and covariance, or nothing; `surprise` (12, 12) adds to the camera's covariance.
 
         Raises:
@@ -297,17 +346,11 @@ class EkfBackend:
         if surprise is not None:
             self._covariance.move_camera(0.0, surprise)
         self._camera = self._camera + change[:CAMERA]
-        self._points = self._points + change[CAMERA : self._covariance.size].reshape(-1, 3)
+        self._landmarks.move(change[CAMERA : self._covariance.size].reshape(-1, 3))
         self._covariance.subtract(W)
+        self._objects.camera_corrected(slots, solution, W)
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
-
-    def _slots_of(self, ids: IdArray | Sequence[int]) -> Any:
-        """Slots (M,) of landmark ids."""
-        try:
-            return np.array([self._slots[int(i)] for i in ids], np.intp)
-        except KeyError as error:
-            raise MeasurementError(f"ekf: landmark {error.args[0]} is not in the map") from None
 
     def _require_started(self, what: str) -> None:
         if not self._stamps:

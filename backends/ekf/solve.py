@@ -9,15 +9,14 @@ A component that is not measured (or gated) keeps its row with a zero Jacobian a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
-from backends.ekf.measurement import Linearisation, stacked
+from backends.ekf.measurement import Linearisation, Measurement, stacked
 from slam.data import BoolArray
 from slam.gating import chi_square_gate, chi_square_limits, squared_distances
 from slam.se3 import Array
@@ -44,7 +43,7 @@ class Problem:
         covariance: P_gg (6 + 3M, 6 + 3M), symmetric.
         z: measurements (M, 3) [px], NaN where a component is not measured.
         sigma: pixel noise [px].
-        linearise: predicted measurements at a mean (6 + 3M,).
+        model: what is predicted at a mean (6 + 3M,), and its derivatives.
         iterations: most linearisations.
         gate_probability: quantile of χ² beyond which a landmark's measurement is rejected.
         guess: a change of [r, φ] (6,) worth trying where the prior is far off, or None.
@@ -54,7 +53,7 @@ class Problem:
     covariance: Array
     z: Array
     sigma: float
-    linearise: Callable[[Array], Linearisation]
+    model: Measurement
     iterations: int
     gate_probability: float
     guess: Array | None = None
@@ -83,10 +82,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Iterate:
-    """A correction, what it predicts, and its cost: squared distance from prior and measurements (∞ if unseen)."""
+    """A correction, the change of the mean that it makes, what is predicted there, and the cost.
+
+    The cost is the squared distance from prior and measurements, ∞ where one cannot be seen.
+    """
 
     s: Array
-    line: Linearisation
+    change: Array
+    z: Array
     cost: float
 
 
@@ -119,9 +122,11 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     if not (np.isfinite(problem.prior).all() and np.isfinite(problem.covariance).all()):
         raise UnsolvableError("the predicted state is not finite")
     s = _towards_guess(problem) if at_guess else np.zeros(len(problem.prior))
-    start = _Iterate(s, problem.linearise(problem.prior + problem.covariance @ s), np.inf)
-    rows = np.isfinite(problem.z) & np.isfinite(start.line.z).all(axis=1, keepdims=True)
-    system = _system(problem, rows, start)
+    change = problem.covariance @ s
+    line = problem.model.linearise(problem.prior + change)
+    start = _Iterate(s, change, line.z, np.inf)
+    rows = np.isfinite(problem.z) & np.isfinite(line.z).all(axis=1, keepdims=True)
+    system = _system(problem, rows, start, line)
     nu = np.where(rows, system.nu.reshape(-1, 3), np.nan)
     used = chi_square_gate(nu, _diagonal_blocks(system.S), problem.gate_probability)
     return Gated(used, start, system)
@@ -159,7 +164,7 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
     With one iteration the step is taken as it is: the papers' filter.
     """
     rows = np.isfinite(problem.z) & used[:, None]
-    now = replace(start, cost=_cost(problem, rows, start.line, float(start.s @ (problem.covariance @ start.s))))
+    now = replace(start, cost=_cost(problem, rows, start.z, float(start.s @ start.change)))
     system = first or _system(problem, rows, now)
     for iteration in range(1, problem.iterations + 1):
         y = _solved(system)
@@ -188,18 +193,17 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
 
 def _solved(system: _System) -> Array:
     """``S⁻¹ ν``."""
-    half = dtrsm(1.0, system.L, system.nu[:, None], lower=1)
-    return np.asarray(dtrsm(1.0, system.L, half, lower=1, trans_a=1)[:, 0])
+    return np.asarray(dpotrs(system.L, system.nu, lower=1)[0])
 
 
 def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterate) -> bool:
     """Whether the measurements changed between two iterates as the Jacobian said."""
-    expected = (system.H @ (problem.covariance @ (following.s - now.s))).reshape(-1, 3)
-    return bool(np.abs(following.line.z - now.line.z - expected)[system.rows].max() < _LINEAR * problem.sigma)
+    expected = (system.H @ (following.change - now.change)).reshape(-1, 3)
+    return bool(np.abs(following.z - now.z - expected)[system.rows].max() < _LINEAR * problem.sigma)
 
 
-def _cost(problem: Problem, rows: BoolArray, line: Linearisation, prior_cost: float) -> float:
-    residual = (problem.z - line.z)[rows]
+def _cost(problem: Problem, rows: BoolArray, z: Array, prior_cost: float) -> float:
+    residual = (problem.z - z)[rows]
     cost = prior_cost + float(residual @ residual) / problem.sigma**2
     return cost if np.isfinite(cost) else np.inf
 
@@ -215,8 +219,8 @@ def _towards_guess(problem: Problem) -> Array:
 
 def _visit(problem: Problem, rows: BoolArray, s: Array) -> _Iterate:
     change = problem.covariance @ s
-    line = problem.linearise(problem.prior + change)
-    return _Iterate(s, line, _cost(problem, rows, line, float(s @ change)))
+    z = problem.model.predict(problem.prior + change)
+    return _Iterate(s, change, z, _cost(problem, rows, z, float(s @ change)))
 
 
 def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) -> tuple[_Iterate, bool]:
@@ -231,13 +235,13 @@ def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) ->
     return now, False
 
 
-def _system(problem: Problem, rows: BoolArray, now: _Iterate) -> _System:
-    H = stacked(now.line, rows)
-    HP = H @ problem.covariance
-    nu = np.where(rows, problem.z - now.line.z, 0.0).reshape(-1) + HP @ now.s
-    S = HP @ H.T
-    S[np.diag_indices_from(S)] += problem.sigma**2
-    L, info = dpotrf(S, lower=1, clean=0)
+def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
+    line = line or problem.model.linearise(problem.prior + now.change)
+    H = stacked(line, rows)
+    nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1) + H @ now.change
+    S = H @ problem.covariance @ H.T
+    S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
+    L, info = dpotrf(S.T, lower=1, clean=0)  # S is symmetric: its transpose is in the order that LAPACK wants
     if info != 0:
         raise UnsolvableError("the innovation covariance is not positive definite")
     return _System(rows, H, nu, S, L)

@@ -6,15 +6,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from backends.smoother import pose_only
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import FactorMaker
+from backends.smoother.objects import ObjectSmoother
 from backends.smoother.posegraph import PoseGraph
 from backends.smoother.prediction import (
     PredictedPoints,
     PredictedPose,
+    first_pose,
     normalised_innovation,
     predict_points,
     predict_pose,
@@ -25,9 +28,11 @@ from backends.smoother.threads import one_blas_thread
 from backends.smoother.uncertainty import quadratic
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
+from slam.known_landmarks import require_known
 from slam.models import EstimatorModels
+from slam.objects.data import ObjectEstimate, ObjectObservations
 from slam.rig import StereoRig
-from slam.se3 import Array, inverse, log
+from slam.se3 import Array, inverse
 from slam.trajectory import Trajectory
 
 
@@ -53,6 +58,7 @@ class SmootherBackend:
         self._stereo = RectifiedStereo.of(rig)
         self._make = FactorMaker(self._stereo, models)
         self._graph = PoseGraph(self._make, self.config)
+        self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
         self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
 
     @property
@@ -65,6 +71,11 @@ class SmootherBackend:
         """Makes factors with this back end's rig and models."""
         return self._make
 
+    @property
+    def solver_seconds(self) -> float:
+        """CPU time spent in gtsam so far [s]: the least that this back end could cost; all else is overhead."""
+        return self._graph.solver_seconds
+
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
@@ -75,6 +86,9 @@ class SmootherBackend:
         if not np.isfinite(stamp) or (len(stamps) and stamp <= stamps[-1]):
             last = f" after {stamps[-1]}" if len(stamps) else ""
             raise MeasurementError(f"smoother: stamp {stamp}{last}: time must be finite and increase")
+        if not len(stamps) and len(self.records.landmarks):
+            self._predicted = first_pose(self.models, float(stamp))
+            return self._in_view(self._predicted)
         if not len(stamps):
             self._graph.append_pose(stamp, self.models.initial_pose)
             P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
@@ -97,7 +111,7 @@ class SmootherBackend:
         if not used.any():
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
         solved = self._points(replace(predicted, T=T), slots[used])
-        step = log(inverse(predicted.T) @ T)
+        step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
         self._predicted = None
         failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
@@ -109,9 +123,7 @@ class SmootherBackend:
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._require_started("add")
-        for i in observations.ids.tolist():
-            if i in self.records.landmarks:
-                raise MeasurementError(f"smoother: landmark {i} is in the map already")
+        self._require_new(observations.ids)
         if not len(observations):
             return
         z = self._stereo.measure(observations)
@@ -153,6 +165,37 @@ class SmootherBackend:
         self._commit()
         return Trajectory(self.records.path.stamps.copy(), self._graph.settled_poses())
 
+    # --- a map that is known (documented in slam.interfaces.MapBackend) ---
+
+    @one_blas_thread
+    def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.insert`."""
+        require_known("smoother", ids, positions, covariances)
+        self._require_new(ids)
+        self._graph.add_known(ids, positions, covariances)
+
+    @one_blas_thread
+    def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
+        """See `slam.interfaces.MapBackend.place`."""
+        self._require_started("place")
+        require_known("smoother", ids, local, covariances)
+        self._require_new(ids)
+        self._commit()
+        self._graph.add_known(ids, local, covariances, self.records.path.count - 1)
+
+    # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
+
+    @one_blas_thread
+    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
+        """See `slam.interfaces.ObjectBackend.update_objects`."""
+        self._require_started("update_objects")
+        self._commit()
+        return self._objects.update(observations, self.records.path, self._graph.window)
+
+    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.ObjectBackend.remove_objects`."""
+        self._objects.remove(ids)
+
     # --- parts ---
 
     def _commit(self) -> None:
@@ -183,7 +226,8 @@ class SmootherBackend:
         """First value of the newest pose, and which measurements agree with it."""
         _, J = self._stereo.project(points.local)
         noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
-        information = np.linalg.inv(predicted.covariance_to_last)
+        known = self.records.landmarks.prior[slots].any()  # what is known in the world does not move with the poses
+        information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to_last)
         problem = pose_only.PoseProblem(
             self._stereo, self.records.landmarks.position[slots], z, noise, predicted.T, information,
             self.models.gate_probability,
@@ -191,5 +235,10 @@ class SmootherBackend:
         return pose_only.solve(problem, predicted.T if guess is None else guess)
 
     def _require_started(self, what: str) -> None:
-        if not self.records.path.count:
+        if not self.records.path.count and self._predicted is None:
             raise MeasurementError(f"smoother: {what} before the first predict")
+
+    def _require_new(self, ids: IdArray) -> None:
+        for i in ids.tolist():
+            if i in self.records.landmarks:
+                raise MeasurementError(f"smoother: landmark {i} is in the map already")

@@ -10,14 +10,23 @@ import gtsam_unstable
 import numpy as np
 
 from backends.smoother import motion
+from backends.smoother.records import Known
 from backends.smoother.stereo import RectifiedStereo
+from backends.smoother.variables import pose_key
 from slam.models import EstimatorModels
-from slam.se3 import Array, nearest_rotation
+from slam.se3 import Array, hat, nearest_rotation
 
 
 def to_pose3(T: Array) -> gtsam.Pose3:
     """A gtsam pose of a matrix (4, 4) that is nearly rigid; gtsam itself would keep the error."""
     return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
+
+
+def inverse_depth(local: Array) -> tuple[Array, Array]:
+    """[x/z, y/z, 1/z] of a point (3,) before a camera, and its derivatives (3, 3)."""
+    x, y, z = local
+    w = 1 / z
+    return np.array([x * w, y * w, w]), w * np.array([[1, 0, -x * w], [0, 1, -y * w], [0, 0, -w]])
 
 
 class FactorMaker:
@@ -74,6 +83,11 @@ class FactorMaker:
         noise = gtsam.noiseModel.Diagonal.Sigmas(scale * motion.motion_sigmas(self.models, dt12))
         return gtsam.CustomFactor(noise, list(keys), error)
 
+    def step(self, keys: tuple[int, int], relative: Array, dt: float) -> gtsam.NonlinearFactor:
+        """Between two successive poses that are known to stand `relative` (4, 4) to each other as well as motion is."""
+        noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.motion_sigmas(self.models, dt))
+        return gtsam.BetweenFactorPose3(*keys, to_pose3(relative), noise)
+
     def point(self, z: list[float]) -> gtsam.StereoPoint2:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
@@ -84,9 +98,34 @@ class FactorMaker:
         factor.add(points, keys, self._K)
         return factor
 
+    def known(self, key: int, known: Known) -> gtsam.NonlinearFactor:
+        """What was known of a landmark variable beforehand, in the world or before a camera.
+
+        Before a camera it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so than in metres.
+        """
+        if known.frame is None:
+            noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
+            return gtsam.PriorFactorPoint3(key, known.position, noise)
+        place, D = inverse_depth(known.position)
+        noise = gtsam.noiseModel.Gaussian.Covariance(D @ known.covariance @ D.T)
+
+        def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
+            pose, landmark = factor.keys()
+            T = values.atPose3(pose).matrix()
+            R = T[:3, :3]
+            local = R.T @ (values.atPoint3(landmark) - T[:3, 3])
+            now, D = inverse_depth(local)
+            if jacobians is not None:
+                jacobians[0] = D @ np.concatenate([hat(local), -np.eye(3)], axis=1)
+                jacobians[1] = D @ R.T
+            return now - place
+
+        return gtsam.CustomFactor(noise, [pose_key(known.frame), key], error)
+
     def explicit(self, point: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:
         """One measurement of a landmark that is a variable."""
-        if np.isfinite(point.uR()):
+        uR = point.uR()
+        if uR == uR:  # not NaN; NumPy's own test costs as much as the factor
             return gtsam.GenericStereoFactor3D(point, self._noise, pose, landmark, self._K, *self._sensor)
         K, noise = self._mono
         uv = np.array([point.uL(), point.v()])

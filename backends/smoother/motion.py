@@ -11,10 +11,13 @@ Poses are ``T_world_left``; perturbations are on the right, [rotation, translati
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from slam.models import EstimatorModels
-from slam.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
+from slam.se3 import Array, pose
+
+_inverse_right = gtsam.Rot3.LogmapDerivative  # inverse of SO(3)'s right Jacobian
 
 
 def motion_sigmas(models: EstimatorModels, dt: float) -> Array:
@@ -37,14 +40,14 @@ def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Arra
     """
     s = dt12 / dt01
     R0, R1 = T0[:3, :3], T1[:3, :3]
-    a = so3_log(R0.T @ R1)
-    step = so3_exp(s * a)
+    a = _log(R0.T @ R1)
+    step = gtsam.Rot3.Expmap(s * a).matrix()
     R2 = R1 @ step
     T2 = pose(R2, T1[:3, 3] + s * (T1[:3, 3] - T0[:3, 3]))
-    right = so3_left_jacobian(-s * a)  # the right Jacobian at s a
+    right = gtsam.Rot3.ExpmapDerivative(s * a)
     J0, J1, Jw = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
-    J0[:3, :3] = -s * right @ np.linalg.inv(so3_left_jacobian(a))
-    J1[:3, :3] = step.T + s * right @ np.linalg.inv(so3_left_jacobian(-a))
+    J0[:3, :3] = -s * right @ _inverse_right(-a)
+    J1[:3, :3] = step.T + s * right @ _inverse_right(a)
     J0[3:, 3:] = -s * R2.T @ R0
     J1[3:, 3:] = (1 + s) * R2.T @ R1
     Jw[:3, :3] = dt12 * right
@@ -68,14 +71,18 @@ def velocity_change(
     R: tuple[Array, Array, Array], t: tuple[Array, Array, Array], dt01: float, dt12: float
 ) -> tuple[Array, tuple[Array, Array, Array]]:
     """Residual (6,) = [ω12 − ω01, v12 − v01] of three successive poses, and its Jacobians (6, 6) by each."""
-    a, b = so3_log(R[0].T @ R[1]), so3_log(R[1].T @ R[2])
+    a, b = _log(R[0].T @ R[1]), _log(R[1].T @ R[2])
     residual = np.concatenate([b / dt12 - a / dt01, (t[2] - t[1]) / dt12 - (t[1] - t[0]) / dt01])
-    Ja = np.linalg.inv(so3_left_jacobian(np.stack([a, -a, b, -b])))
     J = np.zeros((3, 6, 6))
-    J[0, :3, :3] = Ja[0] / dt01
-    J[1, :3, :3] = -Ja[1] / dt01 - Ja[2] / dt12
-    J[2, :3, :3] = Ja[3] / dt12
+    J[0, :3, :3] = _inverse_right(-a) / dt01
+    J[1, :3, :3] = -_inverse_right(a) / dt01 - _inverse_right(-b) / dt12
+    J[2, :3, :3] = _inverse_right(b) / dt12
     J[0, 3:, 3:] = R[0] / dt01
     J[1, 3:, 3:] = -R[1] * (1 / dt01 + 1 / dt12)
     J[2, 3:, 3:] = R[2] / dt12
     return residual, (J[0], J[1], J[2])
+
+
+def _log(R: Array) -> Array:
+    """Rotation vector (3,) of a rotation matrix (3, 3)."""
+    return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(R)))

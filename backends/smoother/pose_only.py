@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from slam.data import BoolArray
 from slam.gating import chi_square_gate
-from slam.se3 import Array, exp, inverse, log
+from slam.se3 import Array, inverse
 
 _STEPS = 12
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # of solving and gating
 _CONVERGED = 1e-5  # [rad, m]; the steps shrink quadratically, so what is left is far smaller
+_ROUGH = 1e-3  # the same while it is not known yet what agrees
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,8 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
     """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
     T = start
     information = problem.information
-    prior = log(inverse(problem.predicted) @ T)
+    prior = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ T))
+    enough = _ROUGH if used is None else _CONVERGED
     for _ in range(_STEPS):
         r, J = residuals(problem, T)
         missing = np.isnan(r)
@@ -92,9 +95,9 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
         weight = _huber(r) if used is None else used.astype(float)
         J_w = (J * weight[:, None, None]).reshape(-1, 6).T
         step = np.linalg.solve(information + J_w @ J.reshape(-1, 6), J_w @ r.reshape(-1) - information @ prior)
-        T = T @ exp(step)
+        T = T @ gtsam.Pose3.Expmap(step).matrix()
         prior = prior + step  # exact to first order: enough for a prior that only keeps few measurements in bounds
-        if np.abs(step).max() < _CONVERGED:
+        if np.abs(step).max() < enough:
             break
     return T
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.records import Path
+from backends.smoother.records import IndexArray, Path
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from backends.smoother.uncertainty import PoseSet, quadratic
 from slam.data import BoolArray
@@ -41,6 +41,8 @@ class PredictedPose:
     @property
     def covariance_to_last(self) -> Array:
         """Covariance (6, 6) where the last pose is known: what all poses have in common moves the landmarks too."""
+        if not len(self.window):
+            return self.noise
         J = self.by_window.copy()
         J[:, -6:] -= adjoint(inverse(self.T) @ self.window.poses[-1])
         return J @ self.window.covariance @ J.T + self.noise
@@ -58,6 +60,35 @@ def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: fl
         T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(poses[-2], poses[-1], stamps[-1] - stamps[-2], dt)
         sigmas = motion.motion_sigmas(models, dt)
     return PredictedPose(stamp, T, J, (Jw * sigmas**2) @ Jw.T, window)
+
+
+def first_pose(models: EstimatorModels, stamp: float) -> PredictedPose:
+    """The first pose by its prior."""
+    sigmas = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
+    none = PoseSet(np.zeros(0, np.intp), np.zeros((0, 4, 4)), np.zeros((0, 0)))
+    return PredictedPose(stamp, models.initial_pose, np.zeros((6, 0)), np.diag(sigmas**2), none)
+
+
+def carried_covariance(models: EstimatorModels, path: Path, known: PoseSet | None, frames: IndexArray) -> Array:
+    """Joint covariance of successive poses up to the newest, carried on from an earlier set by the motion alone.
+
+    Args:
+        models: priors and motion.
+        path: stamps and poses of all frames.
+        known: the earlier set; None for the first pose.
+        frames: the poses asked for (W,).
+    """
+    if known is None:
+        prior = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
+        known = PoseSet(np.zeros(1, np.intp), path.poses[:1], np.diag(prior**2))
+    for i in range(int(known.frames[-1]) + 1, path.count):
+        one = predict_pose(models, path.upto(i), known, float(path.stamps[i]))
+        carry = np.concatenate([np.eye(6 * len(known)), one.by_window])
+        P = carry @ known.covariance @ carry.T
+        P[-6:, -6:] += one.noise
+        known = PoseSet(np.append(known.frames, i), path.poses[: i + 1][-len(known) - 1 :], P)
+    rows = np.concatenate([np.arange(6) + 6 * k for k in np.searchsorted(known.frames, frames)])
+    return known.covariance[np.ix_(rows, rows)]
 
 
 @dataclass(frozen=True)

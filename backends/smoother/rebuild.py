@@ -9,7 +9,7 @@ from backends.smoother.graph import FactorMaker, to_pose3
 from backends.smoother.records import IndexArray, Path, Records, Track
 from backends.smoother.solver import FAILURES, Change, SolverError
 from backends.smoother.variables import pose_key
-from slam.se3 import Array
+from slam.se3 import Array, inverse
 
 _ITERATIONS = 30
 
@@ -17,12 +17,15 @@ _ITERATIONS = 30
 def whole_problem(make: FactorMaker, records: Records) -> tuple[Change, list[tuple[Track, int]]]:
     """All factors and first values, and the tracks with the places of their smart factors."""
     change = Change()
-    add_poses(change, make, records)
+    add_poses(change, make, records, records.history.restarted)
     for rows in records.history.finished:
         points = [make.point(z) for z in records.measurements.z[rows].tolist()]
         change.factors.add(make.smart(points, pose_keys(records, rows)))
     for key, all_rows in records.history.explicit.items():
         add_landmark(change, make, records, key, np.array(all_rows), records.history.places[key])
+        known = records.history.known.get(int(records.measurements.landmark[all_rows[0]]))
+        if known is not None:
+            change.factors.add(make.known(key, known))
     places = []
     for track in records.landmarks.tracks.values():
         if track.informative:
@@ -31,12 +34,17 @@ def whole_problem(make: FactorMaker, records: Records) -> tuple[Change, list[tup
     return change, places
 
 
-def add_poses(change: Change, make: FactorMaker, records: Records) -> None:
-    """All poses, with what ties them to each other and to the world."""
+def add_poses(change: Change, make: FactorMaker, records: Records, restarted: int = 0) -> None:
+    """All poses, with what ties them to each other and to the world; the first `restarted` as they stand."""
     path = records.path
     for i in range(path.count):
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
-        change.factors.add(pose_factor(make, path, i, records.history.impulses[i]))
+        if 0 < i < restarted:
+            relative = inverse(path.poses[i - 1]) @ path.poses[i]
+            factor = make.step((pose_key(i - 1), pose_key(i)), relative, path.stamps[i] - path.stamps[i - 1])
+        else:
+            factor = pose_factor(make, path, i, records.history.impulses[i])
+        change.factors.add(factor)
 
 
 def pose_factor(make: FactorMaker, path: Path, i: int, impulse: float) -> gtsam.NonlinearFactor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +50,12 @@ class Path:
     def poses(self) -> Array:
         """Poses (F, 4, 4); a view that may be written to."""
         return self._poses[: self.count]
+
+    def upto(self, count: int) -> Path:
+        """The first `count` frames; they share their memory with this."""
+        out = copy(self)
+        out.count = count
+        return out
 
     def append(self, stamp: float, T_world_left: Array) -> None:
         """Add a frame."""
@@ -137,6 +144,21 @@ class Track:
         self.rows, self.points, self.keys, self.stereo, self.factor = [], [], [], 0, -1
 
 
+@dataclass(frozen=True)
+class Known:
+    """What was known of a landmark before it was measured.
+
+    Attributes:
+        position: in world coordinates, or in the camera's where `frame` is one (3,) [m].
+        covariance: its covariance (3, 3) [m²].
+        frame: frame of the camera in whose coordinates that is; None for the world's.
+    """
+
+    position: Array
+    covariance: Array
+    frame: int | None = None
+
+
 class History:
     """What the solver was told besides what the tracks hold; with them, all that it takes to tell another one.
 
@@ -144,14 +166,20 @@ class History:
         finished: rows of `Measurements` of each finished smart factor.
         explicit: rows of each landmark that is a variable, by the variable.
         places: where each of those was believed to be at first.
+        variables: number of landmark variables that were ever made, for their names.
+        known: what was known of landmarks beforehand, by serial number.
         impulses: factor on the impulse's standard deviation, by frame.
+        restarted: the poses of so many frames from the first on hang on each other as they are, without measurements.
     """
 
     def __init__(self) -> None:
         self.finished: list[NDArray[np.int64]] = []
         self.explicit: dict[int, list[int]] = {}
         self.places: dict[int, Array] = {}
+        self.known: dict[int, Known] = {}
         self.impulses: list[float] = []
+        self.restarted = 0
+        self.variables = 0
 
 
 class Landmarks:
@@ -164,6 +192,7 @@ class Landmarks:
         covariance: of the position where all poses are known (S, 3, 3) [m²].
         information: of each of its last measurements on the position (S, RECENT, 3, 3) [1/m²], see `uncertainty`.
         older: of all earlier ones together (S, 3, 3).
+        mean, prior: position (S, 3) and information (S, 3, 3) in world coordinates known beforehand; zero for none.
         recent: rows of its last measurements (S, RECENT), −1 where there are fewer; a ring.
         seen: number of measurements (S,).
         last: frame of the last one (S,).
@@ -178,6 +207,8 @@ class Landmarks:
         self.covariance = np.zeros((256, 3, 3))
         self.information = np.zeros((256, RECENT, 3, 3))
         self.older = np.zeros((256, 3, 3))
+        self.mean = np.zeros((256, 3))
+        self.prior = np.zeros((256, 3, 3))
         self.recent = np.full((256, RECENT), -1, np.int64)
         self.seen = np.zeros(256, np.int64)
         self.last = np.zeros(256, np.int64)
@@ -217,7 +248,7 @@ class Landmarks:
         self.serial[slots] = np.arange(self._added, self._added + len(slots))
         self._added += len(slots)
         self.recent[slots], self.seen[slots], self.variable[slots] = -1, 0, -1
-        self.information[slots], self.older[slots] = 0, 0
+        self.information[slots], self.older[slots], self.prior[slots] = 0, 0, 0
         for i, slot, limit in zip(ids.tolist(), slots.tolist(), limits):
             self._slot[i] = slot
             self.tracks[slot] = Track(limit)
@@ -243,7 +274,8 @@ class Landmarks:
         """Room for at least `needed` more landmarks."""
         old = len(self.ids)
         for name in (
-            "ids", "serial", "position", "covariance", "information", "older", "recent", "seen", "last", "variable"
+            "ids", "serial", "position", "covariance", "information", "older", "mean", "prior",
+            "recent", "seen", "last", "variable",
         ):  # fmt: skip
             setattr(self, name, grown(getattr(self, name), old + needed))
         self.ids[old:] = self.variable[old:] = -1
@@ -265,3 +297,40 @@ class Records:
         self.measurements = Measurements()
         self.landmarks = Landmarks()
         self.history = History()
+
+    def finish(self, track: Track) -> None:
+        """End a track; what it holds stays in its factor."""
+        if track.informative:
+            self.history.finished.append(np.array(track.rows))
+        track.restart()
+
+    def take_back(self, slots: IndexArray, rows: IndexArray) -> None:
+        """Take the newest measurements `rows` of landmarks `slots` out again."""
+        self.measurements.landmark[rows] = -1
+        for slot, row in zip(slots.tolist(), rows.tolist()):
+            track, variable = self.landmarks.tracks[slot], int(self.landmarks.variable[slot])
+            if variable >= 0:
+                self._take_back_explicit(slot, variable, row)
+            elif track.rows and track.rows[-1] == row:
+                track.drop_last(bool(np.isfinite(self.measurements.z[row, 2])))
+
+    def _take_back_explicit(self, slot: int, variable: int, row: int) -> None:
+        """Take back a measurement of a landmark's own variable; without depth from the others the variable goes too.
+
+        One that was known beforehand has its depth from there.
+        """
+        rows = self.history.explicit[variable]
+        rows.remove(row)
+        known = rows and int(self.landmarks.serial[slot]) in self.history.known
+        if not known and not np.isfinite(self.measurements.z[rows, 2]).any():
+            del self.history.explicit[variable], self.history.places[variable]
+            self.landmarks.variable[slot] = -1
+
+    def forget_measurements(self) -> None:
+        """Let all poses hang on each other as they are; landmarks stay where they are and are measured anew."""
+        history = self.history
+        history.finished, history.explicit, history.places = [], {}, {}
+        history.restarted = self.path.count
+        for track in self.landmarks.tracks.values():
+            track.restart()
+        self.landmarks.variable[:] = -1

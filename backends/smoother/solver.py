@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from slam.se3 import Array
 _T = TypeVar("_T")
 
 #: What gtsam throws when it cannot solve.
-FAILURES = (RuntimeError, ValueError, IndexError)
+FAILURES = (RuntimeError, ValueError, LookupError)
 
 #: ISAM2 starts from scratch whenever over 65 % of all variables are touched, as they are in a small map. So many
 #: variables that nothing depends on keep it incremental from the start.
@@ -44,12 +45,16 @@ class Change:
         late: variables to eliminate late, those of the first set before those of the second: what will be touched
             again soon. Without it a landmark that was seen from many poses may be eliminated before them, and with it
             in between everything is touched by everything.
+        leaving: variables to marginalise after the update; all their factors stay as they are from then on.
+        staying: all other variables that were there before; only needed where some leave.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)
     late: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
+    leaving: list[int] = field(default_factory=list)
+    staying: list[int] = field(default_factory=list)
 
 
 class Solver:
@@ -57,9 +62,13 @@ class Solver:
 
     Args:
         thresholds: how far each kind of variable may move before it is linearised anew.
+
+    Attributes:
+        seconds: CPU time spent in gtsam so far.
     """
 
     def __init__(self, thresholds: gtsam.ISAM2ThresholdMap) -> None:
+        self.seconds = 0.0
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(thresholds)
         parameters.relinearizeSkip = 1
@@ -76,9 +85,14 @@ class Solver:
         """
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = change.removed
-        if any(change.late):
-            parameters.constrainedKeys = _groups(change.late)
+        if change.leaving:
+            parameters.constrainedKeys = _groups(set(change.staying) - set().union(*change.late), *change.late)
+            parameters.extraReelimKeys = _key_list([*change.leaving, *change.staying])
+        elif any(change.late):
+            parameters.constrainedKeys = _groups(*change.late)
         result = self._guarded(lambda: self._isam.update(change.factors, change.values, parameters))
+        if change.leaving:  # eliminated first of all, so they are leaves of the tree
+            self._guarded(lambda: self._isam.marginalizeLeaves(_key_list(change.leaving)))
         return result.getNewFactorsIndices()
 
     def poses(self, keys: Iterable[int]) -> Array:
@@ -98,33 +112,48 @@ class Solver:
         Raises:
             SolverError: gtsam failed.
         """
-        root = self._guarded(lambda: _root_of(self._isam, keys[-1]))
+        P = self._guarded(lambda: self._joint_covariance(keys))
+        if not np.isfinite(P).all() or (np.diag(P) <= 0).any():
+            raise SolverError("gtsam: a covariance is not finite and positive")
+        return P
+
+    def _joint_covariance(self, keys: list[int]) -> Array:
+        root = _root_of(self._isam, keys[-1])
         if root is not None and set(keys) <= set(root[0]):
             return _covariance_in(*root, keys)
         if len(keys) == 1:
-            return self._guarded(lambda: self._isam.marginalCovariance(keys[0]))
-        return self._guarded(lambda: self._isam.jointMarginalCovariance(keys).fullMatrix())
+            return np.asarray(self._isam.marginalCovariance(keys[0]))
+        return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
 
     def values(self) -> gtsam.Values:
         """All variables, solved to the last."""
         return self._guarded(self._isam.calculateBestEstimate)
 
-    @staticmethod
-    def _guarded(call: Callable[[], _T]) -> _T:
+    def _guarded(self, call: Callable[[], _T]) -> _T:
+        start = time.process_time()
         try:
             return call()
         except FAILURES as error:
             lines = [line.strip() for line in str(error).splitlines() if line.strip()]
             raise SolverError("gtsam: " + (" ".join(lines[:3]) or type(error).__name__)) from error
+        finally:
+            self.seconds += time.process_time() - start
 
 
-def _groups(late: tuple[set[int], set[int]]) -> gtsam.KeyGroupMap:
-    """The form in which gtsam takes `Change.late`."""
+def _groups(*late: set[int]) -> gtsam.KeyGroupMap:
+    """Sets of variables in the order of their elimination, as gtsam takes them; what is in none comes first."""
     groups = gtsam.KeyGroupMap()
-    for number, keys in enumerate(late, start=1 if late[0] else 0):
+    for number, keys in enumerate(filter(None, late), start=1):
         for key in keys:
             groups.insert2(key, number)
     return groups
+
+
+def _key_list(keys: list[int]) -> gtsam.KeyList:
+    out = gtsam.KeyList()
+    for key in keys:
+        out.push_back(key)
+    return out
 
 
 def _root_of(isam: gtsam.ISAM2, key: int) -> tuple[list[int], Array] | None:

@@ -41,19 +41,20 @@ def linearise(
     return E.reshape(*shape, 3, 3) / sigma, r.reshape(*shape, 3) / sigma
 
 
-def position_step(E: Array, r: Array, older: Array) -> tuple[Array, Array]:
+def position_step(E: Array, r: Array, older: Array, prior: Array, offset: Array) -> tuple[Array, Array]:
     """Gauss-Newton steps (M, 3) of the positions, and their covariances (M, 3, 3) where all poses are known.
 
-    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones.
+    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones, `prior` (M, 3, 3) what
+    was known beforehand of positions that stand `offset` (M, 3) from where they are now.
     """
     count, width = r.shape[:2]
     E = E.reshape(count, 3 * width, 3)
     Et = np.swapaxes(E, 1, 2)
-    information = Et @ E + older
+    information = Et @ E + older + prior
     # Far points leave their depth nearly free: the little that is added keeps the inverse finite.
     information += np.eye(3) * (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-12)
     covariance = np.linalg.inv(information)
-    step = covariance @ (Et @ r.reshape(count, 3 * width, 1))
+    step = covariance @ (Et @ r.reshape(count, 3 * width, 1) + prior @ offset[:, :, None])
     return step[:, :, 0], covariance
 
 
@@ -79,17 +80,42 @@ def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, s
     """Jacobians (M, 3, 6 W) of landmark positions by poses of the set.
 
     A measurement from another pose counts for the pose of the set that comes next, as if the two were fixed to each
-    other; what is no longer among the recent measurements counts for the pose next to the oldest one that is.
+    other; what is no longer among the recent measurements counts for the pose next to the oldest one that is. What was
+    known beforehand hangs on no pose.
     """
     rows, count, width = landmarks.recent[slots], len(slots), len(known)
-    frames = measurements.frame[rows]
+    if not width:
+        return np.zeros((count, 3, 0))
+    frames = measurements.frame[rows] if measurements.count else np.zeros_like(rows)
     place = np.minimum(np.searchsorted(known.frames, frames), width - 1)
     share = (place[:, None, :] == np.arange(width)[None, :, None]).astype(float)
     information = (share @ landmarks.information[slots].reshape(*rows.shape, 9)).reshape(count, width, 3, 3)
-    oldest = np.where(rows >= 0, place, width).min(axis=1)
+    oldest = np.where(rows >= 0, place, width - 1).min(axis=1)
     information[np.arange(count), oldest] += landmarks.older[slots]
     carried = landmarks.covariance[slots][:, None] @ information @ _carry(known.poses, landmarks.position[slots])
     return np.swapaxes(carried, 1, 2).reshape(count, 3, 6 * width)
+
+
+class WindowJacobians:
+    """`by_poses` for one set of poses, each landmark's kept once it has been worked out.
+
+    Args:
+        window: the poses.
+        slots: number of slots in the map.
+    """
+
+    def __init__(self, window: PoseSet, slots: int) -> None:
+        self.window = window
+        self._known = np.zeros(slots, bool)
+        self._jacobians = np.empty((slots, 3, 6 * len(window)))
+
+    def of(self, measurements: Measurements, landmarks: Landmarks, slots: IndexArray) -> Array:
+        """Jacobians (M, 3, 6 W) of landmark positions."""
+        missing = slots[~self._known[slots]]
+        if len(missing):
+            self._jacobians[missing] = by_poses(self.window, measurements, landmarks, missing)
+            self._known[missing] = True
+        return self._jacobians[slots]
 
 
 def _carry(poses: Array, points: Array) -> Array:

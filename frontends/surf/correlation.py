@@ -12,7 +12,7 @@ _ITERATIONS = 12
 _CONVERGED = 0.01  # px
 
 
-def patch_windows(spread: float = 0.4) -> NDArray[np.float32]:
+def patch_windows(spread: float) -> NDArray[np.float32]:
     """Gaussian weights (2, 23, 24) of the pixels of the two patch sizes; rows padded with zeros to vector registers.
 
     `spread` is the Gaussian's sigma in units of the patch's half width.

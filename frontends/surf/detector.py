@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.filters import Filters
+from frontends.surf.integral import column_phases
 from frontends.surf.kernels import helper, kernel, vector_helper
 
 #: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
@@ -179,7 +180,6 @@ def _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube
 
 def detect_octave(
     integral: NDArray[np.int32],
-    phases: NDArray[np.int32],
     filters: Filters,
     octave: int,
     threshold: float,
@@ -190,7 +190,6 @@ def detect_octave(
 
     Args:
         integral: see `integral_image`.
-        phases: it by column phase, see `column_phases`.
         filters: of the octave, see `make_filters`.
         octave: 0-based.
         threshold: D_threshold; only responses above it count.
@@ -201,6 +200,8 @@ def detect_octave(
         Candidates (N, COLUMNS) in raster order of the grid.
     """
     columns, inner = (integral.shape[1] - 1) // filters.step, len(filters.sizes) - 2
+    top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
+    phases = column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
     buffer = np.empty(3 * filters.step * phases.shape[2], np.int32)
     ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
     words = np.zeros((columns + 7) // 8, np.uint64)

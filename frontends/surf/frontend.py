@@ -23,6 +23,7 @@ _SURPLUS = 1.35  # features detected for each one needed, to have a choice when 
 _CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima
 _TRIES = 4  # detections at most in one image
 _REACH = 3.0  # largest sub-pixel correction along the row [px]
+_FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
 _COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor
 _OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighbouring rows
 
@@ -49,7 +50,7 @@ class SurfFrontend:
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
         self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
-        self._windows = patch_windows()
+        self._wide, self._narrow = patch_windows(0.4), patch_windows(0.3)
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
 
     @property
@@ -138,7 +139,11 @@ class SurfFrontend:
             """Right pixels of some of the features."""
             uv, size = keypoints.uv[first:last], keypoints.size[first:last]
             start = search_rows(a, b, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
-            return refine(left, right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._windows)
+            wide = refine(left, right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._wide)
+            # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
+            reach = (_FINE_REACH, _FINE_REACH)
+            narrow = refine(left, right, uv, size, wide, c.min_correlation, reach, self._narrow)
+            return np.where(np.isfinite(narrow), narrow, wide)
 
         found = np.concatenate(self._surf.workers.over(len(keypoints), locate))
         disparity = keypoints.uv[:, 0] - found[:, 0]

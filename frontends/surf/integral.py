@@ -39,15 +39,17 @@ def _integral_image(image):
     return out
 
 
-def column_phases(integral: NDArray[np.int32], step: int) -> NDArray[np.int32]:
+def column_phases(integral: NDArray[np.int32], step: int, first: int, last: int) -> NDArray[np.int32]:
     """The columns of an integral image sorted by their remainder: ``out[p, y, j] = integral[y, step * j + p]``.
 
-    A filter that moves in steps of `step` then reads neighbouring memory. Shape (step, H+1, ceil((W+1) / step));
-    columns beyond the image are zero and never used.
+    A filter that moves in steps of `step` then reads neighbouring memory. Shape (step, H+1, ceil((W+1) / step)); only
+    the rows from `first` to before `last` are filled in, and columns beyond the image are not.
     """
     rows, columns = integral.shape
-    out = np.zeros((step, rows, -(-columns // step)), np.int32)
+    if step == 1:
+        return integral[None]
+    out = np.empty((step, rows, -(-columns // step)), np.int32)
     for p in range(step):
-        phase = integral[:, p::step]
-        out[p, :, : phase.shape[1]] = phase
+        phase = integral[first:last, p::step]
+        out[p, first:last, : phase.shape[1]] = phase
     return out

@@ -25,7 +25,7 @@ vector_helper = njit(fastmath=True, **_INNER)
 def kernel(function: Callable[..., Any]) -> Any:
     """A compiled function that Python may call; cached where there is a folder for it."""
     try:
-        return njit(cache=True, nogil=True, **_NUMPY)(function)
+        return njit(cache=True, nogil=True, no_cfunc_wrapper=True, **_NUMPY)(function)
     except RuntimeError as error:
         _LOG.warning("set NUMBA_CACHE_DIR to a folder, or the kernels are compiled in every run: %s", error)
-        return njit(nogil=True, **_NUMPY)(function)
+        return njit(nogil=True, no_cfunc_wrapper=True, **_NUMPY)(function)

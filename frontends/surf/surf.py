@@ -16,10 +16,10 @@ from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussia
 from frontends.surf.detector import COLUMNS, detect_octave
 from frontends.surf.filters import Filters, layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
-from frontends.surf.integral import column_phases, integral_image
+from frontends.surf.integral import integral_image
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
-from frontends.surf.workers import Once, Workers
+from frontends.surf.workers import SHARES, Workers
 from slam.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 #: Angle of upright features [rad]: OpenCV's convention, 270 degrees.
 UPRIGHT_ANGLE = 1.5 * np.pi
 
+_SMALLEST_STRIPE = 48  # grid rows that are worth a task of their own
 _REACH = 0.15  # furthest that localisation moves a feature, in units of its size
 
 
@@ -223,17 +224,12 @@ class Surf:
     def _scans(
         self, integral: NDArray[np.int32], filters: Filters, octave: int, limit: float
     ) -> list[Callable[[], NDArray[np.float64]]]:
-        """Searches of an octave, a stripe of rows for each thread."""
+        """Searches of an octave, in stripes of rows: one, or some for each thread."""
         rows = (integral.shape[0] - 1) >> octave
-        count = max(1, min(self.workers.threads, rows // 32))
-        phases = Once(partial(column_phases, integral, 1 << octave) if octave else lambda: integral[None])
-
-        def scan(first: int, last: int) -> NDArray[np.float64]:
-            """Candidates in a range of rows."""
-            return detect_octave(integral, phases(), filters, octave, limit, first, last)
-
+        threads = self.workers.threads
+        count = 1 if threads == 1 else max(1, min(SHARES * threads, rows // _SMALLEST_STRIPE))
         edges = [rows * k // count for k in range(count + 1)]
-        return [partial(scan, a, b) for a, b in pairwise(edges)]
+        return [partial(detect_octave, integral, filters, octave, limit, a, b) for a, b in pairwise(edges)]
 
 
 def _as_keypoints(rows: NDArray[np.float64]) -> Keypoints:

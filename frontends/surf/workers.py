@@ -6,30 +6,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import pairwise
-from threading import Lock
 from typing import Any
 
-_SMALLEST_SHARE = 32  # items that are worth a thread
-
-
-class Once:
-    """A value that several tasks need: the first that asks for it computes it, the others wait.
-
-    Args:
-        function: computes the value.
-    """
-
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._function = function
-        self._lock = Lock()
-        self._values: list[Any] = []
-
-    def __call__(self) -> Any:
-        """The value."""
-        with self._lock:
-            if not self._values:
-                self._values.append(self._function())
-            return self._values[0]
+#: Tasks for each thread: whoever is done early takes over some of the others' work.
+SHARES = 2
+_SMALLEST_SHARE = 32  # items that are worth a task
 
 
 class Workers:
@@ -57,6 +38,6 @@ class Workers:
 
     def over(self, count: int, function: Callable[[int, int], Any]) -> list[Any]:
         """Results of ``function(first, last)`` on consecutive shares of `count` items."""
-        shares = max(1, min(self.threads, count // _SMALLEST_SHARE))
+        shares = 1 if self.threads == 1 else max(1, min(SHARES * self.threads, count // _SMALLEST_SHARE))
         edges = [count * k // shares for k in range(shares + 1)]
         return self.run([partial(function, a, b) for a, b in pairwise(edges)])

@@ -105,3 +105,18 @@ class MovingObject:
     motion_since_found: Array
     extent: Array
     moving: bool
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a frame's features are.
+
+    Attributes:
+        moving: rows of features that move, or lie on a body that does (V,).
+        undecided: rows of features not seen for long enough to be judged, or in doubt (U,).
+        landmarks: ids of landmarks that turned out to move (L,).
+    """
+
+    moving: NDArray[np.intp]
+    undecided: NDArray[np.intp]
+    landmarks: IdArray

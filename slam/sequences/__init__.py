@@ -49,6 +49,10 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
         ConfigurationError: an option is unknown or its value impossible.
     """
     text = str(path)
+    if not text:
+        raise SequenceError("no sequence is named: the path is empty")
+    if text.startswith(_SYNTHETIC) and format not in (None, "synthetic"):
+        raise ConfigurationError(f"{text}: format {format!r} does not go with a synthetic world")
     if format == "synthetic" or text.startswith(_SYNTHETIC):
         return _open_world(text)
     folder, options = _split(text)

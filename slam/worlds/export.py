@@ -44,9 +44,7 @@ def write_euroc(
         SequenceError: the sequence is no world, the range is empty, or the folder holds a recording already or
             cannot be written.
     """
-    if not isinstance(sequence, WorldSequence):
-        name = getattr(sequence, "name", sequence)
-        raise SequenceError(f"{name}: only synthetic worlds can be rendered, this is a recording")
+    sequence = require_world(sequence)
     first, last = frame_range(start, stop, len(sequence))
     root = Path(folder) / "mav0"
     if root.exists():
@@ -56,6 +54,14 @@ def write_euroc(
     except OSError as error:
         raise SequenceError(f"{root}: cannot be written: {error.strerror or error}") from error
     return root
+
+
+def require_world(sequence: object) -> WorldSequence:
+    """The sequence, if it is a world; else raises SequenceError."""
+    if not isinstance(sequence, WorldSequence):
+        name = getattr(sequence, "name", sequence)
+        raise SequenceError(f"{name}: only synthetic worlds can be rendered, this is a recording")
+    return sequence
 
 
 def _write(

@@ -6,7 +6,7 @@ World axes follow paper B's experiments: x right, y forward (away from the first
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -80,6 +80,18 @@ def rectangle(
     a *= texture.width / np.linalg.norm(a)
     d *= texture.height / np.linalg.norm(d)
     return Rectangle(np.array(list(origin), float), a, d, texture, body, occludes)
+
+
+def in_parts(whole: Rectangle) -> list[Rectangle]:
+    """A rectangle's parts beside each other, if its texture has any (`parts()`, from the left); else itself."""
+    parts: list[Texture] = getattr(whole.texture, "parts", list)()
+    if not parts:
+        return [whole]
+    left = np.cumsum([0.0, *(p.width for p in parts)]) / whole.texture.width
+    return [
+        replace(whole, origin=whole.origin + a * whole.along, along=(b - a) * whole.along, texture=p)
+        for a, b, p in zip(left, left[1:], parts)
+    ]
 
 
 def cuboid(

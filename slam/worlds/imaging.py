@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
 from typing import Any
 
 import cv2
@@ -63,12 +66,30 @@ def sense(
         image = cv2.GaussianBlur(image, (0, 0), model.lens)
     gain *= 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
     light = shading * np.float32(gain)
-    out = image * (light if image.ndim == 2 else light[..., None])
+    out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
     noise = model.noise * (8.0 if faults.burst[frame] else 1.0)
     if noise > 0:
-        out += np.float32(noise) * rng.standard_normal(image.shape, np.float32)
-    np.add(out, np.float32(0.5), out=out)  # to the nearest grey level, as the conversion cuts off
-    return np.clip(out, 0, 255, out=out).astype(np.uint8)
+        cv2.scaleAdd(normal_noise(image.shape, rng), noise, out, dst=out)
+    return cv2.convertScaleAbs(cv2.max(out, 0.0))  # to the nearest grey level
+
+
+def normal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Noise of standard deviation 1 (shape) float32: the sum of two numbers drawn from 256 quantiles of the normal law.
+
+    A tenth of the time of a generator of exact normal numbers; nothing is beyond 4.1.
+    """
+    size = math.prod(shape)
+    drawn = rng.integers(0, 256, 2 * size, np.uint8)
+    parts = cv2.LUT(drawn.reshape(2 * size, 1), _quantiles()).reshape(2, *shape)
+    return cv2.add(parts[0], parts[1])
+
+
+@lru_cache(maxsize=1)
+def _quantiles() -> np.ndarray:
+    """Middles of 256 equally likely parts of the normal law, with variance ½ (256,) float32."""
+    law = NormalDist()
+    values = np.array([law.inv_cdf((i + 0.5) / 256) for i in range(256)])
+    return (values / (values.std() * np.sqrt(2))).astype(np.float32)
 
 
 def _cover(image: np.ndarray) -> np.ndarray:

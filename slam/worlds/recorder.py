@@ -13,7 +13,8 @@ from slam.data import StereoFrame
 from slam.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults
 from slam.worlds.imaging import ImagingModel, sense
-from slam.worlds.raster import Lens, Tiles, draw
+from slam.worlds.lens import Lens
+from slam.worlds.raster import draw
 from slam.worlds.textures.ripmap import Ripmap
 from slam.worlds.world import World
 
@@ -62,13 +63,10 @@ class Recorder:
         T = _between(self._world.T_world_left, frame, ahead)
         bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
         channels = 3 if self._model.colour else 1
-        samples = draw(self._tiles, self._ripmap, bodies, T @ T_left_camera, lens.view, self._world.sky, channels)
+        samples = draw(
+            self._world.drawn_arrays, self._ripmap, bodies, T @ T_left_camera, lens.view, self._world.sky, channels
+        )
         return lens.expose(samples)
-
-    @cached_property
-    def _tiles(self) -> Tiles:
-        """All surfaces in tiles."""
-        return Tiles.cut(self._world.rectangles, self._world.tile)
 
     @cached_property
     def _lenses(self) -> tuple[Lens, Lens]:
@@ -82,8 +80,8 @@ class Recorder:
         return self._model.shading(self._world.rig.width, self._world.rig.height)
 
     def _ripmap(self, rectangle: int) -> Ripmap:
-        """The texture of a rectangle, painted when first seen and kept with the world."""
-        texture = self._world.rectangles[rectangle].texture
+        """The texture of a rectangle drawn, painted when first seen and kept with the world."""
+        texture = self._world.drawn[rectangle].texture
         key = (texture, self._model.colour)
         found: Ripmap | None = self._world.painted.get(key)
         if found is None:

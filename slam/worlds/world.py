@@ -11,7 +11,7 @@ import numpy as np
 from slam.data import IdArray
 from slam.rig import StereoRig
 from slam.se3 import Array
-from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays
+from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,6 @@ class World:
         T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
         reach: nearest and farthest distance at which a landmark can be detected [m].
         texels: texels per metre at which the surfaces are painted.
-        tile: size of the pieces in which surfaces are drawn [m]; within one, the distance should not change much.
         sky: colour (BGR) where no surface is.
         painted: textures painted so far, filled by the recorder.
         seen: landmarks seen in frames so far, filled by the simulator of observations.
@@ -45,7 +44,6 @@ class World:
     T_world_object: Array
     reach: tuple[float, float]
     texels: float
-    tile: float = 1.0
     sky: tuple[int, int, int] = (230, 225, 220)
     painted: dict[Any, Any] = field(default_factory=dict, repr=False)
     seen: dict[int, Any] = field(default_factory=dict, repr=False)
@@ -66,6 +64,16 @@ class World:
     def arrays(self) -> RectangleArrays:
         """All rectangles as arrays."""
         return RectangleArrays.of(self.rectangles)
+
+    @cached_property
+    def drawn(self) -> tuple[Rectangle, ...]:
+        """The rectangles as they are drawn: some in parts, so that only what comes into view is painted."""
+        return tuple(piece for r in self.rectangles for piece in in_parts(r))
+
+    @cached_property
+    def drawn_arrays(self) -> RectangleArrays:
+        """`drawn` as arrays."""
+        return RectangleArrays.of(self.drawn)
 
     @cached_property
     def occluders(self) -> RectangleArrays:

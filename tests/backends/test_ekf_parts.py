@@ -17,9 +17,11 @@ from backends.ekf.angles import (
     reanchor,
 )
 from backends.ekf.covariance import CAMERA, Covariance
-from backends.ekf.measurement import innovation_covariances, linearise, stacked
+from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks
+from backends.ekf.measurement import StereoMeasurement, innovation_covariances, stacked
 from backends.ekf.solve import Problem, _iterate, gate, solve
 from slam import se3
+from slam.errors import MeasurementError
 from slam.euler import angles, body_rate_matrix, rotation
 from slam.testing import GENERAL_RIG
 from tests.backends.scenes import RIG
@@ -103,6 +105,15 @@ def test_the_jacobian_of_a_new_angles_world(phi):
 # --- measurements ---
 
 
+def model(rig, world) -> StereoMeasurement:
+    """With landmarks in world coordinates: they have no charts."""
+    return StereoMeasurement(rig, world, Euclidean(), np.zeros((0, 3, 4)))
+
+
+def linearise(rig, world, pose, points):
+    return model(rig, world).linearise(np.concatenate([pose, points.reshape(-1)]))
+
+
 @pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
 @pytest.mark.parametrize("phi", ATTITUDES)
 def test_measurement_jacobians(rig, phi):
@@ -113,9 +124,7 @@ def test_measurement_jacobians(rig, phi):
     line = linearise(rig, world, np.concatenate([r, phi]), points)
     np.testing.assert_allclose(line.z, rig.project_stereo(h)[0], atol=1e-9)
 
-    def measured(x):
-        return linearise(rig, world, x[:6], x[6:].reshape(-1, 3)).z
-
+    measured = model(rig, world).predict
     x = np.concatenate([r, phi, points.reshape(-1)])
     everything = np.ones((5, 3), bool)
     np.testing.assert_allclose(stacked(line, everything), jacobian(measured, x), rtol=1e-6, atol=1e-5)
@@ -137,9 +146,46 @@ def test_innovation_covariances_are_blocks_of_the_dense_ones():
     S = H @ P @ H.T + 0.25 * np.eye(12)
     cross = P[6:, :6].reshape(4, 3, 6)
     blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
-    found = innovation_covariances(line, P[:6, :6], cross, blocks, 0.5)
+    found = innovation_covariances(line.by_relative, P[:6, :6], cross, blocks, 0.5)
     for i in range(4):
         np.testing.assert_allclose(found[i], S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-9)
+
+
+# --- the landmarks' coordinates ---
+
+
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
+def test_coordinates_there_and_back(coordinates):
+    rng = np.random.default_rng(0)
+    charts = np.concatenate([se3.so3_exp(rng.standard_normal((5, 3))), rng.standard_normal((5, 3, 1))], axis=2)
+    local = rng.uniform((-2, -2, 1), (2, 2, 60), (5, 3))
+    points = (charts[:, :, :3] @ local[:, :, None])[:, :, 0] + charts[:, :, 3]
+    c = coordinates.of(charts, points)
+    np.testing.assert_allclose(coordinates.points(charts, c), points, atol=1e-10)
+    for i, D in enumerate(coordinates.jacobian(charts, c)):
+        numeric = jacobian(lambda x, i=i: coordinates.points(charts[[i]], x[None])[0], c[i], 1e-6 * abs(c[i, 2]))
+        np.testing.assert_allclose(D, numeric, rtol=1e-4, atol=1e-4)
+
+
+def test_a_pixel_error_at_first_sight_is_linear_in_inverse_depth():
+    h = np.array([[3.0, -1.0, 60.0]])
+    chart = np.eye(3, 4)[None]
+    z = RIG.project_stereo(h)[0]
+    c = [InverseDepth().of(chart, RIG.triangulate(z[:, :2], z[:, [2, 1]] + [d, 0]))[0] for d in (-0.5, 0.0, 0.5)]
+    np.testing.assert_allclose(c[0] + c[2], 2 * c[1], atol=1e-12)
+
+
+def test_landmarks_keep_their_names():
+    marks, charts = Landmarks(InverseDepth()), np.tile(np.eye(3, 4), (4, 1, 1))
+    points = np.arange(12.0).reshape(4, 3) + 1
+    marks.append(np.array([7, 3, 9, 1]), charts, points)
+    marks.remove(np.array([3, 9]), np.array([1]), np.array([3]))
+    assert marks.ids.tolist() == [7, 1] and marks.slots([1, 7]).tolist() == [1, 0]
+    np.testing.assert_allclose(marks.points, points[[0, 3]])
+    with pytest.raises(MeasurementError, match="landmark 3 is not in the map"):
+        marks.slots([3])
+    with pytest.raises(MeasurementError, match="landmark 7 is in the map already"):
+        marks.require_new(np.array([4, 7]))
 
 
 # --- the covariance matrix ---
@@ -224,11 +270,11 @@ def test_landmarks_come_and_go():
     covariance, dense = grown(300, rng)
     largest = covariance.capacity
     order = list(range(300))  # which landmark each slot holds
-    for _ in range(260):
-        slot = int(rng.integers(len(order)))
-        covariance.drop(slot)
-        order[slot] = order[-1]
-        order.pop()
+    for count in (1, 7, 100, 1, 150, 0, 1):
+        holes, movers = covariance.drop(rng.permutation(len(order))[:count])
+        for hole, mover in zip(holes, movers):
+            order[hole] = order[mover]
+        del order[len(order) - count :]
     rows = np.concatenate([np.arange(CAMERA), *[CAMERA + 3 * i + np.arange(3) for i in order]])
     expected = dense[np.ix_(rows, rows)]
     np.testing.assert_allclose(covariance.full(), expected, rtol=1e-9, atol=1e-11)
@@ -236,7 +282,7 @@ def test_landmarks_come_and_go():
     J, noise = rng.standard_normal((50, 3, 6)), np.tile(np.eye(3), (50, 1, 1))
     covariance.append(J, noise)
     np.testing.assert_allclose(covariance.full(), augmented(expected, J, noise), rtol=1e-9, atol=1e-11)
-    covariance.drop(covariance.count - 1)
+    covariance.drop(np.array([covariance.count - 1]))
     np.testing.assert_allclose(covariance.full(), augmented(expected, J[:-1], noise[:-1]), rtol=1e-9, atol=1e-11)
 
 
@@ -255,20 +301,16 @@ def far_off(iterations: int, guess: bool = False) -> Problem:
     world, phi = anchor(np.eye(3))
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
     truth = np.concatenate([[0.3, -0.2, 1.5], phi + np.array([0.05, 0.15, -0.1])])
-    z = linearise(RIG, world, truth, points).z + 0.5 * rng.standard_normal((12, 3))
+    z = linearise(RIG, world, truth[:6], points).z + 0.5 * rng.standard_normal((12, 3))
     prior = np.concatenate([np.zeros(3), phi, points.reshape(-1)])
     prior[6:] += 0.05 * rng.standard_normal(36)
     P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.full(36, 0.05**2)]))
-
-    def at(x):
-        return linearise(RIG, world, x[:6], x[6:].reshape(-1, 3))
-
-    return Problem(prior, P, z, 0.5, at, iterations, 0.9999, truth - prior[:6] if guess else None)
+    return Problem(prior, P, z, 0.5, model(RIG, world), iterations, 0.9999, truth - prior[:6] if guess else None)
 
 
 def cost(problem: Problem, x: np.ndarray) -> float:
     d = x - problem.prior
-    residual = (problem.z - problem.linearise(x).z).reshape(-1) / problem.sigma
+    residual = (problem.z - problem.model.predict(x)).reshape(-1) / problem.sigma
     return float(d @ np.linalg.solve(problem.covariance, d) + residual @ residual)
 
 
@@ -282,7 +324,7 @@ def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch)
 
     def residuals(step):  # whitened by the prior, so that a general solver has an easy time
         x = problem.prior + deviation * step
-        return np.concatenate([step, ((problem.z - problem.linearise(x).z) / problem.sigma).reshape(-1)])
+        return np.concatenate([step, ((problem.z - problem.model.predict(x)) / problem.sigma).reshape(-1)])
 
     best = least_squares(residuals, np.zeros(42), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(x, problem.prior + deviation * best.x, atol=1e-5)

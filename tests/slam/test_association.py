@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from slam import se3
-from slam.association import AssociationConfig, crowded, match_everywhere, match_in_windows
+from slam.association import (
+    AssociationConfig,
+    crowded,
+    match_everywhere,
+    match_in_windows,
+    pairs_in_boxes,
+    search_windows,
+)
 from slam.data import Prediction, StereoFeatures
 from slam.errors import ConfigurationError
 from tests.slam.scene import RIG, Cloud
@@ -43,6 +50,36 @@ def test_larger_window_finds_what_the_smallest_does_not():
     assert len(found(cloud, prediction, features)) == len(ids)
     small = AssociationConfig(window_sigmas=(2.5,), d_match=(0.55,))
     assert len(found(cloud, prediction, features, small)) == 0
+
+
+def test_fixed_windows_do_not_care_for_the_covariance():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    fixed = AssociationConfig(windows="fixed", window_sizes=(6.0, 12.0))
+    for sigma in (0.1, 50.0):
+        assert len(found(cloud, predicted(cloud, np.eye(4), (11.0, 11.0), sigma), features, fixed)) == len(ids)
+        assert len(found(cloud, predicted(cloud, np.eye(4), (13.0, 0.0), sigma), features, fixed)) < 0.1 * len(ids)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 4.0, 30.0, 300.0])
+def test_windows_are_the_innovations_ellipses(sigma):
+    """The same candidates as by looking at every pair, whatever the size and shape of the windows."""
+    rng = np.random.default_rng(int(sigma))
+    uv = rng.uniform((0, 0), (320, 240), (150, 2))
+    centres = rng.uniform((-20, -20), (340, 260), (200, 2))
+    A = sigma * rng.normal(size=(200, 2, 2))
+    S = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(2)
+    none = np.zeros(200, np.int64)
+    config = AssociationConfig(window_min=1e-3, window_max=1e4)
+    windows = search_windows(Prediction(0.0, np.eye(4), np.eye(6), none, centres, centres, S), config)
+    rows, columns = pairs_in_boxes(centres, windows.reach, uv)
+    level = windows.level(rows, (uv[columns] - centres[rows]).astype(np.float32))
+    offset = uv[None] - centres[:, None]
+    squared = np.einsum("mni,mij,mnj->mn", offset, np.linalg.inv(S), offset)
+    clear = np.abs(np.sqrt(squared) - 5.0) > 1e-3  # float32 at the very edge
+    inside = np.zeros_like(squared, bool)
+    inside[rows[level < 2], columns[level < 2]] = True
+    np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
 
 
 def test_larger_window_asks_for_a_better_descriptor():
@@ -119,6 +156,8 @@ def test_crowded():
         {"window_min": 0.0},
         {"ratio": 1.5},
         {"hypotheses": 0},
+        {"windows": "round"},
+        {"windows": "fixed", "window_sizes": (30.0, 10.0)},
     ],
 )
 def test_settings_out_of_range(change):

@@ -123,6 +123,23 @@ def test_unknown_world(tmp_path):
     fails_with_one_line(slam("run", "synthetic:moon", "--out", tmp_path / "out"), "moon", "aisle")
 
 
+def test_a_format_of_folders_does_not_go_with_a_world(tmp_path):
+    done = slam("run", "synthetic:desk?frames=2", "--format", "kitti", "--out", tmp_path / "out")
+    fails_with_one_line(done, "synthetic:desk?frames=2", "'kitti'")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["run", "render"])
+def test_an_empty_sequence(command, tmp_path):
+    fails_with_one_line(slam(command, "", "--out", tmp_path / "out"), "path is empty")
+
+
+def test_only_worlds_are_rendered(euroc, tmp_path):
+    done = slam("render", euroc, "--out", tmp_path / "out")
+    fails_with_one_line(done, "only synthetic worlds can be rendered")
+    assert not (tmp_path / "out").exists()
+
+
 def test_out_is_a_file(euroc, tmp_path):
     (tmp_path / "out").write_text("")
     fails_with_one_line(slam("run", euroc, "--out", tmp_path / "out"), "out")

@@ -6,7 +6,15 @@ import pytest
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.landmarks import LandmarkRows
-from slam.map_management import MapConfig, bad_landmarks, new_landmarks, surplus_landmarks
+from slam.map_management import (
+    MapConfig,
+    bad_landmarks,
+    doubled_landmarks,
+    known_features,
+    new_landmarks,
+    surplus_landmarks,
+)
+from slam.visibility import MapView, expected_landmarks
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
@@ -75,6 +83,20 @@ def test_erase_what_is_missed_or_seldom_seen():
     assert bad_landmarks(rows, config).tolist() == [False, True, True, False, False]
 
 
+def test_what_was_hardly_ever_seen_does_not_stay():
+    times = [80, 80, *range(81, 88)]
+    rows = rows_with(seen=[5, 6, *[5] * 7], in_view=[6] * 9, missed=[0] * 9, last_seen=times)
+    assert bad_landmarks(rows, MapConfig(confirmed=6)).tolist() == [True, False, True, *[False] * 6]
+    dark = rows_with(seen=[5, 9], in_view=[6, 9], missed=[0, 0], last_seen=[80, 200])
+    assert not bad_landmarks(dark, MapConfig(confirmed=6)).any()
+
+
+def test_what_is_not_seen_is_forgotten_only_where_wanted():
+    rows = rows_with(seen=[9, 9, 9], in_view=[9, 9, 9], missed=[0, 0, 0], last_seen=[7, 90, 100])
+    assert not bad_landmarks(rows, MapConfig()).any()
+    assert bad_landmarks(rows, MapConfig(forget_after=20)).tolist() == [True, False, False]
+
+
 def test_out_of_view_is_never_missed():
     rows = rows_with(seen=[3], in_view=[3], missed=[0], last_seen=[7])
     features = features_at(np.zeros((0, 2)))
@@ -105,6 +127,59 @@ def test_the_never_confirmed_give_way_first():
     config = MapConfig(target_in_view=3, max_landmarks=3)
     rows = rows_with(last_seen=[5, 1, 9, 3, 9], seen=[1, 4, 1, 4, 2])
     assert surplus_landmarks(rows, config).tolist() == [True, True, False, False, False]
+
+
+def seen_from_the_origin(positions, features):
+    return MapView.of(RIG, np.eye(4), np.asarray(positions, float), features, 1.0)
+
+
+def like(features, rows, seen):
+    """Landmarks that look like some of the features."""
+    n, none = len(rows), np.zeros(len(rows), np.int64)
+    looks, signs = features.descriptors[rows], features.laplacian[rows]
+    return LandmarkRows(np.arange(n), looks, signs, np.asarray(seen), none, none, none, none)
+
+
+def test_a_feature_that_is_a_landmark_already_is_known():
+    features = features_at([(100, 100), (200, 100), (250, 50)], depth=3.0)
+    points = RIG.triangulate(features.uv_left, features.uv_right)
+    landmarks = like(features, [0, 1, 1], [1, 1, 1])
+    # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
+    # like another feature.
+    positions = [points[0] * 1.07, points[1] + [0.2, 0, 0], points[2]]
+    view = seen_from_the_origin(positions, features)
+    assert known_features(view, landmarks, features, CONFIG).tolist() == [True, False, False]
+
+
+def test_of_doubled_landmarks_the_one_seen_less_goes():
+    features = features_at([(100, 100), (200, 100)], depth=3.0)
+    points = RIG.triangulate(features.uv_left, features.uv_right)
+    landmarks = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3])
+    positions = [points[0], points[0] + 0.01, points[1], points[1] - 0.005, points[0] + [0, 0, 0.1]]
+    view = seen_from_the_origin(positions, features)
+    assert doubled_landmarks(view, landmarks, CONFIG).tolist() == [True, False, False, True, False]
+
+
+def test_hidden_landmarks_are_not_expected():
+    """Two landmarks at 6 m: one among features at 2 m, one among features as far as itself; one at the border."""
+    near = features_at([(100 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=2.0)
+    far = features_at([(220 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=6.0)
+    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+    both = StereoFeatures(0.0, *(np.concatenate([getattr(near, n), getattr(far, n)]) for n in names))
+    rays = np.column_stack([RIG.left.normalise(np.array([(100.0, 100), (220, 100), (5, 100)])), np.ones(3)])
+    view = MapView.of(RIG, np.eye(4), 6.0 * rays, both, 0.3)
+    size = (RIG.width, RIG.height)
+    assert expected_landmarks(view, both, size, 16.0, 12.0).tolist() == [False, True, False]
+    assert expected_landmarks(view, both, size, 0.0, 0.0).tolist() == [True, True, True]
+
+
+def test_looks_are_renewed_as_far_as_wanted():
+    rows = rows_with(seen=[1], in_view=[1], missed=[0])
+    rows = LandmarkRows(**{**vars(rows), "descriptors": np.eye(16, dtype=np.float32)[:1]})
+    features = features_at([(1, 1), (2, 2)])
+    for renewal, expected in ((0.0, (1, 0)), (1.0, (0, 1)), (0.5, (0.5**0.5, 0.5**0.5))):
+        after = rows.after_frame(1, rows.ids, rows.ids, features, np.array([1]), renewal)
+        np.testing.assert_allclose(after.descriptors[0, :2], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,10 @@ def test_a_run_leaves_its_files(tmp_path, backend):
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.01
     assert "NIS per degree of freedom" in summary["consistency"]
     assert summary["versions"]["numpy"] == np.__version__
-    assert json.loads((tmp_path / "config.json").read_text())["backend"] == backend
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["backend"] == backend
+    assert config["in_force"]["frontend"]["octaves"] == 2  # left at its default, said all the same
+    assert config["in_force"]["backend"]
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])

@@ -100,9 +100,9 @@ def _room(values: Mapping[str, Any]) -> list[Rectangle]:
     if values["bare"]:
         wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
         out.append(_along_aisle(wall, BARE[0] - 0.5, behind - 0.01, CEILING, 1))
-        side = Material(0.2, HEIGHT, "wood", layout)
+        side = Material(0.19, HEIGHT, "wood", layout)
         out.append(rectangle(side, (BARE[0], SHELF_Y, HEIGHT), (0, 1, 0), (0, 0, -1)))
-        out.append(rectangle(side, (BARE[1], behind, HEIGHT), (0, -1, 0), (0, 0, -1)))
+        out.append(rectangle(side, (BARE[1], behind - 0.01, HEIGHT), (0, -1, 0), (0, 0, -1)))
     return out
 
 

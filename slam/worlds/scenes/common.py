@@ -55,13 +55,13 @@ def clock(values: Mapping[str, Any], duration: float) -> tuple[Array, Array]:
 def assemble(
     name: str, kind: str, values: Mapping[str, Any], rig: StereoRig, stamps: Array, T_world_left: Array,
     rectangles: Iterable[Rectangle], reach: tuple[float, float], texels: float,
-    T_world_object: Array | None = None, tile: float = 1.0,
+    T_world_object: Array | None = None,
 ) -> World:  # fmt: skip
     """A world with its landmarks chosen; the arguments are the world's attributes."""
     surfaces = tuple(rectangles)
     landmarks = place_landmarks(surfaces, values["density"], np.random.default_rng([values["layout"], 31]))
     objects = np.zeros((0, len(stamps), 4, 4)) if T_world_object is None else T_world_object
-    return World(name, kind, rig, stamps, T_world_left, surfaces, landmarks, objects, reach, texels, tile)
+    return World(name, kind, rig, stamps, T_world_left, surfaces, landmarks, objects, reach, texels)
 
 
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:

@@ -43,7 +43,7 @@ def build(values: Mapping[str, Any]) -> World:
     for body in range(1, values["cars"] + 1):
         rectangles += _car(np.eye(4), 5000 + 20 * layout + body, body)
     objects = np.array([_drive(t, body) for body in range(1, values["cars"] + 1)]).reshape(-1, len(t), 4, 4)
-    return assemble("street", "driving", values, rig, stamps, poses, rectangles, (4.0, 60.0), 64.0, objects, 4.0)
+    return assemble("street", "driving", values, rig, stamps, poses, rectangles, (4.0, 60.0), 64.0, objects)
 
 
 def driven(t: Array) -> Array:

@@ -11,7 +11,7 @@ from slam.worlds.textures import layout, paint
 from slam.worlds.textures.paint import Colour
 
 if TYPE_CHECKING:
-    from slam.worlds.textures.surfaces import Shelves
+    from slam.worlds.textures.surfaces import ShelfBay, Shelves
 
 _WOOD = (110.0, 150.0, 190.0)
 
@@ -28,17 +28,18 @@ _BINDINGS = np.array(
 _INKS = ((225.0, 235.0, 240.0), (90.0, 190.0, 220.0), (25.0, 25.0, 25.0), (50.0, 50.0, 160.0))
 
 
-def paint_shelves(shelves: Shelves, density: float) -> np.ndarray:
-    """The picture of a wall of shelves, BGR uint8, `density` texels per metre."""
-    rng = np.random.default_rng([shelves.seed, 61])
-    size = round(shelves.height * density), round(shelves.width * density)
+def paint_bay(bay: ShelfBay, density: float) -> np.ndarray:
+    """The picture of one bay of a wall of shelves, BGR uint8, `density` texels per metre."""
+    shelves = bay.shelves
+    rng = np.random.default_rng([shelves.seed, 61, bay.number])
+    size = round(bay.height * density), round(bay.width * density)
     cloth = 1 + 0.04 * rng.standard_normal(size, np.float32) + 0.04 * paint.clouds(size, rng, 0.012 * density, 2)
     canvas = paint.tinted(0.32 * cloth, _WOOD)  # the back board, seen between and above the books
-    books = shelves.books
-    for i in range(len(books.left)):
+    books = shelves.books.moved(-bay.left)
+    for i in np.flatnonzero((books.left >= 0) & (books.left < bay.width)).tolist():
         _book(canvas, cloth, books, i, density, np.random.default_rng([shelves.seed, 62, int(books.series[i])]), rng)
     _shadows(canvas, shelves, density)
-    _woodwork(canvas, shelves, density, rng)
+    _woodwork(canvas, bay, density, rng)
     return cv2.convertScaleAbs(cv2.subtract(canvas, (_BLACK, _BLACK, _BLACK, 0)), alpha=_CONTRAST)
 
 
@@ -87,7 +88,7 @@ def _bands(canvas: np.ndarray, ink: Colour, colour: np.ndarray, looks: np.random
     height, width = canvas.shape[:2]
     if looks.random() < 0.45:
         top = looks.uniform(0.06, 0.2)
-        field = tuple(np.clip(colour * looks.choice([0.45, 1.7]), 0, 250))
+        field = tuple(np.clip(colour * (0.45, 1.7)[int(looks.integers(2))], 0, 250))
         paint.bar(canvas, (0, top * height, width, looks.uniform(0.1, 0.25) * height), field)
     for _ in range(int(looks.integers(0, 4))):
         paint.bar(canvas, (0, looks.uniform(0.03, 0.7) * height, width, looks.uniform(0.004, 0.014) * height), ink)
@@ -133,36 +134,33 @@ def _shadows(canvas: np.ndarray, shelves: Shelves, density: float) -> None:
         canvas[row] = cv2.convertScaleAbs(canvas[row], alpha=float(share))
 
 
-def _woodwork(canvas: np.ndarray, shelves: Shelves, density: float, rng: np.random.Generator) -> None:
-    """Boards, uprights, plinth and top, with labels on the boards' edges."""
+def _woodwork(canvas: np.ndarray, bay: ShelfBay, density: float, rng: np.random.Generator) -> None:
+    """Boards with labels on their edges, plinth, top, and the bay's share of the uprights beside it."""
     height, width = canvas.shape[:2]
+    high = bay.height
     thick = round(layout.BOARD * density)
-    for board in layout.shelf_rows(shelves.height):
+    for board in layout.shelf_rows(high):
         y = round(board * density)
         wood = paint.wood((thick, width), rng, _WOOD, density)
         wood[-2:] //= 2
         canvas[y : y + thick] = wood[: height - y]
-        _board_labels(canvas, y, thick, shelves, density, rng)
-    base = round((shelves.height - 0.1 + layout.BOARD) * density)
+        _board_label(canvas, y, thick, density, rng)
+    base = round((high - 0.1 + layout.BOARD) * density)
     canvas[base:] = (0.7 * paint.wood((height - base, width), rng, _WOOD, density)).astype(np.uint8)
-    top = round((layout.shelf_rows(shelves.height)[0] - layout.ROW) * density)
+    top = round((layout.shelf_rows(high)[0] - layout.ROW) * density)
     canvas[: max(top, thick)] = paint.wood((max(top, thick), width), rng, _WOOD, density)
-    wide = round(layout.UPRIGHT * density)
-    for bay in range(round(shelves.width / layout.BAY) + 1):
-        x = min(round(bay * layout.BAY * density), width - wide)
-        upright = paint.wood((wide, height), rng, _WOOD, density).transpose(1, 0, 2)
-        canvas[:, x : x + wide] = upright
-        canvas[:, x + wide : x + wide + 3] //= 2
+    half = layout.UPRIGHT / 2
+    wide, narrow = (round(share * half * density) for share in (2, 1))
+    on_left = narrow if bay.number else wide
+    on_right = wide if bay.number == bay.shelves.bays - 1 else narrow
+    for x, thick in ((0, on_left), (width - on_right, on_right)):
+        canvas[:, x : x + thick] = paint.wood((thick, height), rng, _WOOD, density).transpose(1, 0, 2)
+    canvas[:, on_left : on_left + 3] //= 2
 
 
-def _board_labels(
-    canvas: np.ndarray, y: int, thick: int, shelves: Shelves, density: float, rng: np.random.Generator
-) -> None:
-    """Small paper labels on a board's edge."""
-    for bay in range(round(shelves.width / layout.BAY)):
-        x = (bay * layout.BAY + rng.uniform(0.1, 0.7)) * density
-        box = (x, y + 0.12 * thick, 0.09 * density, 0.76 * thick)
-        paint.bar(canvas, box, (205.0, 235.0, 240.0))
-        paint.lettering(
-            canvas, paint.words(rng, 6), (box[0] + 3, box[1] + 3, box[2] - 6, box[3] - 6), (40, 40, 40), rng
-        )
+def _board_label(canvas: np.ndarray, y: int, thick: int, density: float, rng: np.random.Generator) -> None:
+    """A small paper label on a board's edge."""
+    box = (rng.uniform(0.1, 0.7) * density, y + 0.12 * thick, 0.09 * density, 0.76 * thick)
+    paint.bar(canvas, box, (205.0, 235.0, 240.0))
+    inner = (box[0] + 3, box[1] + 3, box[2] - 6, box[3] - 6)
+    paint.lettering(canvas, paint.words(rng, 6), inner, (40, 40, 40), rng)

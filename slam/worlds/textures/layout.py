@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,10 @@ class Books:
     series: np.ndarray
     lean: Array
     label: Array
+
+    def moved(self, right: float) -> Books:
+        """All books so much farther to the right."""
+        return replace(self, left=self.left + right)
 
 
 def shelf_rows(height: float) -> Array:

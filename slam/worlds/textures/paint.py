@@ -8,7 +8,7 @@ import numpy as np
 Colour = tuple[float, float, float]  #: blue, green, red
 Box = tuple[float, float, float, float]  #: left, top, width, height [texels]
 
-_LETTERS = np.array(list("ABCDEFGHIJKLMNOPRSTUVWZ"))
+_LETTERS = "ABCDEFGHIJKLMNOPRSTUVWZ"
 _FONTS = (
     cv2.FONT_HERSHEY_SIMPLEX,
     cv2.FONT_HERSHEY_DUPLEX,
@@ -54,7 +54,7 @@ def wood(shape: tuple[int, int], rng: np.random.Generator, colour: Colour, densi
 
 def words(rng: np.random.Generator, letters: int) -> str:
     """Some capital letters, in words."""
-    text = "".join(rng.choice(_LETTERS, letters))
+    text = "".join(_LETTERS[i] for i in rng.integers(len(_LETTERS), size=letters))
     cut = int(rng.integers(2, max(3, letters)))
     return text[:cut] + " " + text[cut:]
 

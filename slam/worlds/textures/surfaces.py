@@ -40,11 +40,57 @@ class Shelves:
             ]
         )
 
+    @property
+    def bays(self) -> int:
+        """How many bays there are."""
+        return max(1, round(self.width / layout.BAY))
+
+    def parts(self) -> list[ShelfBay]:
+        """Its bays, from the left."""
+        return [ShelfBay(self, number) for number in range(self.bays)]
+
+    def paint(self, density: float) -> np.ndarray:
+        """The picture, BGR."""
+        return np.concatenate([part.paint(density) for part in self.parts()], axis=1)
+
+
+@dataclass(frozen=True)
+class ShelfBay:
+    """One bay of a wall of bookshelves, between the middles of its uprights: painted when it comes into view.
+
+    Attributes:
+        shelves: the wall.
+        number: of the bay, from the left.
+    """
+
+    shelves: Shelves
+    number: int
+
+    @property
+    def left(self) -> float:
+        """Where it begins on the wall [m]."""
+        return self.number * layout.BAY + layout.UPRIGHT / 2 if self.number else 0.0
+
+    @property
+    def width(self) -> float:
+        """Its width [m]."""
+        last = self.number == self.shelves.bays - 1
+        return (self.shelves.width if last else (self.number + 1) * layout.BAY + layout.UPRIGHT / 2) - self.left
+
+    @property
+    def height(self) -> float:
+        """Its height [m]."""
+        return self.shelves.height
+
+    def marks(self) -> Array:
+        """None: the whole wall has them."""
+        return np.zeros((0, 3))
+
     def paint(self, density: float) -> np.ndarray:
         """The picture, BGR."""
         from slam.worlds.textures import books
 
-        return books.paint_shelves(self, density)
+        return books.paint_bay(self, density)
 
 
 @dataclass(frozen=True)

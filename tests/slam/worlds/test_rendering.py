@@ -5,23 +5,34 @@ import numpy as np
 import pytest
 
 from slam.worlds import open_world
+from slam.worlds.geometry import RectangleArrays, rectangle
+from slam.worlds.lens import Lens, View
 from slam.worlds.observe import visible_landmarks
+from slam.worlds.placing import place
 from slam.worlds.textures.layout import fill_shelves
 from slam.worlds.textures.ripmap import Ripmap
+from slam.worlds.textures.surfaces import Material
+from slam.worlds.visibility import by_depth, by_order, painting_order, shown
 
 
 def saddle(image: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """The saddle of grey levels near a pixel (2,): a cubic fitted to 9x9 pixels, moved until it is centred."""
+    """The saddle of grey levels near a pixel (2,): a quartic fitted to 9x9 pixels, moved until it is centred."""
     y, x = (g.ravel().astype(float) for g in np.mgrid[-4:5, -4:5])
     weight = np.exp(-(x * x + y * y) / 8)
-    terms = np.stack([x * x, x * y, y * y, x, y, np.ones(81), x**3, x * x * y, x * y * y, y**3], axis=1)
-    solve = np.linalg.pinv(terms * weight[:, None])
+    powers = [(2, 0), (1, 1), (0, 2), (1, 0), (0, 1), (0, 0)]
+    powers += [(i, degree - i) for degree in (3, 4) for i in range(degree + 1)]
+    solve = np.linalg.pinv(np.stack([x**i * y**j for i, j in powers], axis=1) * weight[:, None])
     place = start.copy()
     for _ in range(6):
         window = cv2.getRectSubPix(image, (9, 9), (float(place[0]), float(place[1]))).ravel()
         c = solve @ (window * weight)
         place += np.clip(-np.linalg.solve([[2 * c[0], c[1]], [c[1], 2 * c[2]]], c[3:5]), -1, 1)
     return place
+
+
+def smoothed(image: np.ndarray) -> np.ndarray:
+    """An image whose edges are smooth enough for `saddle`."""
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
 
 
 def corner_errors(sequence, frames) -> np.ndarray:
@@ -34,28 +45,67 @@ def corner_errors(sequence, frames) -> np.ndarray:
         facing = -(world.landmarks.normals[seen.ids] * offset).sum(axis=1) / np.linalg.norm(offset, axis=1)
         clear = (seen.size > 22) & (facing > 0.5)
         for image, uv, camera in ((frame.left, seen.uv_left, rig.left), (frame.right, seen.uv_right, rig.right)):
-            smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+            smooth = smoothed(image)
             places = uv[clear & camera.in_image(uv, 12)]
             errors += [saddle(smooth, place) - place for place in places]
     return np.array(errors)
+
+
+def test_the_corners_of_an_ideal_picture_are_found_without_bias():
+    """A chess board in perspective, 32x32 samples in each pixel: what `saddle` adds to the errors of the renderer."""
+    rng, n, half = np.random.default_rng(0), 32, 14
+    fine = (np.arange((2 * half + 1) * n) + 0.5) / n - 0.5 - half
+    x, y = np.meshgrid(fine, fine)
+    errors = []
+    for _ in range(12):
+        corner, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2)
+        tilt = rng.uniform(-0.004, 0.004, 2)  # distance changes by up to a tenth over a field
+        dx, dy = x - corner[0], y - corner[1]
+        w = 1 + tilt[0] * dx + tilt[1] * dy
+        s = (np.cos(angle) * dx + np.sin(angle) * dy) / w / rng.uniform(12, 25)
+        t = (np.cos(angle) * dy - np.sin(angle) * dx) / w / rng.uniform(22, 30)
+        board = 130 + 90 * (1 - 2 * (np.floor(s) % 2)) * (1 - 2 * (np.floor(t) % 2))
+        picture = board.reshape(2 * half + 1, n, 2 * half + 1, n).mean(axis=(1, 3))
+        image = cv2.GaussianBlur(np.rint(picture).astype(np.uint8), (0, 0), 0.5)  # the lens
+        errors.append(saddle(smoothed(image), corner + half) - corner - half)
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.005
+    assert np.linalg.norm(errors, axis=1).max() < 0.03
 
 
 @pytest.mark.parametrize("rig", ["rectified", "toedin"])
 @pytest.mark.parametrize("step", [0.1, 0.097])  # one falls on texels' and tiles' edges, the other does not
 def test_corners_are_drawn_where_they_project_in_both_images(board_world, rig, step):
     sequence = board_world(f"rig={rig}&noise=0&vignetting=0", step)
-    errors = corner_errors(sequence, range(0, 400, 40))
+    errors = corner_errors(sequence, range(3, 400, 44))  # in frame 47, corners lie on borders of blocks
     distance = np.linalg.norm(errors, axis=1)
     assert len(errors) > 80
     assert np.abs(errors.mean(axis=0)).max() < 0.01
     assert np.median(distance) < 0.02
-    assert np.percentile(distance, 95) < 0.05
+    assert distance.max() < 0.05
 
 
-def test_more_samples_bring_every_corner_within_a_twentieth_of_a_pixel(board_world):
-    errors = corner_errors(board_world("noise=0&vignetting=0&supersample=4", 0.097), (0, 150, 300))
-    assert len(errors) > 30
-    assert np.linalg.norm(errors, axis=1).max() < 0.05
+@pytest.mark.parametrize("query", ["aisle?box=1", "box", "boxes", "desk", "field", "startup", "street?cars=3"])
+def test_surfaces_in_order_and_a_depth_buffer_show_the_same(query):
+    sequence = open_world(query)
+    world = sequence.world
+    view = Lens.of(world.rig.left, 1).view
+    for k in np.linspace(0, len(world) - 1, 5).astype(int):
+        placed = place(world.drawn_arrays, world.T_world_body(k), world.T_world_left[k], view)
+        order = painting_order(placed)
+        assert order is not None, "built-in worlds need no depth buffer"
+        differ = by_order(placed, view, order) != by_depth(placed, view)
+        assert differ.mean() < 1e-3, "only on edges, where surfaces touch"
+
+
+def test_surfaces_that_reach_through_each_other_are_told_apart_by_depth():
+    wall = Material(2.0, 2.0, "plaster", 0)
+    crossing = [rectangle(wall, (-1, 2 - d, 1), (1, d, 0), (0, 0, -1)) for d in (0.5, -0.5)]
+    view = View(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 101, 101)
+    looking_along_y = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    placed = place(RectangleArrays.of(crossing), np.eye(4)[None], looking_along_y, view)
+    assert painting_order(placed) is None
+    labels = placed.source[shown(placed, view)[50].astype(int) - 1]
+    assert (labels[10:45] == 0).all() and (labels[55:90] == 1).all(), "each is nearer on one side"
 
 
 def test_detail_finer_than_pixels_leaves_no_pattern(board_world):
@@ -158,11 +208,11 @@ def test_options_of_the_camera():
 def test_a_ripmap_keeps_the_mean_and_never_runs_out():
     picture = np.random.default_rng(0).integers(0, 255, (60, 90), dtype=np.uint8)
     ripmap = Ripmap(picture)
-    assert ripmap.level(np.array([1 / 200, 1 / 200])) is not None
-    assert ripmap.level(np.array([1 / 200, 1 / 200])).shape == (60, 90)
-    assert ripmap.level(np.array([2 / 90, 1 / 60])).shape == (60, 45)
-    assert ripmap.level(np.array([50.0, 50.0])).shape == (1, 1)
-    assert ripmap.level(np.array([4 / 90, 4 / 60])).mean() == pytest.approx(picture.mean(), abs=0.5)
+    assert ripmap.level((1 / 200, 1 / 200)) is not None
+    assert ripmap.level((1 / 200, 1 / 200)).shape == (60, 90)
+    assert ripmap.level((2 / 90, 1 / 60)).shape == (60, 45)
+    assert ripmap.level((50.0, 50.0)).shape == (1, 1)
+    assert ripmap.level((4 / 90, 4 / 60)).mean() == pytest.approx(picture.mean(), abs=0.5)
 
 
 def test_books_stand_on_their_boards_and_beside_each_other():

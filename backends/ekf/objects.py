@@ -1,0 +1,266 @@
+"""Moving bodies in the EKF back end: filtered states beside the filter's own (paper B, section 3, with covariance)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.objects_body import (
+    RIGID,
+    Body,
+    CameraBelief,
+    Gathered,
+    advanced,
+    corrected,
+    corrected_by_map,
+    found,
+    gathered,
+    joined,
+    widened,
+    without,
+)
+from backends.ekf.objects_measurement import BodyMeasurement, change_between
+from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
+from slam.data import BoolArray, IdArray
+from slam.errors import MeasurementError
+from slam.models import EstimatorModels
+from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.objects.points import Shape, first_frame, shape_of, with_shape
+from slam.rig import StereoRig
+from slam.se3 import Array, inverse
+
+#: By how much an impulse may exceed its standard deviation where most observations say so.
+_SURPRISES = (0.0, 3.0, 10.0)
+_ENOUGH = 4  # observations that can be judged to agree with each other
+_FAILURES = 3  # so many rejections running, and a point starts anew
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What was made of a body's observations in one frame."""
+
+    measured: bool = False
+    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+class ObjectFilter:
+    """All bodies of one filter.
+
+    A body's frame is fixed at its first sight: its axes are the world's, its origin is the mean of the points. So its
+    pose has no error then, and what is uncertain about the first sight (stereo noise, the camera's pose) is the
+    uncertainty of its points; from then on the pose is that of the motion since.
+
+    Args:
+        rig: the cameras.
+        models: noise, gate, and motion of bodies.
+        iterations: most linearisations in an update.
+    """
+
+    def __init__(self, rig: StereoRig, models: EstimatorModels, iterations: int) -> None:
+        self._rig = rig
+        self._models = models
+        self._iterations = iterations
+        self._bodies: dict[int, Body] = {}
+        self._stamp = 0.0
+        self._now = 0
+
+    # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
+
+    def update(
+        self, observations: Sequence[ObjectObservations], stamp: float, camera: CameraBelief
+    ) -> list[ObjectEstimate]:
+        """See `slam.interfaces.ObjectBackend.update_objects`."""
+        seen = {o.id: o for o in observations}
+        self._require_usable(observations)
+        dt, self._stamp, self._now = stamp - self._stamp, stamp, self._now + 1
+        out = []
+        for number in sorted({*self._bodies, *seen}):
+            body, sight = self._bodies.get(number), _Sight()
+            if body is None:
+                body, sight = self._start(seen[number], camera)
+            else:
+                body = advanced(body, dt, self._models.objects) if dt > 0 else body
+                if number in seen:
+                    body, sight = self._measure(body, seen[number], camera)
+            self._bodies[number] = body
+            out.append(_estimate(body, stamp, sight))
+        return out
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.ObjectBackend.remove_objects`."""
+        numbers = {int(i) for i in ids}
+        for number in sorted(numbers - set(self._bodies)):
+            raise MeasurementError(f"ekf: object {number} is unknown")
+        for number in numbers:
+            del self._bodies[number]
+
+    # --- what happens to the filter's state happens to the bodies' covariance with it ---
+
+    def camera_moved(self, dt: float) -> None:
+        """The camera's [r, φ] went on by dt times [v, ω]."""
+        for body in self._bodies.values():
+            body.cross[:, :POSE] += dt * body.cross[:, POSE:CAMERA]
+
+    def camera_transformed(self, J: Array) -> None:
+        """The camera's state changed its coordinates by the Jacobian J (12, 12)."""
+        for body in self._bodies.values():
+            body.cross[:, :CAMERA] = body.cross[:, :CAMERA] @ J.T
+
+    def landmarks_appended(self, J: Array) -> None:
+        """Landmarks joined whose derivatives by [r, φ] are J (M, 3, 6)."""
+        for number, body in self._bodies.items():
+            new = body.cross[:, :POSE] @ J.reshape(-1, POSE).T
+            self._bodies[number] = replace(body, cross=np.concatenate([body.cross, new], axis=1))
+
+    def landmarks_dropped(self, holes: NDArray[np.intp], movers: NDArray[np.intp], left: int) -> None:
+        """Landmarks went: those of the slots `movers` have moved into `holes`, and the first `left` slots remain."""
+        for number, body in self._bodies.items():
+            marks = body.cross[:, CAMERA:].reshape(len(body.cross), -1, 3)
+            marks[:, holes] = marks[:, movers]
+            cross = np.concatenate([body.cross[:, :CAMERA], marks[:, :left].reshape(len(marks), -1)], axis=1)
+            self._bodies[number] = replace(body, cross=cross)
+
+    def camera_corrected(self, slots: NDArray[np.intp], solution: Solution, W: Array) -> None:
+        """The filter's state changed by ``P[:, g] s``, its covariance became ``P − W Wᵀ`` with ``W = P[:, g] B``.
+
+        g = [r, φ, landmarks `slots`]; s and B are the solution's. What has been learnt of the camera and the map is
+        learnt of the bodies too, as far as they hang on it.
+        """
+        columns = np.concatenate([np.arange(POSE), (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)])
+        for number, body in self._bodies.items():
+            self._bodies[number] = corrected_by_map(body, columns, solution.s, solution.B, W)
+
+    # --- parts ---
+
+    def _require_usable(self, observations: Sequence[ObjectObservations]) -> None:
+        if len({o.id for o in observations}) != len(observations):
+            raise MeasurementError("ekf: an object stands twice among the observations")
+        for o in observations:
+            depths = np.isfinite(self._rig.triangulate(o.uv_left, o.uv_right)).all(axis=1)
+            if o.id not in self._bodies and depths.sum() < 3:
+                raise MeasurementError(f"ekf: object {o.id} is new and has fewer than three points with a depth")
+
+    def _start(self, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, _Sight]:
+        h = self._rig.triangulate(o.uv_left, o.uv_right)
+        T, near = first_frame(camera.T_world_left, h)
+        body = found(o.id, T, self._models.objects, len(camera.columns))
+        body = self._join(body, o, near, camera)
+        return body, _Sight(True, np.sort(body.ids))
+
+    def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, _Sight]:
+        """Correct a body by its known points, then let the new ones join.
+
+        Where nothing agrees with the body (or too little), it is not known where it is, and nothing joins.
+        """
+        place = {i: row for row, i in enumerate(body.ids.tolist())}
+        known = np.array([i in place for i in o.points.tolist()], bool)
+        rows = np.array([place[i] for i in o.points[known].tolist()], np.intp)
+        body, used = self._correct(body, o, known, rows, camera)
+        if len(rows) and not used.any():
+            return body, _Sight(rejected=np.sort(o.points[known]))
+        failures, seen = body.failures.copy(), body.seen.copy()
+        failures[rows] = np.where(used, 0, failures[rows] + 1)
+        seen[rows] = self._now
+        body = without(replace(body, failures=failures, seen=seen), failures >= _FAILURES)
+        old = body.ids
+        body = self._join(body, o, ~np.isin(o.points, old), camera)
+        good = np.union1d(o.points[known][used], np.setdiff1d(body.ids, old))
+        return body, _Sight(bool(used.any()), good, np.setdiff1d(o.points[known][~used], good))
+
+    def _correct(
+        self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief
+    ) -> tuple[Body, BoolArray]:
+        """The body after its update, and which of the observations `known` were used; unchanged where none can be."""
+        nothing = np.zeros(len(rows), bool)
+        if not len(rows):
+            return body, nothing
+        z = np.concatenate([o.uv_left, o.uv_right[:, :1]], axis=1)[known]
+        try:
+            wider, covariances, problem, gated = self._gated(body, rows, z, o.T_world_object, camera)
+            solution = solve(problem, gated)
+        except UnsolvableError:
+            return body, nothing
+        if solution is None or not _enough(solution, body):
+            return body, nothing
+        after = corrected(wider, covariances, solution.s, solution.B)
+        if not (np.isfinite(after.T).all() and (after.covariance.diagonal() > 0).all()):
+            return body, nothing
+        return after, solution.used
+
+    def _gated(
+        self, body: Body, rows: NDArray[np.intp], z: Array, guess: Array | None, camera: CameraBelief
+    ) -> tuple[Body, Gathered, Problem, Gated]:
+        """Gate the observations; where most fail together, the impulse was larger than expected, and not they wrong.
+
+        As for the camera: the guess and wider motion noise are tried until most pass; if nothing helps, the gate at
+        the prediction stands.
+        """
+        most = max(_ENOUGH, (len(z) + 1) // 2)
+        first: tuple[Body, Gathered, Problem, Gated] | None = None
+        for factor in _SURPRISES:
+            wider = widened(body, factor)
+            covariances, problem = self._problem(wider, rows, z, guess, camera)
+            for at_guess in (False,) if guess is None else (False, True):
+                gated = gate(problem, at_guess)
+                tried = (wider, covariances, problem, gated)
+                first = first or tried
+                if len(z) < most or gated.used.sum() >= most:
+                    return tried
+        assert first is not None
+        return first
+
+    def _problem(
+        self, body: Body, rows: NDArray[np.intp], z: Array, guess: Array | None, camera: CameraBelief
+    ) -> tuple[Gathered, Problem]:
+        covariances = gathered(body, camera, rows)
+        model = BodyMeasurement(self._rig, inverse(body.T) @ camera.T_world_left, body.points.select(rows))
+        change = None if guess is None else -change_between(body.T, guess)[[3, 4, 5, 0, 1, 2]]
+        return covariances, Problem(
+            np.zeros(len(covariances.own)), covariances.own, z, self._models.pixel_sigma, model, self._iterations,
+            self._models.gate_probability, change,
+        )  # fmt: skip
+
+    def _join(self, body: Body, o: ObjectObservations, wanted: BoolArray, camera: CameraBelief) -> Body:
+        """With those of the wanted points that have a depth; points unseen for longest make room."""
+        h = self._rig.triangulate(o.uv_left, o.uv_right)
+        rows = np.flatnonzero(wanted & np.isfinite(h).all(axis=1))[: self._models.objects.points]
+        surplus = len(body.ids) + len(rows) - self._models.objects.points
+        if surplus > 0:
+            unseen = np.flatnonzero(body.seen < self._now)
+            oldest = unseen[np.argsort(body.seen[unseen], kind="stable")][:surplus]
+            gone = np.zeros(len(body.ids), bool)
+            gone[oldest] = True
+            body = without(body, gone)
+            rows = rows[: self._models.objects.points - len(body.ids)]
+        if not len(rows):
+            return body
+        shape = self._shape(body, h[rows], inverse(camera.T_world_left) @ body.T)
+        z = np.concatenate([o.uv_left, o.uv_right[:, :1]], axis=1)[rows]
+        h, noise = with_shape(self._rig.project_stereo, z, h[rows], self._models.pixel_sigma, shape)
+        return joined(body, camera, o.points[rows], h, noise, self._now)
+
+    def _shape(self, body: Body, h: Array, T_left_body: Array) -> Shape:
+        """The body's shape in camera coordinates, by the points it has, or else by the new ones at h (M, 3)."""
+        if len(body.ids) < _ENOUGH:
+            return shape_of(h, self._rig.triangulation_covariance(h, self._models.pixel_sigma))
+        D, rows = body.points.derivatives(), RIGID + np.arange(3 * len(body.ids)).reshape(-1, 3)
+        own = body.covariance[rows[:, :, None], rows[:, None, :]]
+        return shape_of(body.points.cartesian(), D @ own @ np.swapaxes(D, 1, 2)).seen_from(T_left_body)
+
+
+def _enough(solution: Solution, body: Body) -> bool:
+    """Whether what is used says something: at least three points, or most of the few that there are."""
+    return bool(solution.used.sum() >= min(3, (len(body.ids) + 1) // 2))
+
+
+def _estimate(body: Body, stamp: float, sight: _Sight) -> ObjectEstimate:
+    P = body.covariance
+    return ObjectEstimate(
+        body.id, stamp, body.T.copy(), P[:6, :6].copy(), body.velocity.copy(), P[6:RIGID, 6:RIGID].copy(),
+        sight.measured, sight.used, sight.rejected,
+    )  # fmt: skip

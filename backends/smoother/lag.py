@@ -1,0 +1,67 @@
+"""A fixed lag: which variables leave the problem, so that a frame's cost does not grow with what the run has seen.
+
+What leaves is marginalised: its factors become a linear one on what they touch. So no factor of theirs may change
+afterwards, and the smart factors that hold a leaving pose are finished first.
+"""
+
+from __future__ import annotations
+
+from backends.smoother.records import Records
+from backends.smoother.solver import Change
+from backends.smoother.variables import pose_key
+
+
+class FixedLag:
+    """Keeps track of the variables that are in the solver.
+
+    Args:
+        records: what is on record.
+        lag: so many of the newest poses stay.
+
+    Attributes:
+        first: frame of the oldest pose that is a variable.
+    """
+
+    def __init__(self, records: Records, lag: int) -> None:
+        self.first = 0
+        self._records = records
+        self._lag = lag
+        self._landmarks: set[int] = set()
+
+    def restart(self) -> None:
+        """Note that everything on record is in the solver again."""
+        self.first = 0
+        self._landmarks = set(self._records.history.explicit)
+
+    def enter(self, landmark: int) -> None:
+        """Note that a landmark has become a variable."""
+        self._landmarks.add(landmark)
+
+    def advance(self, change: Change) -> None:
+        """Put what leaves with the newest pose, and what stays, into the change; that pose is on record already."""
+        first = max(0, self._records.path.count - self._lag)
+        if first <= self.first:
+            return
+        self._finish_tracks(first)
+        gone = self._landmarks_before(first)
+        change.leaving = [*map(pose_key, range(self.first, first)), *gone]
+        self._landmarks.difference_update(gone)
+        newest = self._records.path.count - 1
+        change.staying = [*map(pose_key, range(first, newest)), *sorted(self._landmarks)]
+        self.first = first
+
+    def _finish_tracks(self, first: int) -> None:
+        """Finish the smart factors that hold poses before frame `first`."""
+        oldest = pose_key(first)
+        for track in self._records.landmarks.tracks.values():
+            if track.keys and track.keys[0] < oldest:
+                self._records.finish(track)
+
+    def _landmarks_before(self, first: int) -> list[int]:
+        """Landmark variables that were last measured before frame `first`; their landmarks have none any more."""
+        frame, marks = self._records.measurements.frame, self._records.landmarks
+        explicit = self._records.history.explicit
+        gone = sorted(key for key in self._landmarks.intersection(explicit) if frame[explicit[key][-1]] < first)
+        for key in gone:
+            marks.variable[marks.variable == key] = -1
+        return gone

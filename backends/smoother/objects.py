@@ -1,0 +1,281 @@
+"""Moving bodies in the smoother back end: a fixed-lag smoother for each, beside the graph of the camera's poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from backends.smoother.objects_factors import FRAME, velocities
+from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
+from backends.smoother.objects_window import (
+    CameraWindow,
+    Solver,
+    Window,
+    opened,
+    with_frame,
+    with_points,
+    without_points,
+)
+from backends.smoother.records import IndexArray, Path
+from backends.smoother.stereo import RectifiedStereo
+from backends.smoother.uncertainty import PoseSet
+from slam.data import BoolArray, IdArray, Observations
+from slam.errors import MeasurementError
+from slam.models import EstimatorModels
+from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.objects.points import Shape, first_frame, shape_of, with_shape
+from slam.se3 import Array, adjoint, inverse, transform
+
+_LAG = 4  # frames of a window at least
+_BATCH = 2  # so many frames leave it together: that costs hardly more than for one
+_ITERATIONS = 2
+_ENOUGH = 4  # points that show a shape
+_FAILURES = 3  # so many rejections running, and a point starts anew
+_JITTER = 1e-14  # [rad², m²] that keeps poses of the camera apart which are taken to move together
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What was made of a body's observations in one frame."""
+
+    measured: bool = False
+    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+class ObjectSmoother:
+    """All bodies of one smoother.
+
+    A body's frame is fixed at its first sight: its axes are the world's, its origin is the mean of the points. So its
+    pose has no error then, and what is uncertain about the first sight (stereo noise, the camera's pose) is the
+    uncertainty of its points; from then on the pose is that of the motion since.
+
+    Args:
+        stereo: the rig's rectified twin.
+        sigma: pixel noise in it [px].
+        models: gate and motion of bodies.
+    """
+
+    def __init__(self, stereo: RectifiedStereo, sigma: float, models: EstimatorModels) -> None:
+        self._stereo = stereo
+        self._sigma = sigma
+        self._models = models
+        self._solver = Solver(stereo, sigma, models.objects, _ITERATIONS)
+        self._windows: dict[int, Window] = {}
+
+    # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
+
+    def update(
+        self, observations: Sequence[ObjectObservations], path: Path, window: Callable[[], PoseSet]
+    ) -> list[ObjectEstimate]:
+        """See `slam.interfaces.ObjectBackend.update_objects`.
+
+        The path's last frame is the current one; `window` gives the newest camera poses, and is called if need be.
+        """
+        seen = {o.id: _Measured.of(o, self._stereo) for o in observations}
+        self._require_usable(observations, seen)
+        if not (self._windows or seen):
+            return []
+        camera, out = window(), []
+        for number in sorted({*self._windows, *seen}):
+            body = self._windows.get(number)
+            if body is None:
+                body, sight = self._start(seen[number], path, camera)
+            else:
+                body, sight = self._step(body, seen.get(number), path, camera)
+            self._windows[number] = body
+            out.append(self._estimate(number, body, sight))
+        return out
+
+    def remove(self, ids: IdArray | Sequence[int]) -> None:
+        """See `slam.interfaces.ObjectBackend.remove_objects`."""
+        numbers = {int(i) for i in ids}
+        for number in sorted(numbers - set(self._windows)):
+            raise MeasurementError(f"smoother: object {number} is unknown")
+        for number in numbers:
+            del self._windows[number]
+
+    # --- parts ---
+
+    def _require_usable(self, observations: Sequence[ObjectObservations], seen: dict[int, _Measured]) -> None:
+        if len(seen) != len(observations):
+            raise MeasurementError("smoother: an object stands twice among the observations")
+        for number, measured in seen.items():
+            if number not in self._windows and measured.deep.sum() < 3:
+                raise MeasurementError(f"smoother: object {number} is new and has fewer than three points with a depth")
+
+    def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+        frame, X = path.count - 1, path.poses[-1].copy()
+        T, near = first_frame(X, seen.local)
+        window = self._join(opened(frame, float(path.stamps[-1]), T, X), seen, near)
+        window = self._solver.solved(window, _cameras(window.frames, path, camera))
+        return window, _Sight(True, np.sort(window.ids))
+
+    def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+        """One more frame; where it cannot be solved with its observations, without them, or else anew."""
+        for given in (seen, None):
+            with suppress(np.linalg.LinAlgError):
+                return self._solved_step(window, given, path, camera)
+        return self._restarted(window, seen, path, camera)
+
+    def _restarted(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+        """The body without its points, velocity and past, where it was last or where the guess has it."""
+        T = window.T[-1] if seen is None or seen.guess is None else seen.guess
+        spread = np.full(6, self._models.objects.initial_velocity_sigma**2)
+        window = opened(path.count - 1, float(path.stamps[-1]), T, path.poses[-1].copy(), np.diag(spread))
+        return self._solver.solved(window, _cameras(window.frames, path, camera)), _Sight()
+
+    def _solved_step(
+        self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet
+    ) -> tuple[Window, _Sight]:
+        frame, stamp = path.count - 1, float(path.stamps[-1])
+        if frame == window.frames[-1]:
+            return window, _Sight()
+        cameras = _cameras(np.append(window.frames, frame), path, camera)
+        expected = predicted(window, cameras, stamp, self._models.objects)
+        if seen is None:
+            window, sight = with_frame(window, frame, stamp, expected.T, expected.X, 1.0), _Sight()
+        else:
+            found, known, rows = self._agreement(window, expected, seen)
+            window = with_frame(window, frame, stamp, found.T, expected.X, found.scale)
+            window.z[-1, rows[found.used]] = seen.z[known][found.used]
+            window, sight = self._exchange(window, seen, known, rows, found.used)
+        window = self._solver.solved(window, cameras)
+        if len(window) >= _LAG + _BATCH:
+            window = self._solver.without_oldest(window, cameras, _BATCH)
+        return window, sight
+
+    def _agreement(
+        self, window: Window, expected: PredictedBody, seen: _Measured
+    ) -> tuple[Agreement, BoolArray, IndexArray]:
+        """Where the body is, which of the observations (M,) are of points it has, and their rows there.
+
+        Fewer than three that agree say nothing, but for a body that has few.
+        """
+        known, rows = seen.known(window)
+        nothing = Agreement(expected.T, np.zeros(len(rows), bool), 1.0)
+        if not len(rows):
+            return nothing, known, rows
+        found = agreement(
+            expected, self._stereo, self._sigma, self._models.gate_probability, window.points, rows, seen.z[known],
+            seen.guess,
+        )  # fmt: skip
+        enough = found.used.sum() >= min(3, (len(window.ids) + 1) // 2)
+        return (found if enough else nothing), known, rows
+
+    def _exchange(
+        self, window: Window, seen: _Measured, known: BoolArray, rows: IndexArray, used: BoolArray
+    ) -> tuple[Window, _Sight]:
+        """Points that failed too often leave, new ones join.
+
+        Where nothing agrees with the body, it is not known where it is, and nothing joins.
+        """
+        mine = seen.ids[known]
+        if len(rows) and not used.any():
+            return window, _Sight(rejected=np.sort(mine))
+        failures = window.failures.copy()
+        failures[rows] = np.where(used, 0, failures[rows] + 1)
+        window = without_points(replace(window, failures=failures), failures >= _FAILURES)
+        old = window.ids
+        window = self._join(window, seen, ~np.isin(seen.ids, old))
+        good = np.union1d(mine[used], np.setdiff1d(window.ids, old))
+        return window, _Sight(bool(used.any()), good, np.setdiff1d(mine[~used], good))
+
+    def _join(self, window: Window, seen: _Measured, wanted: BoolArray) -> Window:
+        """With those of the wanted points that have a depth; points unseen for longest make room."""
+        most = self._models.objects.points
+        rows = np.flatnonzero(wanted & seen.deep)[:most]
+        surplus = len(window.ids) + len(rows) - most
+        if surplus > 0:
+            window = without_points(window, _stalest(window, surplus))
+            rows = rows[: most - len(window.ids)]
+        if not len(rows):
+            return window
+        Y = inverse(window.prior.X[-1]) @ window.T[-1]
+        shape = self._shape(window, seen.local[rows], inverse(Y))
+        in_camera = shape.seen_from(Y)
+        h, _ = with_shape(self._stereo.project, seen.z[rows], seen.local[rows], self._sigma, in_camera)
+        information = np.linalg.inv(shape.covariance)
+        return with_points(window, seen.ids[rows], transform(inverse(Y), h), information, shape.mean, seen.z[rows])
+
+    def _shape(self, window: Window, h: Array, T_body_left: Array) -> Shape:
+        """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
+        own = window.point_covariances()
+        if len(own) < _ENOUGH:
+            _, J = self._stereo.project(h)
+            inverse_J = np.linalg.inv(J) * self._sigma
+            return shape_of(h, inverse_J @ np.swapaxes(inverse_J, 1, 2)).seen_from(T_body_left)
+        return shape_of(window.points, own)
+
+    def _estimate(self, number: int, window: Window, sight: _Sight) -> ObjectEstimate:
+        models, P = self._models.objects, window.covariance
+        last = FRAME * (len(window) - 1)
+        velocity = np.zeros(6)
+        spread = np.diag(np.repeat([models.initial_angular_velocity_sigma**2, models.initial_velocity_sigma**2], 3))
+        if len(window) > 1:
+            (velocity,), (before,), (after,) = velocities(window.T[-2:], window.stamps[-2:])
+            mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
+            J = np.concatenate([before, after], axis=1)
+            spread = J @ P[np.ix_(mine, mine)] @ J.T
+        covariance = P[last : last + 6, last : last + 6].copy()
+        return ObjectEstimate(
+            number, float(window.stamps[-1]), window.T[-1].copy(), covariance, velocity, spread,
+            sight.measured, sight.used, sight.rejected,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Observations of a body in the rectified twin.
+
+    Attributes:
+        ids: of the points (M,).
+        z: (M, 3).
+        local: where they triangulate to (M, 3), in left-camera coordinates; NaN without a depth.
+        guess: of T_world_object, or None.
+    """
+
+    ids: IdArray
+    z: Array
+    local: Array
+    guess: Array | None
+
+    @classmethod
+    def of(cls, o: ObjectObservations, stereo: RectifiedStereo) -> _Measured:
+        z = stereo.measure(Observations(o.points, o.uv_left, o.uv_right))
+        return cls(o.points, z, stereo.triangulate(z), o.T_world_object)
+
+    @property
+    def deep(self) -> BoolArray:
+        """Which have a depth (M,)."""
+        return np.asarray(np.isfinite(self.local).all(axis=1))
+
+    def known(self, window: Window) -> tuple[BoolArray, IndexArray]:
+        """Which of the points the window has (M,), and their rows there."""
+        place = {i: row for row, i in enumerate(window.ids.tolist())}
+        known = np.array([i in place for i in self.ids.tolist()], bool)
+        return known, np.array([place[i] for i in self.ids[known].tolist()], np.intp)
+
+
+def _cameras(frames: IndexArray, path: Path, known: PoseSet) -> CameraWindow:
+    """The camera's poses in these frames; those older than the known ones are taken to move with the oldest of them."""
+    poses = path.poses[frames]
+    J = np.zeros((len(frames), 6, len(known), 6))
+    for i, (frame, X) in enumerate(zip(frames.tolist(), poses)):
+        at = max(0, frame - int(known.frames[0]))
+        J[i, :, at] = np.eye(6) if frame >= known.frames[0] else adjoint(inverse(X) @ known.poses[0])
+    flat = J.reshape(6 * len(frames), -1)
+    return CameraWindow(poses, flat @ known.covariance @ flat.T + _JITTER * np.eye(len(flat)))
+
+
+def _stalest(window: Window, count: int) -> BoolArray:
+    """Which points (p,) leave: `count` at most, not seen in the newest frame, those unseen for longest first."""
+    seen = np.isfinite(window.z[..., 0])
+    age = np.where(seen.any(axis=0), np.argmax(seen[::-1], axis=0), len(window))
+    order = np.argsort(-age, kind="stable")[:count]
+    gone = np.zeros(len(age), bool)
+    gone[order[age[order] > 0]] = True
+    return gone

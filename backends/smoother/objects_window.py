@@ -1,0 +1,278 @@
+"""The recent past of one body: its poses in the last frames and its points, estimated together.
+
+A fixed-lag smoother. All that is in the window is linearised anew in every frame; what leaves it (the oldest frame's
+poses and measurements) is marginalised into a prior on the rest. The points stay, so a body seen for long does not
+drift. The camera's poses in the window are unknowns too, with the joint covariance that the smoother's own graph has
+for them as their prior; where a frame leaves, its camera pose leaves with what the later ones say of it, so that
+nothing is known twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+
+from backends.smoother.objects_factors import FRAME, System, add_measurements, add_motion
+from backends.smoother.records import IndexArray
+from backends.smoother.stereo import RectifiedStereo
+from slam.data import BoolArray, IdArray
+from slam.objects.models import ObjectModels
+from slam.se3 import Array, exp, inverse, log
+
+_EXACT = 1e-12 * np.eye(6)  # [rad², m²]
+_LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
+
+
+@dataclass(frozen=True)
+class CameraWindow:
+    """The camera's poses in the frames of a window.
+
+    Attributes:
+        poses: T_world_left (n, 4, 4).
+        covariance: joint (6 n, 6 n), right perturbations.
+    """
+
+    poses: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a window's unknowns besides its measurements: a quadratic about fixed values.
+
+    Attributes:
+        system: information and vector over all unknowns.
+        T, X, points: where it was linearised: body poses (n, 4, 4), camera poses (n, 4, 4), points (p, 3).
+    """
+
+    system: System
+    T: Array
+    X: Array
+    points: Array
+
+
+@dataclass(frozen=True)
+class Window:
+    """One body in the last n frames.
+
+    Attributes:
+        frames: of the smoother's path (n,), ascending.
+        stamps: their times (n,) [s].
+        T: poses T_world_object (n, 4, 4).
+        scales: factors (n,) on the impulse before each.
+        z: measurements (n, p, 3) of the rectified twin, NaN where there is none.
+        ids: of the points (p,).
+        points: in body coordinates (p, 3).
+        failures: how often running each point's observation was rejected (p,).
+        fresh: whether the first frame is that of the first sight.
+        prior: of what has left.
+        covariance: of all unknowns (12 n + 3 p, 12 n + 3 p) after the last solution, zero for those new since.
+    """
+
+    frames: IndexArray
+    stamps: Array
+    T: Array
+    scales: Array
+    z: Array
+    ids: IdArray
+    points: Array
+    failures: IdArray
+    fresh: bool
+    prior: Prior
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def first_point(self) -> int:
+        """Where the points' unknowns begin."""
+        return FRAME * len(self.frames)
+
+    def point_covariances(self) -> Array:
+        """Covariances (p, 3, 3) of the points."""
+        rows = self.first_point + np.arange(3 * len(self.ids)).reshape(-1, 3)
+        return np.asarray(self.covariance[rows[:, :, None], rows[:, None, :]])
+
+
+def opened(frame: int, stamp: float, T: Array, X: Array, covariance: Array = _EXACT) -> Window:
+    """A window with one frame and no points yet.
+
+    At its first sight the body's frame is put there: its pose has no error, by definition.
+    """
+    system = System.empty(FRAME)
+    system.information[:6, :6] = np.linalg.inv(covariance)
+    none = np.zeros(0, np.int64)
+    points = np.zeros((0, 3))
+    return Window(
+        np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points, none, True,
+        Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
+    )  # fmt: skip
+
+
+def with_frame(window: Window, frame: int, stamp: float, T: Array, X: Array, scale: float) -> Window:
+    """With one more frame, in which nothing has been measured yet."""
+    first, size = window.first_point, FRAME * len(window) + 3 * len(window.ids)
+    old = np.concatenate([np.arange(first), np.arange(first, size) + FRAME])
+    p = window.prior
+    prior = Prior(_spread(p.system, old, size + FRAME), _append(p.T, T), _append(p.X, X), p.points)
+    return replace(
+        window,
+        frames=np.append(window.frames, frame),
+        stamps=np.append(window.stamps, stamp),
+        T=_append(window.T, T),
+        scales=np.append(window.scales, scale),
+        z=_append(window.z, np.full(window.z.shape[1:], np.nan)),
+        prior=prior,
+        covariance=_spread_matrix(window.covariance, old, size + FRAME),
+    )
+
+
+def with_points(window: Window, ids: IdArray, points: Array, information: Array, mean: Array, z: Array) -> Window:
+    """With new points (M, 3), measured z (M, 3) in the newest frame; of each it is known that it belongs to the body.
+
+    That is the Gaussian with mean (3,) and information (3, 3) in body coordinates.
+    """
+    if not len(ids):
+        return window
+    size, count = len(window.prior.system.vector), len(ids)
+    system = _spread(window.prior.system, np.arange(size), size + 3 * count)
+    rows = size + np.arange(3 * count).reshape(-1, 3)
+    system.information[rows[:, :, None], rows[:, None, :]] = information
+    system.vector[rows] = (mean - points) @ information
+    measured = np.full((len(window), count, 3), np.nan)
+    measured[-1] = z
+    prior = replace(window.prior, system=system, points=np.concatenate([window.prior.points, points]))
+    return replace(
+        window,
+        z=np.concatenate([window.z, measured], axis=1),
+        ids=np.concatenate([window.ids, ids]),
+        points=np.concatenate([window.points, points]),
+        failures=np.concatenate([window.failures, np.zeros(count, np.int64)]),
+        prior=prior,
+        covariance=_spread_matrix(window.covariance, np.arange(size), size + 3 * count),
+    )
+
+
+def without_points(window: Window, gone: BoolArray) -> Window:
+    """Without some points (mask (p,)): what has left the window of them is marginalised, the rest is forgotten."""
+    if not gone.any():
+        return window
+    rows = window.first_point + (3 * np.flatnonzero(gone)[:, None] + np.arange(3)).reshape(-1)
+    kept = np.setdiff1d(np.arange(len(window.prior.system.vector)), rows)
+    prior = replace(window.prior, system=window.prior.system.eliminated(rows), points=window.prior.points[~gone])
+    return replace(
+        window,
+        z=window.z[:, ~gone],
+        ids=window.ids[~gone],
+        points=window.points[~gone],
+        failures=window.failures[~gone],
+        prior=prior,
+        covariance=window.covariance[np.ix_(kept, kept)],
+    )
+
+
+class Solver:
+    """Solves windows of one rig.
+
+    Args:
+        stereo: the projection.
+        sigma: pixel noise in the rectified twin [px].
+        models: how bodies move.
+        iterations: most linearisations.
+    """
+
+    def __init__(self, stereo: RectifiedStereo, sigma: float, models: ObjectModels, iterations: int) -> None:
+        self._stereo = stereo
+        self._sigma = sigma
+        self._models = models
+        self._iterations = iterations
+
+    def solved(self, window: Window, camera: CameraWindow) -> Window:
+        """The window at its optimum, with covariances.
+
+        Raises:
+            LinAlgError: the equations are singular, or the solution is not finite.
+        """
+        n = len(window)
+        is_camera, C = _cameras(n), np.linalg.inv(camera.covariance)
+        c, now = np.zeros(6 * n), window
+        for _ in range(self._iterations):
+            system = self._system(now, camera.poses @ exp(c.reshape(n, 6)), n, range(n - 1))
+            system.information[np.ix_(is_camera, is_camera)] += C
+            system.vector[is_camera] -= C @ c
+            L, failed = dpotrf(system.information.T, lower=1)  # symmetric, and transposed in the order LAPACK wants
+            if failed:
+                raise np.linalg.LinAlgError("the window's equations are singular")
+            step = dpotrs(L, system.vector, lower=1)[0]
+            frames = step[: FRAME * n].reshape(n, 2, 6)
+            c = c + frames[:, 1].reshape(-1)
+            now = replace(now, T=now.T @ exp(frames[:, 0]), points=now.points + step[FRAME * n :].reshape(-1, 3))
+            if np.abs(frames[:, 0, :3]).max() < _LINEAR:
+                break
+        lower = dpotri(L, lower=1)[0]
+        covariance = np.tril(lower) + np.tril(lower, -1).T
+        if not (np.isfinite(now.T).all() and (covariance.diagonal() > 0).all()):
+            raise np.linalg.LinAlgError("the window has no usable solution")
+        return replace(now, covariance=covariance)
+
+    def without_oldest(self, window: Window, camera: CameraWindow, count: int) -> Window:
+        """Without the `count` oldest frames, which are marginalised; the window must be solved."""
+        n = len(window)
+        is_camera = _cameras(n)
+        system = self._system(window, camera.poses, count, range(min(count + 1, n - 1)))
+        system.information[np.ix_(is_camera, is_camera)] += np.linalg.inv(camera.covariance)
+        later = is_camera[6 * count :]
+        system.information[np.ix_(later, later)] -= np.linalg.inv(camera.covariance[6 * count :, 6 * count :])
+        gone = np.arange(FRAME * count)
+        prior = Prior(system.eliminated(gone), window.T[count:], camera.poses[count:], window.points)
+        return replace(
+            window,
+            frames=window.frames[count:],
+            stamps=window.stamps[count:],
+            T=window.T[count:],
+            scales=window.scales[count:],
+            z=window.z[count:],
+            fresh=False,
+            prior=prior,
+            covariance=window.covariance[len(gone) :, len(gone) :],
+        )
+
+    def _system(self, window: Window, X: Array, measured: int, steps: range) -> System:
+        """All factors, but for the cameras' own prior, linearised at the window's poses and points and cameras X.
+
+        Of the measurements only those of the first frames are taken, `measured` in number, and of the steps of motion
+        only `steps`.
+        """
+        p, n = window.prior, len(window)
+        moved = log(inverse(np.concatenate([p.T, p.X])) @ np.concatenate([window.T, X]))
+        delta = np.concatenate([moved.reshape(2, n, 6).swapaxes(0, 1).reshape(-1), (window.points - p.points).ravel()])
+        system = System(p.system.information.copy(), p.system.vector - p.system.information @ delta)
+        Y = inverse(X[:measured]) @ window.T[:measured]
+        add_measurements(system, self._stereo, self._sigma, window.z[:measured], Y, window.points, window.first_point)
+        add_motion(system, self._models, window.T, window.stamps, window.scales, window.fresh, steps)
+        return system
+
+
+def _cameras(n: int) -> IndexArray:
+    """Unknowns of the cameras."""
+    return (FRAME * np.arange(n)[:, None] + 6 + np.arange(6)).reshape(-1)
+
+
+def _spread(system: System, places: IndexArray, size: int) -> System:
+    """The same system over more unknowns, with the old ones at `places`."""
+    out = System(_spread_matrix(system.information, places, size), np.zeros(size))
+    out.vector[places] = system.vector
+    return out
+
+
+def _spread_matrix(matrix: Array, places: IndexArray, size: int) -> Array:
+    out = np.zeros((size, size))
+    out[np.ix_(places, places)] = matrix
+    return out
+
+
+def _append(array: Array, row: Array) -> Array:
+    return np.concatenate([array, row[None]])

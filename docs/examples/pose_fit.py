@@ -1,0 +1,59 @@
+"""The least that makes a back end: landmarks stay where they were first seen, each pose is fitted to them alone."""
+
+import numpy as np
+
+from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
+from slam.errors import MeasurementError
+from slam.models import EstimatorModels
+from slam.pose_solver import find_consensus, measurement_rows
+from slam.se3 import inverse, transform
+from slam.trajectory import Trajectory
+
+
+class PoseFit:
+    def __init__(self, rig, models=None):
+        self.rig, self.models = rig, models or EstimatorModels()
+        self.T, self.P = np.eye(4), 1e-4 * np.eye(6)  # T_world_left and its covariance: guessed, not estimated
+        self.points, self.stamps, self.poses = {}, [], []
+
+    def predict(self, stamp):
+        if self.stamps and not stamp > self.stamps[-1]:
+            raise MeasurementError(f"time {stamp} is not later than {self.stamps[-1]}")
+        self.stamps.append(stamp)
+        self.poses.append(self.T)  # the camera stays where it is: no model of motion
+        ids = np.array(sorted(self.points), np.int64)
+        local = transform(inverse(self.T), self.positions(ids))
+        view = self.rig.left.in_view(local)
+        left, right = self.rig.project(local[view])
+        innovation = np.tile(100.0 * np.eye(2), (int(view.sum()), 1, 1))  # landmarks may lie 10 px off
+        return Prediction(stamp, self.T, self.P, ids[view], left, right, innovation)
+
+    def update(self, observations, guess=None):
+        seen, sigma = observations, self.models.pixel_sigma
+        if len(seen) < 3:
+            return UpdateReport.nothing(UpdateStatus.EMPTY, "fewer than 3 landmarks", seen.ids[:0])
+        measured = measurement_rows(seen.uv_left, seen.uv_right)
+        start = self.T if guess is None else guess
+        found = find_consensus(self.rig, self.positions(seen.ids), measured, start, 4 * sigma, 64, seed=0)
+        self.T = self.poses[-1] = found.T_world_left
+        used, rejected = seen.ids[found.inliers], seen.ids[~found.inliers]
+        return UpdateReport(UpdateStatus.OK, "", used, rejected, float("nan"), 0)
+
+    def add(self, observations):
+        local = self.rig.triangulate(observations.uv_left, observations.uv_right)
+        self.points.update(zip(observations.ids.tolist(), transform(self.T, local)))
+
+    def remove(self, ids):
+        for i in np.asarray(ids).tolist():
+            del self.points[i]
+
+    def positions(self, ids):
+        return np.array([self.points[int(i)] for i in ids]).reshape(-1, 3)
+
+    def estimate(self, landmarks=True):
+        ids = np.array(sorted(self.points) if landmarks else [], np.int64)
+        spread = np.tile(0.01 * np.eye(3), (len(ids), 1, 1))
+        return Estimate(self.stamps[-1], self.T, self.P, ids, self.positions(ids), spread)
+
+    def trajectory(self):
+        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))

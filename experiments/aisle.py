@@ -1,0 +1,167 @@
+"""The bookshelf aisle of paper A, section V, rendered, with both back ends: its figures, and the errors.
+
+    python experiments/aisle.py [--quick] [--world synthetic:aisle] [--out DIR]
+
+Leaves for each back end the files of a run, and the pictures ``map_3d.png`` (paper A, Fig. 5), ``top_view.png`` (paper
+A, Fig. 6: red ellipses for landmarks measured in the last frame, green ones for the others), ``errors.png`` and
+``map.png`` (D_threshold, landmarks measured and map size over time). Prints a Markdown table. The paper's marks: mean
+pose deviation below 1.5 cm, peak 3 cm, 318 landmarks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frontends import create
+from slam.association_truth import AssociationScore, SurfacePoints
+from slam.config import SystemConfig
+from slam.data import FrameResult, StereoFeatures, StereoFrame
+from slam.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.interfaces import Frontend
+from slam.runner import RunOptions, run
+from slam.sequences import Sequence, open_sequence
+from slam.trajectory import Trajectory
+
+BACKENDS = ("ekf", "smoother")
+HEADER = (
+    "back end", "tracked", "mean error [cm]", "peak [cm]", "end [cm]", "final mean [cm]", "final peak [cm]",
+    "landmarks", "doubled", "right associations [%]", "NIS/dof",
+)  # fmt: skip
+
+
+class Remembered:
+    """A front end that does its work once for each frame and remembers.
+
+    Args:
+        frontend: does the work.
+    """
+
+    def __init__(self, frontend: Frontend) -> None:
+        self._frontend = frontend
+        self._features: dict[int, StereoFeatures] = {}
+
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        """See `slam.interfaces.Frontend`."""
+        if frame.index not in self._features:
+            self._features[frame.index] = self._frontend.extract(frame)
+        return self._features[frame.index]
+
+
+class Judge:
+    """Counts right associations frame by frame, and keeps the last descriptors for the search for doubles.
+
+    Args:
+        sequence: a rendered world.
+    """
+
+    def __init__(self, sequence: Any) -> None:
+        self._points = SurfacePoints(sequence)
+        self._looks: dict[int, np.ndarray] = {}
+        self.score = AssociationScore(0, 0)
+
+    def frame(self, result: FrameResult) -> None:
+        """Take in one frame."""
+        uv = result.features.uv_left
+        error = self._points.errors(result.index, result.matched, uv[result.matched_features])
+        right = int((error < 3).sum())
+        self.score = AssociationScore(self.score.right + right, self.score.wrong + len(error) - right)
+        self._points.add(result.index, result.added, uv[result.added_features])
+        looks = result.features.descriptors
+        self._looks.update(zip(result.added.tolist(), looks[result.added_features]))
+
+    def doubled(self, folder: Path, distance: float = 0.02, descriptor: float = 0.4) -> int:
+        """Pairs of landmarks nearer than `distance` [m] that looked alike at first sight."""
+        from scipy.spatial import cKDTree
+
+        with (folder / "landmarks.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        positions = np.array([[float(r[c]) for c in "xyz"] for r in rows]).reshape(-1, 3)
+        looks = np.array([self._looks[int(r["id"])] for r in rows])
+        pairs = cKDTree(positions).query_pairs(distance, output_type="ndarray")
+        return int((np.linalg.norm(looks[pairs[:, 0]] - looks[pairs[:, 1]], axis=1) < descriptor).sum())
+
+
+def position_errors(path: Trajectory, truth: Trajectory) -> np.ndarray:
+    """Distances (F,) [cm] from the truth, in the frame of the first pose; nothing is aligned."""
+    poses = np.linalg.inv(truth.poses[0]) @ truth.poses[: len(path.poses)]
+    return np.asarray(100 * np.linalg.norm(path.positions - poses[:, :3, 3], axis=1))
+
+
+def _mean_and_peak(errors: np.ndarray) -> tuple[float, float]:
+    return float(errors.mean()), float(errors.max())
+
+
+def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemConfig, out: Path) -> list[Any]:
+    """Run one back end; its row of the table."""
+    judge = Judge(sequence)
+    summary = run(sequence, RunOptions(backend, "surf", config, out / backend), judge.frame, frontend)
+    data = RunData.read(out / backend, backend)
+    assert sequence.ground_truth is not None
+    online = position_errors(data.online, sequence.ground_truth)
+    final = position_errors(data.final, sequence.ground_truth)
+    tracked = summary["status"].get("tracked", 0) + summary["status"].get("started", 0)
+    return [
+        backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), float(online[-1]),
+        *_mean_and_peak(final), summary["landmarks"], judge.doubled(out / backend), 100 * judge.score.precision,
+        summary["consistency"]["NIS per degree of freedom"],
+    ]  # fmt: skip
+
+
+def draw_map_over_time(folders: list[Path], path: Path) -> None:
+    """D_threshold, landmarks measured, and map size over time, a line for each run."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(3, 1, figsize=(9, 5.5), sharex=True, layout="constrained")
+    for folder in folders:
+        with (folder / "frames.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        t = np.array([float(r["stamp"]) for r in rows])
+        for axis, column in zip(axes, ("D_threshold", "used", "map_size")):
+            axis.plot(t - t[0], [float(r[column] or "nan") for r in rows], lw=1, label=folder.name)
+    for axis, label in zip(axes, ("D_threshold", "landmarks measured", "map size")):
+        axis.set_ylabel(label)
+    axes[0].set_yscale("log")
+    axes[1].legend(frameon=False, fontsize=8)
+    axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def main() -> int:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="30 frames")
+    parser.add_argument("--world", default="synthetic:aisle", help="a rendered world")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
+    parser.add_argument("--out", type=Path, default=Path("results/aisle"))
+    arguments = parser.parse_args()
+    world = (
+        arguments.world + ("&" if "?" in arguments.world else "?") + "frames=30" if arguments.quick else arguments.world
+    )
+    sequence = open_sequence(world)
+    config = SystemConfig.for_kind(sequence.kind).with_settings(arguments.set)
+    frontend = Remembered(create("surf", sequence.rig, **config.frontend))
+    rows = [row(sequence, backend, frontend, config, arguments.out) for backend in BACKENDS]
+    runs = [RunData.read(arguments.out / backend, backend) for backend in BACKENDS]
+    draw_map_3d(runs, arguments.out / "map_3d.png")
+    draw_top_view(runs, sequence.ground_truth, arguments.out / "top_view.png")
+    draw_errors(runs, sequence.ground_truth, arguments.out / "errors.png")
+    draw_map_over_time([arguments.out / backend for backend in BACKENDS], arguments.out / "map.png")
+    print("| " + " | ".join(HEADER) + " |\n| --- | --- |" + " ---: |" * (len(HEADER) - 2))
+    for values in rows:
+        print("| " + " | ".join(f"{x:.2f}" if isinstance(x, float) else str(x) for x in values) + " |")
+    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,363 @@
+"""Do the back ends say how sure they are? Monte Carlo over worlds with true association, against the bound.
+
+    python experiments/consistency.py [--quick] [--seeds N] [--frames N] [--out DIR]
+
+Every run simulates a world's observations, gives the same to every back end (`slam.replay`), and starts it at a pose
+drawn from the prior about the true one. Reported, over the runs:
+
+- RMSE of the poses against the posterior Cramér-Rao bound, online (newest pose) and final (whole path);
+- average NEES of the online pose, with its 95 % chi-square band, and the frame at which it leaves the band for good;
+- NIS of the updates, of predicted left pixels (against what was measured there, before any gate), and of landmarks;
+- what 10 % wrong matches cost.
+
+The paths of `desk` and `aisle` are what they are: smoother than the motion model expects. In `drawn` the path on the
+desk is drawn from the motion model itself, so that predictions, too, can be held to their covariances.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import backends
+from experiments.cramer_rao import pose_bounds
+from slam import se3
+from slam.data import Observations
+from slam.metrics import chi_square_band, nees, pose_residuals
+from slam.models import EstimatorModels, MotionModel, models_for
+from slam.replay import Recording
+from slam.se3 import Array
+from slam.worlds import open_world
+from slam.worlds.recording import true_recording, with_mismatches
+from slam.worlds.sequence import WorldSequence
+
+CASES = ("desk", "aisle", "drawn")
+BACKENDS = ("ekf", "smoother")
+DRAWN = MotionModel(acceleration=0.15, angular_acceleration=0.15)
+WRONG = 0.1  # share of wrong matches
+_BOUNDS = 4  # frames at which the online bound is computed
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one back end made of one recording of F frames.
+
+    Attributes:
+        online: errors of the newest pose (F, 6), [rotation, translation].
+        final: errors of the whole path at the end (F, 6).
+        nees: of the newest pose (F,).
+        nis, dof: of the updates (F,), 0 where there was none.
+        pixel: squared distance of one landmark's left pixel from its prediction (F,), two degrees of freedom.
+        landmark: mean NEES of the landmarks at the end, three degrees of freedom.
+        rejected: share of the observations that were rejected.
+    """
+
+    online: Array
+    final: Array
+    nees: Array
+    nis: Array
+    dof: Array
+    pixel: Array
+    landmark: float
+    rejected: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One seed of a case: the runs by back end, without and with wrong matches, and the bounds.
+
+    Attributes:
+        runs, spoilt: by the back end's name.
+        checked: frames (B,) of the online bound.
+        online_bound: least covariances (B, 6, 6) of the newest pose.
+        final_bound: least covariances (F, 6, 6) of the whole path.
+    """
+
+    runs: dict[str, Run]
+    spoilt: dict[str, Run]
+    checked: np.ndarray
+    online_bound: Array
+    final_bound: Array
+
+
+def simulated(case: str, seed: int, frames: int) -> tuple[Recording, WorldSequence]:
+    """A recording of a case, in the world's own coordinates, and the world."""
+    world = "desk" if case == "drawn" else case
+    sequence = open_world(f"{world}?frames={frames}&seed={seed}&outliers=0")
+    models = replace(models_for(sequence.kind), pixel_sigma=sequence.values["sigma"])
+    rng = np.random.default_rng([seed, 77])
+    if case == "drawn":
+        models = replace(models, motion=DRAWN, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.1)
+        path = drawn_path(sequence.world.T_world_left[0], sequence.world.stamps, models, rng)
+        sequence = WorldSequence(sequence.name, replace(sequence.world, T_world_left=path, seen={}), sequence.values)
+    sigma = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
+    start = sequence.ground_truth.poses[0] @ se3.exp(sigma * rng.standard_normal(6))
+    return true_recording(sequence, models=replace(models, T_world_left=start)), sequence
+
+
+def drawn_path(T: Array, stamps: Array, models: EstimatorModels, rng: np.random.Generator) -> Array:
+    """Poses (F, 4, 4) from T on whose velocities walk randomly as the models say."""
+    v = models.initial_velocity_sigma * rng.standard_normal(3)
+    w = models.initial_angular_velocity_sigma * rng.standard_normal(3)
+    poses = [T]
+    for dt in np.diff(stamps):
+        sigma_v, sigma_w = np.sqrt(models.motion.velocity_variance(dt))
+        v, w = v + sigma_v * rng.standard_normal(3), w + sigma_w * rng.standard_normal(3)
+        T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
+        poses.append(T)
+    return np.array(poses)
+
+
+def run(recording: Recording, points: Array, name: str, seed: int) -> Run:
+    """One back end on one recording; `points` (N, 3) are the true landmarks."""
+    backend = backends.create(name, recording.rig, models=recording.models)
+    rng, truth = np.random.default_rng([seed, 78]), recording.ground_truth
+    assert truth is not None
+    poses, covariances, nis, dof, pixel = [], [], [], [], []
+    rejected = given = 0
+    for frame in recording:
+        prediction = backend.predict(frame.stamp)
+        pixel.append(_pixel_distance(prediction, frame.observed, rng))
+        report = backend.update(frame.observed)
+        backend.add(frame.added)
+        estimate = backend.estimate(landmarks=False)
+        poses.append(estimate.T_world_left)
+        covariances.append(estimate.covariance)
+        nis.append(report.nis if report.dof else 0.0)
+        dof.append(report.dof)
+        rejected, given = rejected + len(report.rejected), given + len(frame.observed)
+    online = pose_residuals(np.array(poses), truth.poses)
+    last = backend.estimate()
+    landmark = nees(last.positions - points[last.ids], last.covariances).mean()
+    return Run(
+        online, pose_residuals(backend.trajectory().poses, truth.poses), nees(online, np.array(covariances)),
+        np.array(nis), np.array(dof), np.array(pixel), float(landmark), rejected / max(1, given),
+    )  # fmt: skip
+
+
+def _pixel_distance(prediction, seen: Observations, rng: np.random.Generator) -> float:
+    """Squared distance of one landmark's left pixel from its prediction, NaN where none was in view."""
+    _, ours, theirs = np.intersect1d(prediction.ids, seen.ids, return_indices=True)
+    if not len(ours):
+        return np.nan
+    k = rng.integers(len(ours))
+    nu = seen.uv_left[theirs[k]] - prediction.uv_left[ours[k]]
+    return float(nu @ np.linalg.solve(prediction.innovation[ours[k]], nu))
+
+
+def trial(case: str, seed: int, frames: int, wrong: bool) -> Trial:
+    """All of one seed."""
+    recording, sequence = simulated(case, seed, frames)
+    points = sequence.landmarks.positions
+    runs = {name: run(recording, points, name, seed) for name in BACKENDS}
+    spoilt = with_mismatches(recording, WRONG, seed) if wrong else None
+    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name, seed) for name in BACKENDS}
+    seen = [_all_seen(f.observed, f.added) for f in recording]
+    truth = sequence.ground_truth
+
+    def bounds(count: int) -> Array:
+        return pose_bounds(recording.rig, recording.models, truth.stamps, truth.poses, points, seen[:count])
+
+    checked = np.unique(np.linspace(min(5, frames - 1), frames - 1, _BOUNDS).astype(int))
+    final = bounds(frames)
+    online = np.array([bounds(k + 1)[-1] for k in checked[:-1].tolist()] + [final[-1]])
+    return Trial(runs, runs_spoilt, checked, online, final)
+
+
+def _all_seen(observed: Observations, added: Observations) -> Observations:
+    parts = [np.concatenate([getattr(o, name) for o in (observed, added)]) for name in ("ids", "uv_left", "uv_right")]
+    return Observations(*parts)
+
+
+def trials(case: str, seeds: int, frames: int, wrong: int) -> list[Trial]:
+    """All seeds of a case, two at a time; the first `wrong` of them with wrong matches, too."""
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        jobs = [pool.submit(trial, case, seed, frames, seed < wrong) for seed in range(seeds)]
+        return [job.result() for job in jobs]
+
+
+# --- what the trials say ---
+
+
+def rms(errors: Array) -> float:
+    return float(np.sqrt((errors**2).sum(axis=-1).mean()))
+
+
+def against_the_bound(done: Sequence[Trial], name: str, part: slice) -> tuple[float, float, float, float]:
+    """RMSE and bound, online and final, of the rotation or the translation."""
+    online = rms(np.array([t.runs[name].online[t.checked, part] for t in done]))
+    final = rms(np.array([t.runs[name].final[:, part] for t in done]))
+    bounds = [
+        np.sqrt(np.mean([np.trace(b[:, part, part], axis1=1, axis2=2).mean() for b in each]))
+        for each in ([t.online_bound for t in done], [t.final_bound for t in done])
+    ]
+    return online, float(bounds[0]), final, float(bounds[1])
+
+
+def leaves(mean: Array, high: float, patience: int = 5) -> int | None:
+    """First frame from which the mean NEES lies above the band for so many frames; None if it never does."""
+    above = mean > high
+    for k in range(len(mean) - patience + 1):
+        if above[k : k + patience].all():
+            return k
+    return None
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(header) + " |", "| --- | --- |" + " ---: |" * (len(header) - 2)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def accuracy_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
+    for name in BACKENDS:
+        cells = [case, name]
+        for part, scale in ((slice(3, 6), 1e3), (slice(0, 3), np.rad2deg(1))):
+            online, online_bound, final, final_bound = against_the_bound(done, name, part)
+            cells += [f"{scale * online:.2f}", f"{online / online_bound:.2f}"]
+            cells += [f"{scale * final:.2f}", f"{final / final_bound:.2f}"]
+        yield cells
+
+
+def consistency_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
+    """Each mean beside its band; the mean over a run has the band of one frame, as its frames hang together."""
+    n = len(done)
+    low, high = chi_square_band(6, n)
+    for name in BACKENDS:
+        runs = [t.runs[name] for t in done]
+        mean = np.mean([r.nees for r in runs], axis=0)
+        inside = 100 * np.mean((mean > low) & (mean < high))
+        left = leaves(mean, high)
+        nis, dof = sum(r.nis.sum() for r in runs), sum(r.dof.sum() for r in runs)
+        nis_low, nis_high = chi_square_band(1, int(dof))
+        pixels = np.concatenate([r.pixel for r in runs])
+        pixels = pixels[np.isfinite(pixels)]
+        pixel_low, pixel_high = chi_square_band(2, len(pixels))
+        mark_low, mark_high = chi_square_band(3, n)
+        yield [
+            case, name, f"{mean.mean():.2f} ({low:.2f}–{high:.2f})", f"{inside:.0f} %",
+            "never" if left is None else str(left), f"{nis / dof:.3f} ({nis_low:.3f}–{nis_high:.3f})",
+            f"{pixels.mean():.2f} ({pixel_low:.2f}–{pixel_high:.2f})",
+            f"{np.mean([r.landmark for r in runs]):.2f} ({mark_low:.2f}–{mark_high:.2f})",
+        ]  # fmt: skip
+
+
+def wrong_match_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
+    done = [t for t in done if t.spoilt]
+    for name in BACKENDS if done else ():
+        clean, spoilt = (
+            [rms(np.array([getattr(r[name], path)[:, 3:] for r in runs])) for path in ("online", "final")]
+            for runs in ([t.runs for t in done], [t.spoilt for t in done])
+        )
+        rejected = 100 * np.mean([t.spoilt[name].rejected for t in done])
+        yield [
+            case, name, f"{1e3 * clean[0]:.2f}", f"{1e3 * spoilt[0]:.2f}", f"{spoilt[0] / clean[0]:.2f}",
+            f"{1e3 * clean[1]:.2f}", f"{1e3 * spoilt[1]:.2f}", f"{spoilt[1] / clean[1]:.2f}", f"{rejected:.1f} %",
+        ]  # fmt: skip
+
+
+ACCURACY = (
+    "world", "back end", "online [mm]", "/ bound", "final [mm]", "/ bound", "online [deg]", "/ bound", "final [deg]",
+    "/ bound",
+)  # fmt: skip
+CONSISTENCY = (
+    "world",
+    "back end",
+    "NEES (95 %)",
+    "frames inside",
+    "leaves at",
+    "NIS/dof",
+    "pixel NIS",
+    "landmark NEES",
+)
+WRONG_MATCHES = (
+    "world", "back end", "online [mm]", "with 10 % wrong", "ratio", "final [mm]", "with 10 % wrong", "ratio",
+    "rejected",
+)  # fmt: skip
+
+
+def report(results: dict[str, list[Trial]]) -> str:
+    """The three tables."""
+    tables = ((ACCURACY, accuracy_rows), (CONSISTENCY, consistency_rows), (WRONG_MATCHES, wrong_match_rows))
+    return "\n\n".join(
+        table(header, [row for case, done in results.items() for row in rows(case, done)]) for header, rows in tables
+    )
+
+
+def write_csv(path: Path, results: dict[str, list[Trial]]) -> None:
+    """A row per case, back end and frame: means over the runs."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["world", "back_end", "frame", "rmse_m", "rmse_rad", "nees", "nis", "dof", "pixel_nis"])
+        for case, done in results.items():
+            for name in BACKENDS:
+                runs = [t.runs[name] for t in done]
+                for k in range(len(runs[0].nees)):
+                    errors = np.array([r.online[k] for r in runs])
+                    means = [np.mean([getattr(r, what)[k] for r in runs]) for what in ("nees", "nis", "dof", "pixel")]
+                    writer.writerow([case, name, k, rms(errors[:, 3:]), rms(errors[:, :3]), *means])
+
+
+def draw(path: Path, results: dict[str, list[Trial]]) -> None:
+    """Error against the bound, and average NEES against its band, frame by frame."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, len(results), figsize=(4.2 * len(results), 6), sharex="col", squeeze=False)
+    for (case, done), (top, bottom) in zip(results.items(), axes.T):
+        for name in BACKENDS:
+            errors = np.array([t.runs[name].online[:, 3:] for t in done])
+            top.plot(1e3 * np.sqrt((errors**2).sum(axis=2).mean(axis=0)), label=name)
+            bottom.plot(np.mean([t.runs[name].nees for t in done], axis=0), label=name)
+        bound = np.mean([np.trace(t.online_bound[:, 3:, 3:], axis1=1, axis2=2) for t in done], axis=0)
+        top.plot(done[0].checked, 1e3 * np.sqrt(bound), "k.--", label="bound")
+        bottom.axhspan(*chi_square_band(6, len(done)), color="0.85", label="95 % band")
+        top.set(title=case, ylim=(0, None))
+        bottom.set(xlabel="frame", ylim=(0, None))
+    axes[0, 0].set_ylabel("RMSE of the newest position [mm]")
+    axes[1, 0].set_ylabel("average NEES of the newest pose")
+    axes[0, 0].legend()
+    axes[1, 0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two seeds of fifteen frames")
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--wrong", type=int, default=6, help="seeds that are run with wrong matches as well")
+    parser.add_argument("--frames", type=int, default=120)
+    parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)
+    parser.add_argument("--out", type=Path, default=Path("results/consistency"))
+    arguments = parser.parse_args()
+    seeds, frames, wrong = arguments.seeds, arguments.frames, arguments.wrong
+    if arguments.quick:
+        seeds, frames, wrong = 2, 15, 1
+    results = {}
+    for case in arguments.cases:
+        results[case] = trials(case, seeds, frames, wrong)
+        print(f"{case} done:\n{report({case: results[case]})}", file=sys.stderr, flush=True)
+    text = f"{seeds} runs of {frames} frames; wrong matches in {min(wrong, seeds)} of them\n\n" + report(results)
+    print(text)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "tables.md").write_text(text + "\n")
+    write_csv(arguments.out / "consistency.csv", results)
+    draw(arguments.out / "consistency.png", results)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

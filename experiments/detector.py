@@ -1,0 +1,104 @@
+"""D_threshold, octaves and radius of the features (paper A, III.A).
+
+    python experiments/detector.py [--quick] [--out DIR]
+
+Paper A, on one 320x240 webcam image: 837 features at D_threshold 0, 41 at 10000; the number and the time fall as the
+threshold rises; radii grow with the octave and numbers fall, so that octaves 3 and 4 are left out. Here: the median
+over frames of the rendered aisle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.surf import medians
+from frontends.surf import Surf
+from slam.sequences import open_sequence
+
+THRESHOLDS = (0, 10, 100, 300, 1000, 3000, 10_000)
+PAPER = {0: "837", 10_000: "41"}
+OCTAVES = 4
+
+
+def images(count: int) -> list[np.ndarray]:
+    """Images along the whole aisle."""
+    sequence = open_sequence("synthetic:aisle?speed=6")
+    return [sequence.frame(int(k)).left for k in np.linspace(0, len(sequence) - 1, count)]
+
+
+def counts(pictures: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Median number of features (T, octaves), and the radii [px] of all at threshold 100 by octave."""
+    radii: list[list[np.ndarray]] = [[] for _ in range(OCTAVES)]
+    table = np.zeros((len(THRESHOLDS), len(pictures), OCTAVES))
+    for i, limit in enumerate(THRESHOLDS):
+        for j, image in enumerate(pictures):
+            found = Surf(limit, OCTAVES).detect(image)
+            table[i, j] = np.bincount(found.octave, minlength=OCTAVES)
+            if limit == 100:
+                for octave in range(OCTAVES):
+                    radii[octave].append(0.5 * found.size[found.octave == octave])
+    return np.median(table, axis=1), [np.concatenate(r) for r in radii]
+
+
+def times(image: np.ndarray, rounds: int) -> np.ndarray:
+    """CPU time of detection [ms] (T, 2) with one and with two octaves."""
+    tasks = {f"{limit} {n}": partial(Surf(limit, n).detect, image) for limit in THRESHOLDS for n in (1, 2)}
+    found = medians(tasks, rounds)
+    return np.array([[found[f"{limit} {n}"] for n in (1, 2)] for limit in THRESHOLDS])
+
+
+def draw(table: np.ndarray, ms: np.ndarray, radii: list[np.ndarray], path: Path) -> None:
+    """Features and time over the threshold, and radii by octave."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((11, 3.2), layout="constrained")
+    a, b, c = figure.subplots(1, 3)
+    x = np.maximum(THRESHOLDS, 1)
+    names = [f"octave {i + 1}" for i in range(OCTAVES)]
+    a.stackplot(x, *table.T, labels=names)
+    a.plot([1, 10_000], [837, 41], "k*", label="paper A, its own image")
+    a.set(xscale="log", xlabel="D_threshold", ylabel="features")
+    b.plot(x, ms[:, 0], "o-", x, ms[:, 1], "s-")
+    b.set(xscale="log", xlabel="D_threshold", ylabel="CPU time of detection [ms]", ylim=(0, None))
+    b.legend(["one octave", "two octaves"])
+    c.hist(radii, bins=np.arange(3, 80, 2), stacked=True, label=names)
+    c.set(xlabel="radius [px]", ylabel="features")
+    a.legend(fontsize=8)
+    c.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three images, few repetitions")
+    parser.add_argument("--out", type=Path, default=Path("results/detector"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    pictures = images(3 if arguments.quick else 25)
+    table, radii = counts(pictures)
+    ms = times(pictures[len(pictures) // 2], 3 if arguments.quick else 41)
+    head = ["D_threshold", *(f"octave {i + 1}" for i in range(OCTAVES)), "octaves 1 and 2", "paper A"]
+    lines = ["| " + " | ".join([*head, "ms, 1 octave", "ms, 2 octaves"]) + " |", "|" + " ---: |" * (len(head) + 2)]
+    for limit, row, time in zip(THRESHOLDS, table, ms):
+        cells = [str(limit), *(f"{n:.0f}" for n in row), f"{row[:2].sum():.0f}", PAPER.get(limit, "")]
+        lines.append("| " + " | ".join([*cells, *(f"{t:.2f}" for t in time)]) + " |")
+    shares = table[THRESHOLDS.index(100)] / max(table[THRESHOLDS.index(100)].sum(), 1)
+    sizes = ", ".join(f"{np.median(r):.1f} px" for r in radii if len(r))
+    first = f"At D_threshold 100, {100 * shares[:2].sum():.0f} % of all features are in the first two octaves"
+    lines += ["", f"{first}; median radius by octave: {sizes}."]
+    text = "\n".join(lines)
+    print(text)
+    (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
+    draw(table, ms, radii, arguments.out / "detector.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""What faults do to a run: blackout, dropped frames, dropped right images, and a camera that is carried off.
+
+    python experiments/faults.py [--quick] [--out DIR]
+
+Each fault on the rendered world ``desk``, both back ends. Prints a Markdown table: the sequence of states, the position
+error before and after the fault, how long it took to recognise the map again, and the share of right associations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frontends import create
+from slam.association_truth import SurfacePoints
+from slam.config import SystemConfig
+from slam.data import FrameResult, StereoFeatures, StereoFrame
+from slam.se3 import inverse
+from slam.sequences import open_sequence
+from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "smoother")
+HEADER = (
+    "fault", "back end", "states", "error before [cm]", "mean after [cm]", "peak after [cm]", "end [cm]",
+    "frames until recognised", "right associations [%]", "added while lost",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One recording of the desk.
+
+    Attributes:
+        name: for the table.
+        options: of the world.
+        jump: the camera is carried from one frame to another: (last before, first after); None for not.
+        last_good: the last frame before the fault.
+        over: the first frame after it.
+    """
+
+    name: str
+    options: str
+    last_good: int
+    over: int
+    jump: tuple[int, int] | None = None
+
+
+def faults(quick: bool) -> list[Fault]:
+    """The recordings; frame numbers are in the recording, after any are dropped."""
+    n = 40 if quick else 120
+    rng = np.random.default_rng(0)  # frame 0 keeps its right image: without it there is no map that could be kept
+    chosen = ",".join(str(k) for k in range(1, 2 * n) if rng.random() < 0.3)
+    return [
+        Fault("none", f"frames={2 * n}", n, n + 1),
+        Fault("2 s of blackout", f"frames={2 * n + 60}&black={n}:{n + 60}", n - 1, n + 60),
+        Fault("30 % of frames dropped", f"frames={2 * n}&drop=0.3", n // 2, n // 2 + 1),
+        Fault("30 % of right images dropped", f"frames={2 * n}&dropright={chosen}", n, n + 1),
+        Fault("carried off to a known place", "frames=900", n - 1, n, (n, 20 if quick else 30)),
+        Fault("carried off to an unknown place", "frames=900", n - 1, n, (n, 450)),
+    ]
+
+
+def frames(fault: Fault, count: int) -> Iterator[tuple[int, StereoFrame]]:
+    """Numbers in the world's recording, and frames with times that go on evenly."""
+    sequence = open_sequence(f"synthetic:desk?{fault.options}")
+    if fault.jump is None:
+        yield from enumerate(sequence)
+        return
+    last, first = fault.jump
+    order = [*range(last), *range(first, first + count - last)]
+    stamps = sequence.stamps
+    for step, k in enumerate(order):
+        yield k, replace(next(iter(sequence.frames(k, k + 1))), index=step, stamp=float(stamps[step]))
+
+
+def extract(fault: Fault, count: int) -> list[tuple[int, StereoFeatures]]:
+    """Features of a recording, for both back ends."""
+    sequence = open_sequence(f"synthetic:desk?{fault.options}")
+    frontend = create("surf", sequence.rig, **SystemConfig.for_kind("handheld").frontend)
+    return [(k, frontend.extract(frame)) for k, frame in frames(fault, count)]
+
+
+def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) -> list[Any]:
+    """One row of the table."""
+    sequence = open_sequence(f"synthetic:desk?{fault.options}")
+    system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
+    truth = sequence.ground_truth.poses
+    world = np.linalg.inv(truth[features[0][0]])
+    points, results, errors, right, total, strays = SurfacePoints(sequence), [], [], 0, 0, 0
+    for k, seen in features:
+        result = system.process_features(seen)
+        off = points.errors(k, result.matched, seen.uv_left[result.matched_features])
+        right, total = right + int((off < 3).sum()), total + len(off)
+        points.add(k, result.added, seen.uv_left[result.added_features])
+        strays += len(result.added) if result.status.value == "lost" else 0
+        if result.status.value == "started":  # errors count from where the map begins
+            world = result.estimate.T_world_left @ np.linalg.inv(truth[k])
+        errors.append(100 * float(np.linalg.norm((inverse(world @ truth[k]) @ result.estimate.T_world_left)[:3, 3])))
+        results.append(result)
+    found = [i for i in range(fault.over, len(results)) if results[i].status.value == "tracked"]
+    after = errors[found[0] :] if found else [float("nan")]
+    return [
+        fault.name, backend, states(results), errors[fault.last_good], float(np.mean(after)), max(after), errors[-1],
+        found[0] - fault.over if found else None, 100 * right / max(total, 1), strays,
+    ]  # fmt: skip
+
+
+def states(results: list[FrameResult]) -> str:
+    """The states one after the other, with the number of frames of each."""
+    return ", ".join(f"{name} {len(list(group))}" for name, group in groupby(r.status.value for r in results))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="shorter recordings")
+    parser.add_argument("--out", type=Path, default=Path("results/faults"))
+    arguments = parser.parse_args()
+    rows = []
+    for fault in faults(arguments.quick):
+        features = extract(fault, 80 if arguments.quick else 300)
+        rows += [run(fault, backend, features) for backend in BACKENDS]
+        for row in rows[-len(BACKENDS) :]:
+            print("| " + " | ".join(f"{x:.2f}" if isinstance(x, float) else str(x) for x in row) + " |", flush=True)
+    print("| " + " | ".join(HEADER) + " |\n" + "| --- | --- | --- |" + " ---: |" * (len(HEADER) - 3))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

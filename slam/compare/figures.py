@@ -1,0 +1,229 @@
+"""The pictures of a comparison's report, as SVG texts."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.compare.measure import SERIES_COLUMNS, Metric
+from slam.compare.sweep import Run
+from slam.compare.tables import Group
+from slam.compare.trial import SERIES
+from slam.metrics import align, associate, chi_square_band
+from slam.se3 import Array
+from slam.sequences import open_sequence
+from slam.trajectory import Trajectory
+
+COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#ad1457", "#558b2f")
+_WIDTH = 5.2  # [inch] about that of a phone: text stays readable where the picture fills the screen
+
+
+def colours(group: Group) -> dict[str, str]:
+    """A colour per back end."""
+    return {backend: COLOURS[i % len(COLOURS)] for i, backend in enumerate(group.runs)}
+
+
+def example(group: Group) -> dict[str, Run]:
+    """The first trial that every back end completed; else the first completed of each."""
+    for k in range(group.trials):
+        runs = {backend: group.runs[backend][k] for backend in group.runs}
+        if all(run.completed for run in runs.values()):
+            return runs
+    firsts = {backend: next((r for r in runs if r.completed), None) for backend, runs in group.runs.items()}
+    return {backend: run for backend, run in firsts.items() if run is not None}
+
+
+def read_series(run: Run) -> dict[str, Array]:
+    """A run's columns of `SERIES_COLUMNS`."""
+    rows = np.genfromtxt(run.folder / SERIES, delimiter=",", skip_header=1, ndmin=2)
+    return dict(zip(SERIES_COLUMNS, rows.reshape(-1, len(SERIES_COLUMNS)).T))
+
+
+def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:
+    """The path that a run said online (the final one of a replay), and the true one in its axes."""
+    file = run.folder / "trajectory.txt"
+    own = Trajectory.read_tum(file if file.exists() else run.folder / "trajectory_final.txt")
+    truth = open_sequence(run.trial.source).ground_truth
+    if truth is None:
+        return own, None
+    estimated, true = associate(own, truth, 0.02, interpolated=True)
+    return own, align(true, estimated).apply_trajectory(true)
+
+
+def draw_pairs(group: Group, metric: Metric) -> str:
+    """Each trial's value by back end, pairs joined by a line: whether the differences are of one sign."""
+    figure, axis = _axes(2.6)
+    names = list(group.runs)
+    values = np.array([metric.scale * group.values(name, metric.key) for name in names])
+    axis.plot(range(len(names)), values, color="0.7", lw=1, zorder=1)
+    for i, colour in enumerate(colours(group).values()):
+        axis.plot(np.full(values.shape[1], i), values[i], "o", color=colour, ms=5, alpha=0.8)
+    axis.set_xticks(range(len(names)), names)
+    axis.set_xlim(-0.5, len(names) - 0.5)
+    axis.set_ylabel(metric.title)
+    axis.set_ylim(0, 1.1 * float(np.nanmax(values, initial=1e-9)))
+    return _svg(figure)
+
+
+def draw_paths(group: Group) -> str:
+    """Top view of the first trial's paths and the true one."""
+    figure, axis = _axes(3.6)
+    truth = None
+    for name, run in example(group).items():
+        own, true = paths(run)
+        truth = true if truth is None else truth
+        axis.plot(*own.positions[:, [0, 2]].T, color=colours(group)[name], lw=1.6, label=name)
+    if truth is not None:
+        axis.plot(*truth.positions[:, [0, 2]].T, "--", color="0.3", lw=1, label="truth")
+    axis.set(xlabel="right [m]", ylabel="forward [m]")
+    axis.axis("equal")
+    axis.legend(frameon=False, fontsize=8)
+    return _svg(figure)
+
+
+def draw_errors(group: Group) -> str:
+    """Position error of the first trial over time, component by component, inside the ±3σ that each run claims."""
+    figure, axes = _rows(3, 1.5)
+    for name, run in example(group).items():
+        s = read_series(run)
+        t = s["stamp"] - s["stamp"][0]
+        for axis, c in zip(axes, "xyz"):
+            band = 300 * s[f"sd_{c}"]
+            axis.fill_between(t, -band, band, color=colours(group)[name], alpha=0.13, lw=0)
+            axis.plot(t, 100 * s[f"error_{c}"], color=colours(group)[name], lw=1, label=name)
+    for axis, label in zip(axes, ("right", "down", "forward")):
+        axis.axhline(0, color="0.6", lw=0.5)
+        axis.set_ylabel(f"{label} [cm]")
+    axes[0].legend(frameon=False, fontsize=8, ncols=3, loc="upper left")
+    axes[-1].set_xlabel("time [s]")
+    return _svg(figure)
+
+
+def draw_nees(group: Group) -> str:
+    """NEES / 6 over time, mean over the trials, with the 95 % band of as many independent ones."""
+    from matplotlib.ticker import LogLocator
+
+    figure, axis = _axes(2.8)
+    for name, runs in group.runs.items():
+        every = [read_series(run) for run in runs if run.completed]
+        if not every:
+            continue
+        length = min(len(s["nees"]) for s in every)
+        nees = np.array([s["nees"][1:length] for s in every])
+        t = (every[0]["stamp"] - every[0]["stamp"][0])[1:length]
+        axis.plot(t, nees.mean(axis=0) / 6, color=colours(group)[name], lw=1.2, label=name)
+    low, high = chi_square_band(6, max(1, group.trials))
+    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {group.trials}")
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("")
+    axis.set(xlabel="time [s]", ylabel="NEES / 6")
+    axis.legend(frameon=False, fontsize=8, ncols=3)
+    return _svg(figure)
+
+
+def draw_timing(group: Group) -> str:
+    """Milliseconds per frame and stage, median of the trials' medians."""
+    names = list(group.runs)
+    figure, axis = _axes(0.8 + 0.45 * len(names))
+    left = np.zeros(len(names))
+    runs = {name: [r for r in group.runs[name] if r.milliseconds] for name in names}
+    stages = dict.fromkeys(stage for rs in runs.values() for r in rs for stage in r.milliseconds if stage != "total")
+    for i, stage in enumerate(stages):
+        width = np.array(
+            [np.median([r.milliseconds.get(stage, 0.0) for r in runs[n]]) if runs[n] else 0.0 for n in names]
+        )
+        axis.barh(range(len(names)), width, left=left, color=f"C{i}", label=stage)
+        left += width
+    axis.set_yticks(range(len(names)), names)
+    axis.invert_yaxis()
+    axis.set_xlabel("ms per frame, one thread")
+    axis.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0))
+    return _svg(figure)
+
+
+def map_data(group: Group, most: int = 700) -> dict[str, Any]:
+    """The first trial's maps and paths for the picture in 3D that can be turned."""
+    layers = []
+    truth = None
+    for name, run in example(group).items():
+        own, true = paths(run)
+        truth = true if truth is None else truth
+        layers.append(
+            {
+                "name": name,
+                "colour": colours(group)[name],
+                "path": _thin(own.positions),
+                **_landmarks(run.folder, own, most),
+            }
+        )
+    return {"layers": layers, "truth": [] if truth is None else _thin(truth.positions)}
+
+
+def _landmarks(folder: Path, own: Trajectory, most: int) -> dict[str, Any]:
+    """Positions and the axes of the 2σ ellipsoids of the best-known landmarks near the path."""
+    file = folder / "landmarks.csv"
+    rows = (
+        np.genfromtxt(file, delimiter=",", skip_header=1, ndmin=2).reshape(-1, 12)
+        if file.exists()
+        else np.zeros((0, 12))
+    )
+    positions, upper = rows[:, 1:4], rows[:, 4:10]
+    extent = max(float(np.ptp(own.positions, axis=0).max()), 1.0)
+    distance = np.linalg.norm(positions - own.positions.mean(axis=0), axis=1)
+    size = np.sqrt(np.maximum(upper[:, 0] + upper[:, 3] + upper[:, 5], 0))
+    near = np.flatnonzero((distance < 2 * extent + 3) & (size < 0.3 * extent))
+    near = near[np.argsort(size[near], kind="stable")[:most]]
+    covariances = upper[near][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    values, vectors = np.linalg.eigh(covariances)
+    axes = 2 * np.sqrt(np.maximum(values, 0))[:, None, :] * vectors
+    return {"points": _round(positions[near]), "axes": _round(np.swapaxes(axes, 1, 2).reshape(-1, 9))}
+
+
+def _thin(positions: Array, most: int = 600) -> list[list[float]]:
+    step = max(1, len(positions) // most)
+    return _round(positions[::step])
+
+
+def _round(rows: Array) -> list[list[float]]:
+    return [[round(float(x), 4) for x in row] for row in rows]
+
+
+_STYLE: Mapping[str, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "slam",
+    "font.size": 9,
+    "font.family": "sans-serif",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+
+
+def _axes(height: float) -> tuple[Any, Any]:
+    figure, axes = _rows(1, height)
+    return figure, axes[0]
+
+
+def _rows(count: int, height: float) -> tuple[Any, list[Any]]:
+    """A figure of rows of axes under one time axis, apart from pyplot's global state."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(dict(_STYLE)):
+        figure = Figure((_WIDTH, height * count), layout="constrained")
+        axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    return figure, list(axes)
+
+
+def _svg(figure: Any) -> str:
+    from matplotlib import rc_context
+
+    text = io.StringIO()
+    with rc_context(dict(_STYLE)):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()

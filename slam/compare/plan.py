@@ -1,0 +1,169 @@
+"""What a comparison runs: sequences × settings × back ends × seeds, in pairs that differ in the back end alone."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from slam.errors import ConfigurationError
+
+SYNTHETIC = "synthetic:"
+
+#: Measurements straight from a world's landmarks in place of a front end's: no image is made.
+SIMULATED = "simulated"
+
+CLOSED_LOOP, REPLAY = "closed loop", "replay"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A front end and settings, the same for every back end.
+
+    Attributes:
+        name: shown in the tables.
+        frontend: a name, or `SIMULATED`.
+        settings: ``section.key=value``, applied in their order.
+    """
+
+    name: str
+    frontend: str = "surf"
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All of a comparison.
+
+    Attributes:
+        sequences: as `slam.open_sequence` takes them.
+        backends: names; differences are taken from the first.
+        variants: front ends and settings.
+        trials: seeds 0, 1, … of every synthetic world; recorded sequences have one trial.
+        start, stop: range of frames.
+        replay: besides the closed loop, feed the first back end's measurements to every back end.
+
+    Raises:
+        ConfigurationError: nothing to run, a name stands twice, or a world's seed is given although trials choose it.
+    """
+
+    sequences: tuple[str, ...]
+    backends: tuple[str, ...]
+    variants: tuple[Variant, ...] = field(default_factory=lambda: (Variant("surf"),))
+    trials: int = 1
+    start: int = 0
+    stop: int | None = None
+    replay: bool = True
+
+    def __post_init__(self) -> None:
+        for what, names in (
+            ("sequence", self.sequences),
+            ("back end", self.backends),
+            ("variant", tuple(v.name for v in self.variants)),
+        ):
+            if not names:
+                raise ConfigurationError(f"comparison: no {what} is given")
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise ConfigurationError(f"comparison: {what} {twice!r} is given twice")
+        if self.trials < 1:
+            raise ConfigurationError(f"comparison: there must be at least one trial, got {self.trials}")
+        for sequence in self.sequences:
+            if is_world(sequence) and re.search(r"[?&]seed=", sequence):
+                raise ConfigurationError(f"{sequence}: leave the seed out, the trials have seeds 0 to N − 1")
+            if not is_world(sequence) and any(v.frontend == SIMULATED for v in self.variants):
+                raise ConfigurationError(f"{sequence}: front end {SIMULATED!r} is for synthetic worlds alone")
+
+    def trials_of(self, mode: str) -> Iterator[Trial]:
+        """All trials of a mode, in the order of the tables."""
+        for sequence in self.sequences:
+            for variant in self.variants:
+                for seed in range(self.trials if is_world(sequence) else 1):
+                    for backend in self.backends:
+                        yield Trial(sequence, variant, backend, seed, mode, self.start, self.stop)
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Closed loop, and replay where it is asked for."""
+        return (CLOSED_LOOP, REPLAY) if self.replay else (CLOSED_LOOP,)
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as plain types."""
+        return asdict(self)
+
+    def command(self) -> str:
+        """The command that runs the plan again."""
+        from shlex import join
+
+        words = ["slam", "compare", *self.sequences, "--backends", ",".join(self.backends)]
+        for variant in self.variants:
+            if variant != Variant("surf"):
+                words += ["--variant", ":".join([variant.name, variant.frontend, *variant.settings])]
+        words += ["--trials", str(self.trials)]
+        if self.start or self.stop is not None:
+            words += ["--frames", f"{self.start or ''}:{'' if self.stop is None else self.stop}"]
+        return join([*words, *([] if self.replay else ["--no-replay"])])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run.
+
+    Attributes:
+        sequence: as the plan has it.
+        variant: front end and settings.
+        backend: name.
+        seed: of the recording of a synthetic world; 0 for recorded sequences.
+        mode: `CLOSED_LOOP` or `REPLAY`.
+        start, stop: range of frames.
+    """
+
+    sequence: str
+    variant: Variant
+    backend: str
+    seed: int
+    mode: str
+    start: int = 0
+    stop: int | None = None
+
+    @property
+    def source(self) -> str:
+        """The sequence's text, with the seed where it is a world."""
+        if not is_world(self.sequence):
+            return self.sequence
+        return f"{self.sequence}{'&' if '?' in self.sequence else '?'}seed={self.seed}"
+
+    @property
+    def folder(self) -> str:
+        """Where its files go, below the comparison's ``runs``."""
+        parts = (short_name(self.sequence), short_name(self.variant.name), f"seed_{self.seed}", self.backend)
+        return "/".join((*parts, self.mode.replace(" ", "_")))
+
+
+def is_world(sequence: str) -> bool:
+    """Whether a sequence is a synthetic world."""
+    return sequence.startswith(SYNTHETIC)
+
+
+def short_name(text: str) -> str:
+    """A file name for a text: readable, and its own even where only odd characters or a long path tell two apart."""
+    plain = re.sub(r"[^A-Za-z0-9.]+", "_", text.removeprefix(SYNTHETIC)).strip("_")
+    if plain == text.removeprefix(SYNTHETIC) and len(plain) <= 60:
+        return plain
+    return f"{plain[-48:].strip('_')}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def parse_variant(text: str, common: tuple[str, ...] = ()) -> Variant:
+    """A variant from ``NAME:FRONTEND:KEY=VALUE:KEY=VALUE…``; settings `common` to all come first.
+
+    Raises:
+        ConfigurationError: not of that form.
+    """
+    name, _, rest = text.partition(":")
+    parts = [part for part in rest.split(":") if part]
+    frontend = parts.pop(0) if parts and "=" not in parts[0] else "surf"
+    if not name or any("=" not in part for part in parts):
+        raise ConfigurationError(f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…")
+    return Variant(name, frontend, (*common, *parts))

@@ -1,0 +1,201 @@
+"""Jobs on the cores of this machine, or on a Dask cluster; a worker that dies loses nothing but its present job."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from slam.errors import SlamError
+
+_SHARED_DEATHS = 2  # a job whose worker has died so often is next run alone, so that no other is to blame
+
+#: Read by the libraries when they are loaded, which is before a worker's first job.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class WorkerDiedError(SlamError):
+    """A job has ended its worker process even where it ran alone."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A call to be made in some process.
+
+    Attributes:
+        name: for messages.
+        function: importable, so that it can be sent.
+        arguments: gives the call's arguments when it is made; they are sent, too.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    arguments: Callable[[], tuple[Any, ...]] = tuple
+
+
+#: Is told of each job that has ended: what came back, or the exception that it raised.
+Deliver = Callable[[Job, Any, BaseException | None], None]
+
+
+class Scheduler(Protocol):
+    """Where jobs run."""
+
+    def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
+        """Run all jobs, in any order; `deliver` is called here, once for each, as they end."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalScheduler:
+    """Worker processes on this machine, each with one thread for linear algebra.
+
+    When a worker dies (killed, out of memory) the pool is made anew and goes on; the jobs that were running run again.
+
+    Attributes:
+        workers: number of processes.
+    """
+
+    workers: int
+
+    def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
+        """See `Scheduler`."""
+        waiting = deque(jobs)
+        deaths: dict[str, int] = {}
+        alone: deque[Job] = deque()
+        while waiting:
+            for job in _in_pool(waiting, self.workers, deliver):
+                deaths[job.name] = deaths.get(job.name, 0) + 1
+                (alone if deaths[job.name] >= _SHARED_DEATHS else waiting).append(job)
+        while alone:
+            for job in _in_pool(deque([alone.popleft()]), 1, deliver):
+                deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
+
+
+def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:
+    """Run jobs until none is waiting or a worker dies; the jobs that were running then come back.
+
+    No more jobs are submitted than there are workers: so those submitted are those that were running.
+    """
+    running: dict[Future[Any], Job] = {}
+    with _pool(workers) as pool:
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    running[pool.submit(waiting[0].function, *waiting[0].arguments())] = waiting[0]
+                    waiting.popleft()
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    error = future.exception()
+                    if isinstance(error, BrokenProcessPool):
+                        raise error
+                    deliver(running.pop(future), None if error else future.result(), error)
+        except BrokenProcessPool:
+            return _undelivered(running, deliver)
+    return []
+
+
+def _undelivered(running: dict[Future[Any], Job], deliver: Deliver) -> list[Job]:
+    """The jobs that a broken pool has lost; those that had ended just before are delivered."""
+    lost = []
+    for future, job in running.items():
+        error = future.exception()
+        if isinstance(error, BrokenProcessPool):
+            lost.append(job)
+        else:
+            deliver(job, None if error else future.result(), error)
+    return lost
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool whose processes begin with one thread each, and end with this block however it ends."""
+    before = {process.pid for process in multiprocessing.active_children()}
+    kept = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, _begin_worker)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        own = [process for process in multiprocessing.active_children() if process.pid not in before]
+        for process in own:
+            process.terminate()
+        for process in own:
+            process.join()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for name, value in kept.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _begin_worker() -> None:
+    """Leave interrupts to the parent, and end when it is gone, however it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)
+
+
+@dataclass(frozen=True)
+class DaskScheduler:
+    """The workers of an existing Dask cluster. They need this package in the same version, and recorded sequences under
+    the same paths; files come back over the network, no shared folder is needed.
+
+    Attributes:
+        address: of the scheduler, such as ``"tcp://10.0.0.1:8786"``.
+        patience: how long to wait for its first answer [s].
+    """
+
+    address: str
+    patience: float = 10.0
+
+    def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
+        """See `Scheduler`. Raises SlamError where dask.distributed is missing or nobody answers at the address."""
+        distributed = _distributed()
+        try:
+            client = distributed.Client(self.address, timeout=self.patience)
+        except (OSError, ValueError) as error:
+            raise SlamError(f"no Dask scheduler answers at {self.address}: {error}") from error
+        waiting: deque[Job] = deque(jobs)
+        running: dict[Any, Job] = {}
+        with client:
+            while waiting or running:
+                while waiting and len(running) < max(1, 2 * sum(client.ncores().values())):
+                    job = waiting.popleft()
+                    # Not pure: Dask must not take calls with equal arguments for one.
+                    running[client.submit(job.function, *job.arguments(), pure=False)] = job
+                for future in distributed.wait(list(running), return_when="FIRST_COMPLETED").done:
+                    failed = future.exception()
+                    deliver(running.pop(future), None if failed else future.result(), failed)
+
+
+def _distributed() -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise SlamError("--scheduler needs dask.distributed: pip install 'surf-stereo-slam[cluster]'") from error
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

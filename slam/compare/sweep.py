@@ -1,0 +1,194 @@
+"""All trials of a comparison, each once: what is done stays done, and a sweep that was killed goes on where it was.
+
+A trial's folder appears at once with all its files, ``result.json`` among them, and is its own checkpoint.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from slam import registry
+from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Trial
+from slam.compare.scheduler import Job, Scheduler
+from slam.compare.trial import (
+    COMPLETED,
+    RECORDING,
+    RESULT,
+    TIMING,
+    Files,
+    config_of,
+    failure,
+    frontend_of,
+    result_files,
+    run_trial,
+)
+from slam.errors import SlamError
+from slam.outputs import write_json
+from slam.runner import versions
+from slam.sequences import open_sequence
+
+RUNS, SWEEP = "runs", "sweep.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trial that has ended.
+
+    Attributes:
+        trial: what was run.
+        outcome: ``"completed"``, or ``"failed: …"`` with the reason.
+        metrics: figures by key of `slam.compare.measure.METRICS`; none where it failed.
+        milliseconds: median per stage.
+        folder: its files.
+    """
+
+    trial: Trial
+    outcome: str
+    metrics: dict[str, float]
+    milliseconds: dict[str, float]
+    folder: Path
+
+    @property
+    def completed(self) -> bool:
+        """Whether it came to its end."""
+        return self.outcome == COMPLETED
+
+
+def sweep(plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial], None] | None = None) -> list[Run]:
+    """Run what is not done yet, and read all runs of the plan, in its order.
+
+    Args:
+        plan: what to run.
+        out: folder; one of an earlier sweep with the same versions is gone on with.
+        scheduler: where trials run.
+        on_done: called for each trial that ends, and for those that were done before.
+
+    Raises:
+        SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
+    """
+    check(plan)
+    _prepare(plan, out)
+    for mode in plan.modes:
+        jobs = {}
+        for trial in plan.trials_of(mode):
+            if _is_done(trial, out):
+                if on_done is not None:
+                    on_done(trial)
+            else:
+                jobs[trial.folder] = trial
+        scheduler.run(
+            [Job(name, run_trial, partial(_arguments, plan, trial, out)) for name, trial in jobs.items()],
+            partial(_keep, jobs, out, on_done),
+        )
+    return [read_run(trial, out) for mode in plan.modes for trial in plan.trials_of(mode)]
+
+
+def check(plan: Plan) -> None:
+    """Try every sequence, front end, back end and setting once; raises SlamError for what cannot work."""
+    for trial in plan.trials_of(CLOSED_LOOP):
+        if trial.seed:
+            continue
+        sequence = open_sequence(trial.source)
+        config = config_of(trial, sequence)
+        if frontend_of(trial, sequence) is None:
+            registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
+        registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
+
+
+def read_run(trial: Trial, out: Path) -> Run:
+    """A trial's outcome from its folder.
+
+    Raises:
+        SlamError: it is not there, or cannot be read.
+    """
+    folder = out / RUNS / trial.folder
+    try:
+        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        timing = folder / TIMING
+        milliseconds = json.loads(timing.read_text(encoding="utf-8")) if timing.exists() else {}
+    except (OSError, ValueError) as error:
+        raise SlamError(f"{folder}: cannot be read as a run of a comparison: {error}") from error
+    return Run(trial, result["outcome"], result["metrics"], milliseconds, folder)
+
+
+def _arguments(plan: Plan, trial: Trial, out: Path) -> tuple[Trial, bytes | None]:
+    """A trial, and for a replay the measurements of the first back end's closed loop."""
+    if trial.mode != REPLAY:
+        return trial, None
+    first = Trial(trial.sequence, trial.variant, plan.backends[0], trial.seed, CLOSED_LOOP, trial.start, trial.stop)
+    run = read_run(first, out)
+    return trial, (run.folder / RECORDING).read_bytes() if run.completed else None
+
+
+def _keep(
+    jobs: dict[str, Trial],
+    out: Path,
+    on_done: Callable[[Trial], None] | None,
+    job: Job,
+    files: Files | None,
+    error: BaseException | None,
+) -> None:
+    """Put a trial's files in their place, all at once; one that raised is a failed run, with its reason."""
+    trial = jobs[job.name]
+    if files is None:
+        files = result_files(trial, failure(error or SlamError("nothing came back")))
+    folder = out / RUNS / trial.folder
+    part = folder.with_name(folder.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    for name, content in files.items():
+        (part / name).write_bytes(content)
+    shutil.rmtree(folder, ignore_errors=True)
+    part.rename(folder)
+    if on_done is not None:
+        on_done(trial)
+
+
+def _is_done(trial: Trial, out: Path) -> bool:
+    """Whether the trial has ended before.
+
+    Raises:
+        SlamError: its folder holds a trial with other settings.
+    """
+    path = out / RUNS / trial.folder / RESULT
+    if not path.exists():
+        return False
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))["trial"]
+    except (OSError, ValueError, KeyError):
+        return False
+    if before != json.loads(json.dumps(asdict(trial))):
+        raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
+    return True
+
+
+def _prepare(plan: Plan, out: Path) -> None:
+    """The folder, and in it what is run; raises SlamError where it holds a sweep of other versions."""
+    path = out / SWEEP
+    if path.exists():
+        _require_same_versions(path)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"plan": plan.to_json(), "command": plan.command(), "versions": versions()})
+    except OSError as error:
+        raise SlamError(f"cannot write to {out}: {error.strerror or error}") from error
+
+
+def _require_same_versions(path: Path) -> None:
+    try:
+        before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["versions"]
+    except (OSError, ValueError, KeyError) as error:
+        raise SlamError(f"{path}: cannot be read as that of a comparison: {error}") from error
+    changed = [name for name, version in versions().items() if before.get(name) != version]
+    if changed:
+        now = versions()[changed[0]]
+        raise SlamError(
+            f"{path.parent}: begun with {changed[0]} {before.get(changed[0])}, now {now}: runs cannot be compared; "
+            "give another --out"
+        )

@@ -1,0 +1,139 @@
+"""The tables of a comparison as data, and as CSV files: the same bytes however and wherever the trials were run."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.compare.measure import BY_KEY, METRICS, Metric, object_metric
+from slam.compare.plan import Plan, Variant
+from slam.compare.statistics import Difference, difference
+from slam.compare.sweep import Run
+from slam.se3 import Array
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that are compared with each other: one sequence, variant and mode.
+
+    Attributes:
+        sequence, variant, mode: what they share.
+        runs: by back end, each in the order of seeds.
+    """
+
+    sequence: str
+    variant: Variant
+    mode: str
+    runs: dict[str, list[Run]]
+
+    @property
+    def trials(self) -> int:
+        """Number of trials of each back end."""
+        return len(next(iter(self.runs.values())))
+
+    @property
+    def metrics(self) -> list[Metric]:
+        """Figures that at least one run has, those of moving objects last."""
+        keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
+        others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
+        return [m for m in METRICS if m.key in keys] + others
+
+    def values(self, backend: str, key: str) -> Array:
+        """A figure by trial (N,), NaN where the run failed or has none."""
+        return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
+
+    def failures(self, backend: str) -> int:
+        """Number of runs that failed."""
+        return sum(not run.completed for run in self.runs[backend])
+
+    def differences(self, metric: Metric) -> dict[str, Difference]:
+        """Each other back end against the first, by name."""
+        first, *others = self.runs
+        reference = self.values(first, metric.key)
+        return {other: difference(metric, reference, self.values(other, metric.key)) for other in others}
+
+
+def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
+    """The runs, sorted by what they share, in the plan's order."""
+    found = []
+    for sequence in plan.sequences:
+        for variant in plan.variants:
+            for mode in plan.modes:
+                own = [
+                    r for r in runs if (r.trial.sequence, r.trial.variant, r.trial.mode) == (sequence, variant, mode)
+                ]
+                by_name = {b: [r for r in own if r.trial.backend == b] for b in plan.backends}
+                found.append(Group(sequence, variant, mode, by_name))
+    return found
+
+
+DIFFERENCE_COLUMNS = (
+    "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
+    "difference", "low", "high", "p", "other_lower", "verdict",
+)  # fmt: skip
+MEAN_COLUMNS = ("sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "min", "max")
+RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
+
+
+def write_tables(plan: Plan, runs: Sequence[Run], out: Path) -> None:
+    """Write runs.csv, means.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
+    own = sorted({key for run in runs for key in run.metrics} - set(BY_KEY))
+    keys = [*BY_KEY, *own]
+    _write(out / "runs.csv", (*RUN_COLUMNS, *keys), ((*_head(r), *_cells(r, keys)) for r in runs))
+    every = groups(plan, runs)
+    _write(out / "means.csv", MEAN_COLUMNS, (row for group in every for row in _mean_rows(group)))
+    _write(out / "differences.csv", DIFFERENCE_COLUMNS, (row for group in every for row in _difference_rows(group)))
+    stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
+    rows = ((*_head(r), *(_number(r.milliseconds.get(s)) for s in stages)) for r in runs)
+    _write(out / "timings.csv", (*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)), rows)
+
+
+def _head(run: Run) -> tuple[str, ...]:
+    t = run.trial
+    return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
+
+
+def _cells(run: Run, keys: Sequence[str]) -> list[str]:
+    return [_number(run.metrics.get(key)) for key in keys]
+
+
+def _mean_rows(group: Group) -> Iterable[tuple[object, ...]]:
+    for metric in group.metrics:
+        for backend in group.runs:
+            values = group.values(backend, metric.key)
+            values = values[np.isfinite(values)]
+            figures = (values.mean(), _sd(values), values.min(), values.max()) if len(values) else (np.nan,) * 4
+            head = (group.sequence, group.variant.name, group.mode, backend, metric.key)
+            yield (*head, len(values), group.failures(backend), *map(_number, figures))
+
+
+def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
+    first = next(iter(group.runs))
+    for metric in group.metrics:
+        for other, d in group.differences(metric).items():
+            head = (group.sequence, group.variant.name, group.mode, metric.key, first, other, d.pairs, d.missing)
+            figures = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p))
+            yield (*head, *figures, d.lower, d.verdict.value)
+
+
+def _sd(values: Array) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+
+
+def _number(value: float | None) -> str:
+    """A number for a CSV cell; empty where there is none."""
+    return f"{value:.9g}" if value is not None and np.isfinite(value) else ""
+
+
+def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table at once or not at all."""
+    part = path.with_name(path.name + ".part")
+    with part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+    part.replace(path)

@@ -1,0 +1,152 @@
+"""A moving rigid body as the detector keeps it: its pose over the window, and which tracks belong to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from slam.data import BoolArray
+from slam.objects.data import ObjectEstimate
+from slam.objects.tracks import Tracks
+from slam.se3 import Array, inverse, so3_exp, so3_log
+
+_SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
+_REACH = 1.8  # farthest point of a body from its origin, in diagonals of the extent with which it was found
+_SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body.
+
+    Attributes:
+        id: its id.
+        T: pose T_world_object (4, 4) at the present frame.
+        velocity: [ω, v] (6,) in world axes.
+        covariance: of the pose (6, 6), body axes.
+        history: poses at the window's slots (W, 4, 4).
+        known: at which slots there is one (W,).
+        T_first: pose at the begin of the window when it was found, and
+        T_before: at the previous frame.
+        T_found, T_reported: the back end's poses when it was found, and at the previous frame.
+        lower, upper: extent of its points (3,), body coordinates.
+        reach: its points lie no farther from its origin [m].
+        seen_at: when it was last measured [s].
+        seen: number of frames in which it was measured.
+        measured: whether it was in this frame.
+        moving: whether it moves now.
+        estimate: of the back end; None where there is none yet.
+    """
+
+    id: int
+    T: Array
+    velocity: Array
+    covariance: Array
+    history: Array
+    known: BoolArray
+    T_first: Array
+    T_before: Array
+    T_found: Array
+    T_reported: Array
+    lower: Array
+    upper: Array
+    reach: float
+    seen_at: float
+    seen: int = 1
+    measured: bool = True
+    moving: bool = True
+    estimate: ObjectEstimate | None = field(default=None, repr=False)
+
+    def placed(self, T: Array, slot: int) -> Body:
+        """The body with its pose at the present frame, whose slot is `slot`."""
+        history, known = self.history.copy(), self.known.copy()
+        history[slot], known[slot] = T, True
+        return replace(self, T=T, history=history, known=known)
+
+
+def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float) -> Body:
+    """A body found with a twist at its centre; its poses over the window follow from an even motion.
+
+    Args:
+        id: for it.
+        centre: origin (3,) of its frame in world coordinates, now.
+        twist: [ω, v] (6,).
+        times: of the window's slots less the present (W,) [s].
+        stamp: the present [s].
+    """
+    history = np.tile(np.eye(4), (len(times), 1, 1))
+    history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
+    history[:, :3, 3] = centre + times[:, None] * twist[3:]
+    T = np.eye(4)
+    T[:3, 3] = centre
+    none = np.zeros(3)
+    return Body(
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, T, none, none, np.inf, stamp
+    )  # fmt: skip
+
+
+def advanced(body: Body, dt: float, slot: int, acceleration: float) -> Body:
+    """The body moved on evenly to the next frame, not measured yet."""
+    T = body.T.copy()
+    T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
+    T[:3, 3] += dt * body.velocity[3:]
+    covariance = body.covariance + (acceleration * dt) ** 2 * dt * np.eye(6)
+    moved = replace(body, T_before=body.T, covariance=covariance, measured=False)
+    return moved.placed(T, slot)
+
+
+def from_estimate(body: Body, estimate: ObjectEstimate, slot: int, min_speed: float) -> Body:
+    """The body with the back end's belief taken over."""
+    before = estimate if body.estimate is None else body.estimate
+    found = estimate.T_world_object if body.estimate is None else body.T_found
+    size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
+    speed = float(np.linalg.norm(estimate.velocity[3:]) + size * np.linalg.norm(estimate.velocity[:3]))
+    v, P = estimate.velocity, estimate.velocity_covariance
+    settled = body.seen > _SETTLED
+    certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
+    return replace(
+        body.placed(estimate.T_world_object, slot),
+        velocity=v if settled else body.velocity,
+        covariance=estimate.covariance,
+        moving=not settled or (certain and speed > min_speed),
+        estimate=estimate,
+        T_found=found,
+        T_reported=before.T_world_object,
+    )
+
+
+def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
+    """The body placed by the rigid fit of its points alone, where no back end estimates it."""
+    turn = so3_log(T[:3, :3] @ body.T_before[:3, :3].T) / dt
+    shift = (T[:3, 3] - body.T_before[:3, 3]) / dt
+    velocity = 0.5 * body.velocity + 0.5 * np.concatenate([turn, shift])
+    return replace(body.placed(T, slot), velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
+
+
+def with_extent(body: Body, local: Array) -> Body:
+    """The body with the extent of its points (K, 3)."""
+    if len(local) < 3:
+        return body
+    lower, upper = np.percentile(local, [5, 95], axis=0)
+    reach = body.reach if np.isfinite(body.reach) else _REACH * float(np.linalg.norm(upper - lower))
+    return replace(body, lower=lower, upper=upper, reach=reach)
+
+
+def in_body_axes(body: Body, tracks: Tracks) -> tuple[Array, Array, BoolArray]:
+    """Measurements of tracks that were kept in world coordinates, in the body's: points, information, both by slot.
+
+    Returns:
+        points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).
+    """
+    known = (tracks.dof > 0) & body.known
+    A = np.where(known[..., None, None], tracks.A, 0.0)
+    R = body.history[:, :3, :3]
+    ridge = 1e-6 * np.trace(A, axis1=2, axis2=3)[..., None, None] * np.eye(3) + 1e-9 * np.eye(3)
+    p = (
+        np.linalg.solve(A + ridge, np.where(known[..., None], tracks.b, 0.0)[..., None])[..., 0]
+        + tracks.anchor[:, None]
+    )
+    back = inverse(body.history)
+    points = np.einsum("wij,nwj->nwi", back[:, :3, :3], p) + back[:, :3, 3]
+    return points, np.einsum("wji,nwjk,wkl->nwil", R, A, R), known

@@ -1,0 +1,91 @@
+"""Settings of the detector of moving objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam.errors import ConfigurationError
+from slam.models import FORBID_UNKNOWN, require_not_negative
+
+MODES = ("detect", "procedure1", "off")
+
+
+@dataclass(frozen=True)
+class ObjectsConfig:
+    """Settings of the detector of moving objects.
+
+    Attributes:
+        mode: ``"detect"`` finds moving bodies without being told; ``"procedure1"`` is the papers' detector with a
+            database of known features (paper B, 3); ``"off"``.
+        window: number of frames over which a feature is judged.
+        patience: a track that belongs to no body is given up after so many frames without a match.
+        max_speed: no point of a body is faster [m/s]; bounds the search for features that are not where a still point
+            would be.
+        min_speed: no body is taken for moving that is slower [m/s].
+        speed_floor: standard deviation of a still point's apparent velocity that no noise explains (calibration,
+            drift), as a share of the camera's own speed.
+        search_radius: half size of the search windows of tracks, at least [px]; and
+        search_limit: at most.
+        d_match: largest descriptor distance in the search windows; ratio: of the best to the second best.
+        wide_d_match, wide_ratio: the same for features far from where a still point would be.
+        min_frames: a feature is judged from so many measurements on.
+        certain: χ²(3) of a track's displacement from which it is taken to move even alone.
+        doubtful: from which it becomes no landmark.
+        enough: with so many landmarks recognised, features become landmarks only when they were judged to be still.
+        suspect: χ²(6) of a large cluster's motion against the rest of the scene's from which its landmarks measure the
+            camera no more, and
+        group_test: from which it moves; of small clusters more is asked for.
+        min_support: features that must move alike before a body is made of them, and
+        confirm: for so many frames.
+        max_points: most points kept of a body.
+        forget_after: a body not seen for so long is forgotten [s].
+        database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
+        least_side, least_sine: of the triangle of features in ``"procedure1"``: sides [m], and sines of its angles.
+        margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal.
+    """
+
+    mode: str = "off"
+    window: int = 12
+    patience: int = 3
+    max_speed: float = 1.5
+    min_speed: float = 0.01
+    speed_floor: float = 0.01
+    search_radius: float = 4.0
+    search_limit: float = 25.0
+    d_match: float = 0.5
+    ratio: float = 0.85
+    wide_d_match: float = 0.45
+    wide_ratio: float = 0.8
+    min_frames: int = 4
+    certain: float = 60.0
+    doubtful: float = 14.0
+    enough: int = 30
+    suspect: float = 20.0
+    group_test: float = 30.0
+    min_support: int = 4
+    confirm: int = 2
+    max_points: int = 80
+    forget_after: float = 8.0
+    margin: float = 0.25
+    database: str = ""
+    least_side: float = 0.08
+    least_sine: float = 0.3
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        require_not_negative(self)
+        if self.mode not in MODES:
+            raise ConfigurationError(f"objects: mode must be one of {MODES}, got {self.mode!r}")
+        if self.mode == "procedure1" and not self.database:
+            raise ConfigurationError("objects: mode procedure1 needs a database of the object's features")
+        if not 3 <= self.min_frames <= self.window:
+            raise ConfigurationError("objects: 3 <= min_frames <= window is required")
+        if self.min_support < 3 or self.max_points < self.min_support:
+            raise ConfigurationError("objects: 3 <= min_support <= max_points is required")
+        if self.suspect > self.group_test:
+            raise ConfigurationError("objects: suspect <= group_test is required")
+        if not (0 < self.ratio <= 1 and 0 < self.wide_ratio <= 1):
+            raise ConfigurationError("objects: ratios must lie in (0, 1]")
+        if not 0 < self.search_radius <= self.search_limit:
+            raise ConfigurationError("objects: 0 < search_radius <= search_limit is required")

@@ -1,0 +1,131 @@
+"""Frames with what moves drawn into them: beacons yellow, object features black (paper B, Fig. 10), boxes and axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.data import FrameResult
+from slam.errors import SlamError
+from slam.objects.data import MovingObject
+from slam.rig import StereoRig
+from slam.se3 import Array, inverse, transform
+
+_BEACON, _MOVING, _RING = (0, 230, 255), (0, 0, 0), (255, 255, 255)  # BGR
+_AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
+_BOXES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
+_EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
+_PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
+
+
+def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
+    """The left image (BGR uint8), enlarged to about `width`, with beacons, moving features, boxes and axes.
+
+    Args:
+        image: left image of the frame.
+        result: of the step.
+        rig: the cameras.
+        width: of the picture [px].
+    """
+    import cv2
+
+    picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    scale = max(1, round(width / picture.shape[1]))
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for thing in result.objects:
+        _draw_object(picture, thing, result, rig, scale)
+    moving = np.zeros(len(result.features), bool)
+    moving[result.moving_features] = True
+    beacons = result.matched_features[~moving[result.matched_features]]
+    for u, v in result.features.uv_left[beacons]:
+        cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _BEACON, 1, cv2.LINE_AA)
+    for u, v in result.features.uv_left[moving]:
+        cv2.circle(picture, _pixel(u, v, scale), 2 * scale + 1, _RING, 1, cv2.LINE_AA)
+        cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _MOVING, 2, cv2.LINE_AA)
+    return picture
+
+
+def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int) -> None:
+    """Box, axes, number and speed of one body; thinner where it is not seen in this frame."""
+    import cv2
+
+    T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
+    lower, upper = thing.extent
+    corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
+    colour = _BOXES[(thing.id - 1) % len(_BOXES)]
+    thickness = 2 if thing.estimate.measured else 1
+    for a, b in _EDGES:
+        _line(picture, rig, transform(T_left_object, np.linspace(corners[a], corners[b], _PARTS)), colour, thickness,
+              scale)  # fmt: skip
+    length = 0.6 * max(float((upper - lower).max()), 1e-3)
+    for axis, axis_colour in enumerate(_AXES):
+        ends = np.linspace(np.zeros(3), length * np.eye(3)[axis], _PARTS)
+        _line(picture, rig, transform(T_left_object, ends), axis_colour, 2 * thickness, scale)
+    top = rig.left.project(transform(T_left_object, corners))
+    if np.isfinite(top).all():
+        u, v = top.min(axis=0)
+        speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
+        text = f"{thing.id}  {speed:.2f} m/s" if thing.moving else f"{thing.id}  at rest"
+        at = _pixel(u, v - 3, scale)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _RING, 3, cv2.LINE_AA)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
+
+
+def _line(
+    picture: np.ndarray, rig: StereoRig, points: Array, colour: tuple[int, int, int], thickness: int, scale: int
+) -> None:
+    """A polyline through points (N, 3) in left-camera coordinates; pieces behind the camera are left out."""
+    import cv2
+
+    uv = rig.left.project(points)
+    limit = 20 * rig.width
+    good = np.asarray((np.abs(np.nan_to_num(uv, nan=2.0 * limit)) < limit).all(axis=1))
+    for i in range(len(points) - 1):
+        if good[i] and good[i + 1]:
+            cv2.line(
+                picture,
+                _pixel(uv[i, 0], uv[i, 1], scale),
+                _pixel(uv[i + 1, 0], uv[i + 1, 1], scale),
+                colour,
+                thickness,
+                cv2.LINE_AA,
+            )
+
+
+def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
+    return round(scale * (u + 0.5)), round(scale * (v + 0.5))
+
+
+class FramePictures:
+    """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
+
+    Raises:
+        SlamError: the video cannot be written.
+    """
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self.path = path
+        self.rate = rate
+        self._video: Any = None
+        (path.parent if path.suffix == ".mp4" else path).mkdir(parents=True, exist_ok=True)
+
+    def add(self, number: int, picture: np.ndarray) -> None:
+        """Append one picture, `number` in its sequence."""
+        import cv2
+
+        if self.path.suffix != ".mp4":
+            cv2.imwrite(str(self.path / f"{number:06d}.png"), picture)
+            return
+        if self._video is None:
+            size = (picture.shape[1], picture.shape[0])
+            self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.rate, size)
+            if not self._video.isOpened():
+                raise SlamError(f"cannot write the video {self.path}")
+        self._video.write(picture)
+
+    def close(self) -> None:
+        """Finish the video."""
+        if self._video is not None:
+            self._video.release()

@@ -1,0 +1,254 @@
+"""How well moving objects are found and measured, against known truth. Definitions: docs/objects.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import FrameResult
+from slam.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
+
+_SINGULAR = 1e-14  # smallest eigenvalue of a covariance that counts
+_SUPPORT = 4  # stereo features from which a body counts as in view
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Rotation [deg] and translation [m] of errors, a row each."""
+
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def of(cls, E: Array) -> PoseErrors:
+        """Of error motions (N, 4, 4)."""
+        return cls(np.degrees(rotation_angle(E[:, :3, :3])), np.linalg.norm(E[:, :3, 3], axis=1))
+
+    def summary(self) -> dict[str, float]:
+        """Median and RMSE of both."""
+        if not len(self.rotation):
+            return {}
+        return {
+            "rotation median [deg]": float(np.median(self.rotation)),
+            "rotation RMSE [deg]": float(np.sqrt(np.mean(self.rotation**2))),
+            "translation median [m]": float(np.median(self.translation)),
+            "translation RMSE [m]": float(np.sqrt(np.mean(self.translation**2))),
+        }
+
+
+def motion_errors(estimated: Array, true: Array, delta: int = 1) -> PoseErrors:
+    """Errors of the motions over `delta` rows, in the true body's frame before the motion.
+
+    ``E = T⁻¹ (H_est⁻¹ H_true) T`` with ``H = T_k T_{k−Δ}⁻¹`` in world coordinates and T the true pose at k − Δ. It
+    does not depend on where in the body its frame was put, and the translation is that of the body's own place.
+
+    Args:
+        estimated: poses T_world_object (N, 4, 4).
+        true: the true ones in the same world frame; the body frames may differ.
+        delta: number of rows between.
+    """
+    H = estimated[delta:] @ inverse(estimated[:-delta])
+    G = true[delta:] @ inverse(true[:-delta])
+    before = true[:-delta]
+    return PoseErrors.of(inverse(before) @ inverse(H) @ G @ before)
+
+
+def body_alignment(estimated: Array, true: Array) -> Array:
+    """The change D (4, 4) of body frame with ``T_true ≈ T_estimated D`` over all rows, in the mean."""
+    D = inverse(estimated) @ true
+    mean = D[0].copy()
+    for _ in range(5):
+        mean[:3, :3] = mean[:3, :3] @ so3_exp(so3_log(mean[:3, :3].T @ D[:, :3, :3]).mean(axis=0))
+    mean[:3, 3] = D[:, :3, 3].mean(axis=0)
+    return mean
+
+
+def absolute_pose_errors(estimated: Array, true: Array) -> PoseErrors:
+    """Errors ``(T_estimated D)⁻¹ T_true`` of poses (N, 4, 4) after one change D of body frame for all."""
+    return PoseErrors.of(inverse(estimated @ body_alignment(estimated, true)) @ true)
+
+
+def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
+    """NEES of object poses with covariances (N, 6, 6), after one change of body frame for all.
+
+    Rows whose covariance is singular, as where a body defines its own axes, are left out.
+    """
+    D = body_alignment(estimated, true)
+    e = log(inverse(estimated) @ true @ inverse(D))
+    known = np.linalg.eigvalsh(covariances)[:, 0] > _SINGULAR  # in its first frame a body defines its own axes
+    return np.asarray(np.einsum("ni,nij,nj->n", e[known], np.linalg.inv(covariances[known]), e[known]), np.float64)
+
+
+@dataclass
+class _Life:
+    """What was reported of one object."""
+
+    frames: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    measured: list[bool] = field(default_factory=list)
+    votes: dict[int, int] = field(default_factory=dict)
+
+    @property
+    def truth(self) -> int:
+        """The body on which most of its features lie, over its life; 0 for the still world."""
+        return max(self.votes, key=lambda body: (self.votes[body], -body)) if self.votes else 0
+
+
+class ObjectScore:
+    """Gathers a run's results frame by frame and sums them up.
+
+    Args:
+        bodies: true poses ``T_world_object`` of every body (B, N, 4, 4) by frame, in the truth's world; ids from 1.
+        stamps: of the frames (N,) [s].
+        pixel: how far a body's image moves before it can be said to move [px].
+        focal: focal length [px].
+        cameras: true poses of the left camera (N, 4, 4).
+    """
+
+    def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float, pixel: float = 1.0) -> None:
+        self.bodies = bodies
+        self.cameras = cameras
+        self.moves_from = [_first_motion(poses, cameras, focal, pixel) for poses in bodies]
+        self.lives: dict[int, _Life] = {}
+        self.right = self.wrong = self.missed = self.still = 0
+        self.false_frames = 0
+        self.counted = self.counted_right = 0
+        self.covered: dict[int, list[bool]] = {}
+        self.frames = 0
+        self._world: Array | None = None
+
+    def add(self, frame: int, result: FrameResult, labels: NDArray) -> None:
+        """Take in one frame.
+
+        Args:
+            frame: its number.
+            result: of the step.
+            labels: the body of each feature (N,), 0 for the still world, −1 for features that are nothing.
+        """
+        if self._world is None:
+            self._world = result.estimate.T_world_left @ inverse(self.cameras[frame])
+        self.frames += 1
+        flagged = np.zeros(len(labels), bool)
+        flagged[result.moving_features] = True
+        started = np.array([False] + [frame >= k for k in self.moves_from])
+        moving = (labels > 0) & started[np.maximum(labels, 0)]
+        still, stereo = labels == 0, result.features.has_stereo
+        self.right += int((flagged & moving & stereo).sum())
+        self.missed += int((~flagged & moving & stereo).sum())
+        self.wrong += int((flagged & still).sum())
+        self.still += int(still.sum())
+        self._count(frame, result, labels, moving & stereo)
+
+    def _count(self, frame: int, result: FrameResult, labels: NDArray, moving: NDArray) -> None:
+        named = set()
+        for thing in result.objects:
+            life = self.lives.setdefault(thing.id, _Life())
+            for label in labels[thing.features]:
+                if label >= 0:
+                    life.votes[int(label)] = life.votes.get(int(label), 0) + 1
+            life.frames.append(frame)
+            life.poses.append(thing.estimate.T_world_object)
+            life.covariances.append(thing.estimate.covariance)
+            life.measured.append(thing.estimate.measured)
+            if thing.estimate.measured:
+                named.add((thing.id, life.truth))
+        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() >= _SUPPORT}
+        for body in in_view:
+            self.covered.setdefault(body, []).append(any(truth == body for _, truth in named))
+        relevant = [truth for _, truth in named if truth == 0 or truth in in_view]
+        self.counted += 1
+        self.counted_right += sorted(relevant) == sorted(in_view)
+        self.false_frames += any(truth == 0 for _, truth in named)
+
+    def summary(self) -> dict[str, Any]:
+        """All figures; see docs/objects.md."""
+        precision = self.right / max(self.right + self.wrong, 1)
+        recall = self.right / max(self.right + self.missed, 1)
+        figures: dict[str, Any] = {
+            "features": {
+                "precision": precision,
+                "recall": recall,
+                "F1": 2 * precision * recall / max(precision + recall, 1e-12),
+                "false moving per 1000 still": 1e3 * self.wrong / max(self.still, 1),
+            },
+            "false movers per frame": self.false_frames / max(self.frames, 1),
+            "counted right": self.counted_right / max(self.counted, 1),
+            "bodies": {str(b): self.body(b) for b in range(1, len(self.bodies) + 1)},
+            "false objects": [len(life.frames) for life in self.lives.values() if life.truth == 0],
+        }
+        return figures
+
+    def body(self, body: int) -> dict[str, Any]:
+        """Figures of one true body; its longest-lived object is measured."""
+        lives = {id: life for id, life in self.lives.items() if life.truth == body}
+        covered = self.covered.get(body, [])
+        figures: dict[str, Any] = {
+            "frames in view": len(covered),
+            "coverage": float(np.mean(covered)) if covered else None,
+            "ids": sorted(lives),
+        }
+        if not lives or self._world is None:
+            return figures
+        first = min(min(life.frames) for life in lives.values())
+        figures["delay [frames]"] = first - self.moves_from[body - 1]
+        life = max(lives.values(), key=lambda one: len(one.frames))
+        rows = np.flatnonzero(life.measured)
+        if len(rows) < 3:
+            return figures
+        frames = np.array(life.frames)
+        own = np.array(life.poses)
+        true = self._world @ self.bodies[body - 1][frames]
+        both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
+        me = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
+        errors = PoseErrors(np.array([e.rotation[0] for e in me]), np.array([e.translation[0] for e in me]))
+        values = object_nees(own[rows], np.array(life.covariances)[rows], true[rows])
+        figures["ME"] = errors.summary()
+        figures["relative, 10 frames"] = motion_errors(own, true, 10).summary() if len(own) > 10 else {}
+        figures["absolute"] = absolute_pose_errors(own[rows], true[rows]).summary()
+        figures["mean NEES"] = float(np.mean(values)) if len(values) else None
+        figures["dof"] = 6.0
+        return figures
+
+
+def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested summary with its keys joined by ``·``."""
+    out: dict[str, Any] = {}
+    for key, value in figures.items():
+        name = f"{prefix}{key}"
+        out.update(flat(value, name + " · ") if isinstance(value, Mapping) else {name: value})
+    return out
+
+
+def _first_motion(poses: Array, cameras: Array, focal: float, pixel: float) -> int:
+    """First frame in which a body's place differs by more than `pixel` from where it was in the first, as seen then.
+
+    Its origin and points 0.1 m off it along its axes are looked at. The number of frames where it never does.
+    """
+    marks = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
+    world = np.einsum("nij,mj->nmi", poses[:, :3, :3], marks) + poses[:, None, :3, 3]
+    shift = np.linalg.norm(world - world[0], axis=2).max(axis=1)
+    distance = np.maximum(np.linalg.norm(poses[:, :3, 3] - cameras[:, :3, 3], axis=1), 0.1)
+    moved = np.flatnonzero(focal * shift / distance > pixel)
+    return int(moved[0]) if len(moved) else len(poses)
+
+
+def score_for(sequence: Any) -> ObjectScore | None:
+    """A score for a sequence that knows its moving objects; None for all others."""
+    world = getattr(sequence, "world", None)
+    if world is None or not len(world.object_ids):
+        return None
+    frames = [sequence.objects(k).T_world_object for k in range(len(sequence))]
+    poses = np.swapaxes(np.array(frames), 0, 1)
+    return ObjectScore(poses, sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu)
+
+
+def labels_in_images(sequence: Any, frame: int, uv: Array) -> NDArray[np.int64]:
+    """The body that is seen at left pixels (N, 2) of a rendered frame, 0 for the still world."""
+    image = sequence.object_ids(frame)
+    column, row = np.clip(np.round(uv).astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
+    return np.asarray(image[row, column], np.int64)

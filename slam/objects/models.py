@@ -1,0 +1,49 @@
+"""The one place for what every estimator assumes of moving bodies: motion model, priors, how many points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from slam.errors import ConfigurationError
+
+#: As `slam.models.FORBID_UNKNOWN`, which imports this module.
+_FORBID_UNKNOWN = {"extra": "forbid"}
+
+
+@dataclass(frozen=True)
+class ObjectModels:
+    """How bodies move: constant velocity in world axes, disturbed by impulses, as the camera does.
+
+    Pixel noise and gate are those of `slam.models.EstimatorModels`.
+
+    Attributes:
+        acceleration: density of the noise of the origin's velocity [m/s / √s].
+        angular_acceleration: density of the noise of the angular velocity [rad/s / √s].
+        initial_velocity_sigma, initial_angular_velocity_sigma: of a new body's velocities [m/s], [rad/s], mean zero.
+        points: so many points of a body are estimated at most; those unseen for longest make room for new ones.
+
+    Raises:
+        ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
+    """
+
+    acceleration: float = 1.0
+    angular_acceleration: float = 2.0
+    initial_velocity_sigma: float = 0.5
+    initial_angular_velocity_sigma: float = 1.0
+    points: int = 40
+
+    __pydantic_config__ = _FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigurationError(f"objects: {f.name} must be positive and finite, got {value}")
+        if self.points < 3:
+            raise ConfigurationError(f"objects: points must be at least 3, got {self.points}")
+
+    def velocity_variance(self, dt: float) -> tuple[float, float]:
+        """Variances of the impulses on the linear [m²/s²] and angular [rad²/s²] velocity over `dt` [s]."""
+        return self.acceleration**2 * dt, self.angular_acceleration**2 * dt

@@ -1,0 +1,73 @@
+"""The detectors of moving objects by mode, and the one that detects nothing."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import Estimate, IdArray, StereoFeatures
+from slam.interfaces import Backend
+from slam.models import EstimatorModels
+from slam.objects.config import ObjectsConfig
+from slam.objects.data import Judgement, MovingObject
+from slam.objects.detector import MovingObjectDetector
+from slam.objects.procedure1 import Procedure1Detector
+from slam.rig import StereoRig
+
+
+class ObjectDetector(Protocol):
+    """What the system asks of a detector of moving objects, in every step after the back end's update."""
+
+    @property
+    def suspects(self) -> IdArray:
+        """Ids of landmarks that may move: they do not measure the camera's next pose."""
+        ...
+
+    def judge(
+        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
+    ) -> Judgement:
+        """Say which features move, before any of them becomes a landmark.
+
+        Args:
+            features: of the frame.
+            estimate: the camera's pose after the update.
+            landmark: id of the landmark that each feature was recognised as (N,), -1 for none.
+            used: rows of the features that the back end used.
+        """
+        ...
+
+    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
+        """Give the bodies' observations to the back end, and report what it makes of them."""
+        ...
+
+
+class NoDetector:
+    """Takes everything for still."""
+
+    suspects: IdArray = np.zeros(0, np.int64)
+
+    def judge(
+        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
+    ) -> Judgement:
+        """Nothing moves, nothing is undecided."""
+        none = np.zeros(0, np.intp)
+        return Judgement(none, none, np.zeros(0, np.int64))
+
+    def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
+        """No objects."""
+        return ()
+
+
+def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> ObjectDetector:
+    """The detector of the configured mode.
+
+    Raises:
+        ConfigurationError: the database of mode ``"procedure1"`` cannot be read.
+    """
+    if config.mode == "off":
+        return NoDetector()
+    if config.mode == "procedure1":
+        return Procedure1Detector(rig, config, models)
+    return MovingObjectDetector(rig, config, models)

@@ -1,0 +1,95 @@
+"""A body's points at their first sight: the body's frame, and what its shape says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.data import BoolArray
+from slam.se3 import Array, transform
+
+Projection = Callable[[Array], tuple[Array, Array]]
+
+_FAR = 4.0  # so many times the median distance from the median point is no part of the body
+_SHAPELY = 4  # points that show a shape
+_STEPS = 3  # of Gauss-Newton; the prior is weak where depth is known well
+
+
+def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
+    """The frame of a body seen for the first time: origin at the mean of its points, axes of the world.
+
+    Points far off the others (false stereo matches) are left out, so that they do not move the origin away.
+
+    Args:
+        T_world_left: pose (4, 4) of the camera.
+        h: its points (M, 3) in camera coordinates, NaN where there is no depth.
+
+    Returns:
+        T_world_object (4, 4), and which points were taken (M,).
+    """
+    world = transform(T_world_left, h)
+    seen = np.isfinite(world).all(axis=1)
+    middle = np.median(world[seen], axis=0)
+    distance = np.linalg.norm(world - middle, axis=1)
+    near = np.zeros(len(h), bool)
+    near[seen] = distance[seen] <= _FAR * np.median(distance[seen])
+    T = np.eye(4)
+    T[:3, 3] = world[near].mean(axis=0)
+    return T, near
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Where the points of a body lie: a Gaussian with mean (3,) and covariance (3, 3) in some frame."""
+
+    mean: Array
+    covariance: Array
+
+    def seen_from(self, T: Array) -> Shape:
+        """The same in another frame, to which T (4, 4) takes coordinates."""
+        R = T[:3, :3]
+        return Shape(R @ self.mean + T[:3, 3], R @ self.covariance @ R.T)
+
+
+def shape_of(points: Array, covariances: Array) -> Shape:
+    """The spread of a body's points (M, 3), less what their uncertainties (M, 3, 3) make it seem larger.
+
+    No extent is taken to be less than half the middle one: a body is seldom flatter than that, and would be taken for
+    flat wrongly where depth is all noise. Fewer than four points show no shape: then next to nothing is said.
+    """
+    if len(points) < _SHAPELY:
+        return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
+    offset = points - points.mean(axis=0)
+    total = offset.T @ offset / max(1, len(points) - 1)
+    values, axes = np.linalg.eigh(total - covariances.mean(axis=0))
+    least = max(values[1] / 4, 1e-4 * float(np.trace(total)), 1e-3 * float(np.trace(covariances.mean(axis=0))))
+    return Shape(points.mean(axis=0), (axes * np.maximum(values, least)) @ axes.T)
+
+
+def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Shape) -> tuple[Array, Array]:
+    """Points as stereo measures them, given besides that they belong to a body of known shape.
+
+    Far off, stereo scatters the points of a body further in depth than the body is deep. As they stand they make a
+    turn of the body seem much better visible than it is: an estimate that is linearised there is overconfident. With
+    the shape as prior each point is drawn to the others as far as its depth is noise.
+
+    Args:
+        project: gives measurements (M, 3) and derivatives (M, 3, 3) of points (M, 3) in left-camera coordinates.
+        z: measurements (M, 3) = (uL, vL, uR) [px].
+        h: where they triangulate to (M, 3), in left-camera coordinates.
+        sigma: pixel noise [px].
+        shape: of the body in left-camera coordinates.
+
+    Returns:
+        points (M, 3) in left-camera coordinates, and their covariances (M, 3, 3).
+    """
+    prior = np.linalg.inv(shape.covariance)
+    for _ in range(_STEPS):
+        predicted, J = project(h)
+        weight = np.swapaxes(J, 1, 2) / sigma**2
+        covariance = np.linalg.inv(weight @ J + prior)
+        gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
+        h = h + (covariance @ gradient[:, :, None])[:, :, 0]
+    return h, covariance

@@ -1,0 +1,183 @@
+"""Checks of what a back end says and refuses, call by call."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slam import se3
+from slam.data import Observations, UpdateStatus
+from slam.errors import ConfigurationError, MeasurementError
+from slam.testing.scene import (
+    DT,
+    MODELS,
+    NONE,
+    RIG,
+    Factory,
+    Run,
+    assert_covariance,
+    assert_near,
+    make_scene,
+    raises,
+    started,
+    tracked,
+)
+
+
+def first_prediction_is_the_start(factory: Factory) -> None:
+    """The first predict returns the initial pose with its covariance and no landmark."""
+    prediction = factory(RIG, models=MODELS).predict(3.0)
+    assert prediction.stamp == 3.0
+    np.testing.assert_allclose(prediction.T_world_left, np.eye(4), atol=1e-9)
+    assert_covariance(prediction.covariance, (6, 6), "first prediction")
+    sigma = np.sqrt(np.diag(prediction.covariance))
+    expected = np.repeat([MODELS.initial_rotation_sigma, MODELS.initial_position_sigma], 3)
+    np.testing.assert_allclose(sigma, expected, rtol=0.1)
+    assert len(prediction.ids) == len(prediction.uv_left) == len(prediction.uv_right) == 0
+    assert prediction.innovation.shape == (0, 2, 2)
+
+
+def initial_pose_is_kept(factory: Factory) -> None:
+    """The world may be any: the first pose is the models', and everything else follows in that world."""
+    T = se3.exp(np.array([0.4, -0.8, 2.0, 10.0, -20.0, 5.0]))
+    scene = make_scene()
+    run, _ = tracked(factory, scene, replace(MODELS, T_world_left=T.tolist()))
+    backend = run.backend
+    assert_near(backend.estimate().T_world_left, T @ scene.poses[-1], "pose in a turned world")
+    found = backend.estimate()
+    error = found.positions - se3.transform(T, scene.points[found.ids])
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.5, "landmarks are not in the initial pose's world"
+
+
+def time_must_increase(factory: Factory) -> None:
+    """A stamp that is not finite or not later is refused, and does no harm."""
+    backend, _ = started(factory)
+    for stamp in (0.0, -1.0, float("nan"), float("inf")):
+        raises(MeasurementError, backend.predict, stamp, what=f"predict({stamp}) after 0.0")
+    assert backend.predict(DT).stamp == DT
+
+
+def calls_before_the_first_prediction(factory: Factory) -> None:
+    """Nothing can be measured before the start."""
+    seen = make_scene(1).frames[0]
+    raises(MeasurementError, factory(RIG, models=MODELS).add, seen, what="add before predict")
+    raises(MeasurementError, factory(RIG, models=MODELS).update, seen, what="update before predict")
+
+
+def unknown_option_is_refused(factory: Factory) -> None:
+    """An option that does not exist is an error, not ignored."""
+    raises(ConfigurationError, factory, RIG, models=MODELS, no_such_option=1, what="unknown option")
+
+
+def nothing_seen_is_no_error(factory: Factory) -> None:
+    """Frames without observations: the state is predicted, the status says so, uncertainty grows."""
+    scene = make_scene(6)
+    backend = tracked(factory, scene)[0].backend
+    before = backend.estimate()
+    for k in range(6, 12):
+        backend.predict(DT * k)
+        report = backend.update(Observations.empty())
+        assert report.status is UpdateStatus.EMPTY and report.dof == 0 and np.isnan(report.nis)
+        assert len(report.used) == len(report.rejected) == 0
+    after = backend.estimate()
+    assert np.isfinite(after.T_world_left).all()
+    assert_covariance(after.covariance, (6, 6), "after frames without observations")
+    assert np.trace(after.covariance) > np.trace(before.covariance), "uncertainty must grow in the dark"
+    np.testing.assert_array_equal(after.ids, before.ids)
+
+
+def ids_must_fit_the_map(factory: Factory) -> None:
+    """Unknown ids, known ids added again, and rows without depth are refused and change nothing."""
+    backend, seen = started(factory)
+    before = backend.estimate()
+    stranger = Observations(np.array([999]), seen.uv_left[:1], seen.uv_right[:1])
+    blind = replace(stranger, uv_right=np.full((1, 2), np.nan))
+    behind = replace(stranger, uv_right=stranger.uv_left + np.array([30.0, 0.0]))
+    raises(MeasurementError, backend.add, seen.select(np.arange(3)), what="add of known ids")
+    raises(MeasurementError, backend.add, blind, what="add without a right pixel")
+    raises(MeasurementError, backend.add, behind, what="add with negative depth")
+    raises(MeasurementError, backend.remove, [999], what="remove of an unknown id")
+    raises(MeasurementError, backend.positions, np.array([999]), what="position of an unknown id")
+    backend.predict(DT)
+    raises(MeasurementError, backend.update, stranger, what="update with an unknown id")
+    after = backend.estimate()
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_allclose(after.positions, before.positions, atol=1e-9)
+
+
+def estimate_is_in_order(factory: Factory) -> None:
+    """Ids ascend, `positions` follows the order asked for, and without landmarks the pose is the same."""
+    scene, run = make_scene(2), Run(factory)
+    run.step(0, scene.frames[0].select(np.arange(len(scene.frames[0]))[::-1]))
+    run.step(1, scene.frames[1])
+    backend = run.backend
+    whole, pose_only = backend.estimate(), backend.estimate(landmarks=False)
+    assert (np.diff(whole.ids) > 0).all()
+    # An offline back end may solve for `estimate` alone, so `positions` may be an earlier answer, but not another one.
+    off = np.abs(backend.positions(whole.ids[::-1])[::-1] - whole.positions)
+    deviations = np.sqrt(np.diagonal(whole.covariances, axis1=1, axis2=2))
+    assert (off < deviations).all(), "positions and estimate differ by more than a standard deviation"
+    assert len(pose_only.ids) == 0 and pose_only.positions.shape == (0, 3) and pose_only.covariances.shape == (0, 3, 3)
+    np.testing.assert_array_equal(pose_only.T_world_left, whole.T_world_left)
+    np.testing.assert_allclose(pose_only.covariance, whole.covariance, rtol=1e-9)
+    assert whole.stamp == pose_only.stamp == DT
+
+
+def trajectory_has_every_stamp(factory: Factory) -> None:
+    """A pose for every stamp predicted; the last is the estimate's; all near the truth."""
+    scene = make_scene()
+    backend = tracked(factory, scene)[0].backend
+    trajectory = backend.trajectory()
+    np.testing.assert_allclose(trajectory.stamps, DT * np.arange(len(scene.frames)), atol=1e-12)
+    np.testing.assert_allclose(trajectory.poses[-1], backend.estimate().T_world_left, atol=1e-9)
+    for T, truth in zip(trajectory.poses, scene.poses):
+        assert_near(T, truth, "trajectory")
+
+
+def results_are_the_callers_own(factory: Factory) -> None:
+    """Writing into what a back end returned does not reach its state."""
+    backend = tracked(factory, make_scene(4))[0].backend
+    before = backend.estimate()
+    copy = (before.T_world_left.copy(), before.positions.copy(), before.covariance.copy())
+    returned = backend.estimate()
+    for array in (returned.T_world_left, returned.positions, returned.covariance, backend.trajectory().poses):
+        if array.flags.writeable:
+            array[:] = 7.0
+    backend.positions(before.ids)[:] = 7.0
+    after = backend.estimate()
+    for a, b in zip(copy, (after.T_world_left, after.positions, after.covariance)):
+        np.testing.assert_array_equal(a, b)
+
+
+def same_input_same_bytes(factory: Factory) -> None:
+    """Two runs over the same observations agree to the last bit."""
+    runs = [tracked(factory, make_scene(8))[0].backend for _ in range(2)]
+    first, second = (backend.estimate() for backend in runs)
+    np.testing.assert_array_equal(first.T_world_left, second.T_world_left)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    np.testing.assert_array_equal(first.positions, second.positions)
+    np.testing.assert_array_equal(runs[0].trajectory().poses, runs[1].trajectory().poses)
+
+
+def removed_landmarks_are_gone(factory: Factory) -> None:
+    """Removal takes landmarks out of everything; tracking goes on; an id may come back."""
+    scene = make_scene()
+    run, _ = tracked(factory, replace(scene, frames=scene.frames[:8]))
+    backend = run.backend
+    ids = backend.estimate().ids
+    gone, kept = ids[::3], np.setdiff1d(ids, ids[::3])
+    before = backend.positions(kept)
+    backend.remove(gone)
+    run.known -= set(gone.tolist())
+    backend.remove(NONE)
+    np.testing.assert_array_equal(backend.estimate().ids, kept)
+    np.testing.assert_allclose(backend.positions(kept), before, atol=1e-6)
+    raises(MeasurementError, backend.positions, gone[:1], what="position of a removed landmark")
+    for k in range(8, len(scene.frames)):
+        prediction, report = run.step(k, scene.frames[k])
+        assert report.status is UpdateStatus.OK
+        assert k > 8 or not np.isin(prediction.ids, gone).any(), "a removed landmark is predicted"
+    assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose after removals")
+    back = gone[np.isin(gone, scene.frames[-1].ids)]
+    assert len(back) and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back"

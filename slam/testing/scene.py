@@ -1,0 +1,131 @@
+"""What the checks of the contract share: a small scene, a back end on its way through it, and assertions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from slam import se3
+from slam.camera import PinholeCamera
+from slam.data import BoolArray, Observations, Prediction, UpdateReport
+from slam.interfaces import Backend
+from slam.models import EstimatorModels
+from slam.rig import StereoRig
+from slam.se3 import Array
+
+Factory = Callable[..., Backend]
+
+RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
+
+#: Distorted, with the right camera turned and shifted: measurements are in the rig's own pixels whatever it is.
+GENERAL_RIG = StereoRig(
+    PinholeCamera(410.0, 405.0, 310.0, 245.0, 640, 480, "radtan", (-0.1, 0.02, 1e-3, -5e-4)),
+    PinholeCamera(400.0, 402.0, 325.0, 238.0, 640, 480, "radtan", (-0.08, 0.01, -5e-4, 1e-3)),
+    se3.so3_exp(np.array([0.01, -0.03, 0.005])),
+    np.array([-0.2, 0.004, -0.006]),
+)
+
+SIGMA = 0.5  # pixel noise [px]
+MODELS = EstimatorModels(pixel_sigma=SIGMA)
+DT = 0.1
+_POSITION, _ROTATION = 0.05, 0.01  # largest pose errors on the scene [m], [rad]
+NONE = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A camera that flies slowly through points, with noisy observations of all of them that are in view."""
+
+    rig: StereoRig
+    poses: Array
+    points: Array
+    frames: tuple[Observations, ...]
+
+
+def make_scene(count: int = 15, rig: StereoRig = RIG) -> Scene:
+    """A scene of 60 points, with so many frames."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform((-4, -3, 4), (4, 3, 12), (60, 3))
+    step = se3.exp(DT * np.array([0.02, 0.1, -0.05, 0.2, -0.1, 0.5]))
+    poses = [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ step)
+    frames = tuple(observe(rig, T, points, rng) for T in poses)
+    return Scene(rig, np.array(poses), points, frames)
+
+
+def observe(rig: StereoRig, T: Array, points: Array, rng: np.random.Generator) -> Observations:
+    """What the rig sees of points (N, 3) from the pose T (4, 4), with noise."""
+    left, right = rig.project(se3.transform(se3.inverse(T), points))
+    seen = np.flatnonzero(rig.left.in_image(left) & rig.right.in_image(right))
+    noise = SIGMA * rng.standard_normal((2, len(seen), 2))
+    return Observations(seen.astype(np.int64), left[seen] + noise[0], right[seen] + noise[1])
+
+
+class Run:
+    """A back end on its way through frames; it remembers which landmarks it has added."""
+
+    def __init__(self, factory: Factory, rig: StereoRig = RIG, models: EstimatorModels = MODELS) -> None:
+        self.backend: Backend = factory(rig, models=models)
+        self.known: set[int] = set()
+
+    def step(self, k: int, seen: Observations) -> tuple[Prediction, UpdateReport]:
+        """Frame k: predict, update with what the map has, add the rest."""
+        prediction = self.backend.predict(DT * k)
+        old = self.in_map(seen)
+        report = self.backend.update(seen.select(old))
+        self.backend.add(seen.select(~old))
+        self.known.update(seen.ids.tolist())
+        return prediction, report
+
+    def in_map(self, seen: Observations) -> BoolArray:
+        """Which observations (M,) are of landmarks that the map has."""
+        return np.array([i in self.known for i in seen.ids.tolist()], bool)
+
+
+def tracked(factory: Factory, scene: Scene, models: EstimatorModels = MODELS) -> tuple[Run, list[UpdateReport]]:
+    """A back end after all frames of a scene, and its reports."""
+    run = Run(factory, scene.rig, models)
+    return run, [run.step(k, seen)[1] for k, seen in enumerate(scene.frames)]
+
+
+def all_but_the_last(factory: Factory, scene: Scene) -> tuple[Backend, Observations]:
+    """A back end with the last frame predicted but not measured, and what it sees there of its map."""
+    run, _ = tracked(factory, replace(scene, frames=scene.frames[:-1]))
+    run.backend.predict(DT * (len(scene.frames) - 1))
+    last = scene.frames[-1]
+    return run.backend, last.select(run.in_map(last))
+
+
+def started(factory: Factory) -> tuple[Backend, Observations]:
+    """A back end that has seen one frame, and what it saw."""
+    run, scene = Run(factory), make_scene(1)
+    run.step(0, scene.frames[0])
+    return run.backend, scene.frames[0]
+
+
+def raises(error: type[Exception], call: Callable[..., Any], *args: Any, what: str, **kwargs: Any) -> None:
+    """Fail unless the call raises the error."""
+    try:
+        call(*args, **kwargs)
+    except error:
+        return
+    raise AssertionError(f"{what}: {error.__name__} expected")
+
+
+def assert_covariance(P: Array, shape: tuple[int, ...], what: str) -> None:
+    """Fail unless P is finite, of that shape, symmetric and positive definite (or nearly)."""
+    assert P.shape == shape and np.isfinite(P).all(), f"{what}: finite covariance of shape {shape} expected"
+    scale = np.abs(P).max(initial=0.0)
+    assert np.abs(P - np.swapaxes(P, -1, -2)).max(initial=0.0) <= 1e-9 * scale, f"{what}: covariance is not symmetric"
+    assert not len(P) or np.linalg.eigvalsh(P).min() > -1e-9 * scale, f"{what}: covariance is not positive definite"
+
+
+def assert_near(T: Array, truth: Array, what: str, factor: float = 1.0) -> None:
+    """Fail unless a pose is near the true one."""
+    error = se3.log(se3.inverse(truth) @ T)
+    turned, moved = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    assert moved < factor * _POSITION and turned < factor * _ROTATION, f"{what}: off by {moved} m, {turned} rad"

@@ -1,0 +1,223 @@
+"""Landmarks whose place is known beforehand, in the world or before the camera, in every back end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import backends
+from slam import se3
+from slam.data import Observations, UpdateStatus
+from slam.errors import MeasurementError
+from slam.interfaces import MapBackend
+from slam.models import EstimatorModels
+from slam.rig import StereoRig
+
+RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
+SIGMA = 0.5
+DT = 0.1
+KNOWN = 0.01  # standard deviation of what is known of a landmark [m]
+NAMES = ("ekf", "smoother", "batch")
+START = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.4]))  # the camera's true place at first
+
+
+class Scene:
+    """Points known to within `KNOWN`, and a camera that flies slowly before them from `START`."""
+
+    def __init__(self, frames: int = 12, count: int = 40, mono: bool = False, seed: int = 3) -> None:
+        rng = np.random.default_rng(seed)
+        self.points = rng.uniform((-3, -2, 4), (3, 2, 9), (count, 3))
+        self.ids = 7 + 3 * np.arange(count)
+        self.believed = self.points + KNOWN * rng.standard_normal((count, 3))
+        self.covariances = np.tile(KNOWN**2 * np.eye(3), (count, 1, 1))
+        step = se3.exp(DT * np.array([0.02, 0.1, -0.05, 0.2, -0.1, 0.3]))
+        self.poses = [START]
+        for _ in range(frames - 1):
+            self.poses.append(self.poses[-1] @ step)
+        self.seen = [self._observe(T, rng, mono) for T in self.poses]
+
+    def _observe(self, T, rng, mono):
+        left, right = RIG.project(se3.transform(se3.inverse(T), self.points))
+        rows = np.flatnonzero(RIG.left.in_image(left) & RIG.right.in_image(right))
+        noise = SIGMA * rng.standard_normal((2, len(rows), 2))
+        right = np.full((len(rows), 2), np.nan) if mono else right[rows] + noise[1]
+        return Observations(self.ids[rows], left[rows] + noise[0], right)
+
+    def row(self, ids):
+        return np.searchsorted(self.ids, ids)
+
+
+def models(**changes):
+    vague = {"initial_position_sigma": 1.0, "initial_rotation_sigma": 0.5}
+    return EstimatorModels(pixel_sigma=SIGMA, **{**vague, **changes})
+
+
+def tracked(name, scene, options=None, before=True, guess=START, disturb=None, share=0.9):
+    """A back end after all frames, which begins at the origin while the camera is at `START`."""
+    backend = backends.create(name, RIG, models=models(), **(options or {}))
+    if before:
+        backend.insert(scene.ids, scene.believed, scene.covariances)
+    for k, seen in enumerate(scene.seen):
+        prediction = backend.predict(DT * k)
+        if k == 0 and not before:
+            backend.insert(scene.ids, scene.believed, scene.covariances)
+            continue
+        report = backend.update(seen, guess if k < 2 else None)
+        assert report.status is UpdateStatus.OK, (k, report.reason)
+        assert len(report.used) > share * len(seen)
+        if k > 1:
+            assert len(prediction.ids) > 20
+        if disturb is not None:
+            disturb(k, backend)
+    return backend
+
+
+def squared_distance(estimate, truth):
+    error = se3.log(se3.inverse(estimate.T_world_left) @ truth)
+    return float(error @ np.linalg.solve(estimate.covariance, error))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_camera_is_found_in_a_known_map(name):
+    scene = Scene()
+    backend = tracked(name, scene)
+    assert isinstance(backend, MapBackend)
+    estimate = backend.estimate()
+    # 40 points known to 1 cm, 4 to 9 m away, fix the place to 15 mm; χ²₆ exceeds 25 once in 3000 times
+    assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
+    assert squared_distance(estimate, scene.poses[-1]) < 25
+    assert np.sqrt(np.trace(estimate.covariance[3:, 3:])) < 0.02
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_measuring_makes_the_map_better_and_its_covariances_fit(name):
+    scene = Scene(frames=20)
+    estimate = tracked(name, scene).estimate()
+    assert (estimate.ids == scene.ids).all()
+    errors = estimate.positions - scene.points
+    assert np.square(errors).mean() < np.square(scene.believed - scene.points).mean()
+    assert np.trace(estimate.covariances, axis1=1, axis2=2).mean() < 3 * KNOWN**2
+    distances = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(estimate.covariances), errors)
+    assert 0.5 < distances.mean() / 3 < 1.6  # 40 landmarks, correlated through the pose
+
+
+@pytest.mark.parametrize("name", ("ekf", "smoother"))
+def test_left_pixels_alone_are_enough_in_a_known_map(name):
+    scene = Scene(mono=True)
+    estimate = tracked(name, scene).estimate()
+    assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
+    assert squared_distance(estimate, scene.poses[-1]) < 25
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_inserted_and_never_seen_stays_as_it_is(name):
+    scene = Scene(frames=6)
+    backend = backends.create(name, RIG, models=models())
+    behind, P = np.array([[1.0, 2.0, -30.0]]), np.diag([0.01, 0.04, 0.09])[None]
+    backend.insert(np.array([5000]), behind, P)
+    backend.insert(scene.ids, scene.believed, scene.covariances)
+    for k, seen in enumerate(scene.seen):
+        backend.predict(DT * k)
+        backend.update(seen, START)
+    estimate = backend.estimate()
+    np.testing.assert_allclose(estimate.positions[-1], behind[0], atol=1e-6)
+    np.testing.assert_allclose(estimate.covariances[-1], P[0], rtol=1e-3, atol=1e-6)
+    assert backend.positions(np.array([5000])).shape == (1, 3)
+    backend.remove([5000])
+    with pytest.raises(MeasurementError, match="5000"):
+        backend.positions(np.array([5000]))
+
+
+def test_filter_smoother_and_batch_agree():
+    scene = Scene()
+    poses = [tracked(name, scene).estimate().T_world_left[:3, 3] for name in NAMES]
+    # the camera's place is known to 15 mm; they differ by how they linearise
+    assert np.ptp(poses, axis=0).max() < 0.001
+
+
+def test_after_the_first_frame_serves_as_well():
+    scene = Scene()
+    for name in ("ekf", "smoother"):
+        estimate = tracked(name, scene, before=False).estimate()
+        assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
+
+
+def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
+    scene = Scene()
+    plain = tracked("smoother", scene).estimate()
+    rebuilt = tracked("smoother", scene, disturb=lambda k, b: b._graph._recover() if k in (0, 5) else None).estimate()
+    np.testing.assert_allclose(rebuilt.T_world_left, plain.T_world_left, atol=1e-3)  # of 15 mm
+    np.testing.assert_allclose(rebuilt.positions, plain.positions, atol=1e-3)
+
+    def forget(k, backend):
+        if k == 5:
+            backend.records.forget_measurements()
+            backend._graph._rebuild(solved=False)
+
+    forgotten = tracked("smoother", scene, disturb=forget, share=0.4)
+    last = forgotten.estimate().T_world_left
+    assert np.linalg.norm(last[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
+
+
+def test_the_smoother_with_a_lag_tracks_in_a_known_map():
+    scene = Scene(frames=30)
+    estimate = tracked("smoother", scene, {"lag": 12}).estimate()
+    assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_landmarks_placed_before_the_camera_move_with_its_pose(name):
+    """With the camera's own place known to 5 cm, so is theirs; the next pose is known relative to them."""
+    scene = Scene(frames=8)
+    backend = backends.create(
+        name, RIG, models=models(initial_position_sigma=0.05, initial_rotation_sigma=1e-3, T_world_left=START.tolist())
+    )
+    backend.predict(0.0)
+    first = scene.seen[0]
+    local = RIG.triangulate(first.uv_left, first.uv_right)
+    backend.place(first.ids, local, RIG.triangulation_covariance(local, SIGMA))
+    spread = np.sqrt(backend.estimate().covariances[:, 0, 0])
+    assert (spread > 0.05).all()
+    for k, seen in enumerate(scene.seen[1:], start=1):
+        backend.predict(DT * k)
+        report = backend.update(seen.select(np.isin(seen.ids, first.ids)))
+        assert len(report.used) > 0.8 * len(seen)
+    last = backend.estimate().T_world_left
+    # the first pose is believed where it is: what was placed is seen from there
+    assert np.linalg.norm(last[:3, 3] - scene.poses[-1][:3, 3]) < 0.03
+
+
+def test_placing_what_stereo_says_is_adding():
+    """`place` with the stereo pair's own covariance gives the filter the very belief that `add` does."""
+    scene = Scene(frames=1)
+    seen = scene.seen[0]
+    local = RIG.triangulate(seen.uv_left, seen.uv_right)
+    one, other = (backends.create("ekf", RIG, models=models()) for _ in range(2))
+    one.predict(0.0), other.predict(0.0)
+    one.add(seen)
+    other.place(seen.ids, local, RIG.triangulation_covariance(local, SIGMA))
+    np.testing.assert_array_equal(one.estimate().covariances, other.estimate().covariances)
+    np.testing.assert_array_equal(one.estimate().positions, other.estimate().positions)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda i, x, P: (i, x[:-1], P), "positions"),
+        (lambda i, x, P: (np.r_[i[:-1], i[0]], x, P), "twice"),
+        (lambda i, x, P: (i, x * np.nan, P), "not finite"),
+        (lambda i, x, P: (i, x, -P), "positive definite"),
+        (lambda i, x, P: (i, x, P + np.triu(P + 1, 1)), "positive definite"),
+    ],
+)
+def test_bad_input_is_refused_with_one_line(name, change, words):
+    scene = Scene(frames=1)
+    backend = backends.create(name, RIG, models=models())
+    with pytest.raises(MeasurementError, match=words):
+        backend.insert(*change(scene.ids, scene.believed, scene.covariances))
+    backend.insert(scene.ids, scene.believed, scene.covariances)
+    with pytest.raises(MeasurementError, match=r"landmark 7 .*already"):
+        backend.insert(scene.ids, scene.believed, scene.covariances)
+    with pytest.raises(MeasurementError, match="before the first predict"):
+        backend.place(scene.ids + 1000, scene.believed, scene.covariances)

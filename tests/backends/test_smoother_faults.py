@@ -1,0 +1,253 @@
+"""gtsam fails: the smoother rebuilds from its records and the run goes on, the same way every time."""
+
+from __future__ import annotations
+
+from itertools import count
+
+import gtsam
+import numpy as np
+import pytest
+
+from backends import smoother
+from backends.smoother import SmootherBackend, rebuild, solver
+from slam import se3
+from slam.data import Observations, UpdateStatus
+from slam.models import EstimatorModels, MotionModel
+from tests.backends.scenes import RIG, path, run, scene, step
+
+MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
+DT = 0.1
+
+#: What gtsam throws from update and from its queries.
+ERRORS = {
+    "indeterminate": RuntimeError(
+        "\nIndeterminant linear system detected while working near variable\n8646911284551352325 (Symbol: x5).\n"
+    ),
+    "cheirality": RuntimeError("Stereo Cheirality Exception"),
+    "no such key": IndexError("invalid map<K, T> key"),
+    "no such value": RuntimeError("Attempting to at the key 'x7', which does not exist in the Values."),
+    "not in a table": KeyError("x7"),
+    "bad argument": ValueError("removeFactorIndices: no such factor"),
+}
+
+
+def drive(frames: int = 22):
+    return scene(path(frames, DT, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.03, 0.0])), points=150)
+
+
+class Fails:
+    """A method that fails in some of its calls, counted from 0, and otherwise does what it did."""
+
+    def __init__(self, monkeypatch, owner, name: str, calls, error: Exception) -> None:
+        self.original, self.calls, self.error, self.number = getattr(owner, name), set(calls), error, count()
+        self.failed = 0
+        fails = self
+
+        def method(*args, **kwargs):
+            if next(fails.number) in fails.calls:
+                fails.failed += 1
+                raise fails.error
+            return fails.original(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, method)
+
+
+class BrokenIsam:
+    """gtsam's ISAM2, but for one method that fails in some of its calls over all instances."""
+
+    method = "update"
+    calls: frozenset[int] = frozenset()
+    error: Exception = RuntimeError()
+    number = count()
+    failed = 0
+
+    def __init__(self, parameters) -> None:
+        self._isam = ISAM2(parameters)
+
+    def __getattr__(self, name: str):
+        def broken(*args):
+            if next(BrokenIsam.number) in BrokenIsam.calls:
+                BrokenIsam.failed += 1
+                raise BrokenIsam.error
+            return getattr(self._isam, name)(*args)
+
+        return broken if name == BrokenIsam.method else getattr(self._isam, name)
+
+
+ISAM2 = gtsam.ISAM2
+
+
+@pytest.fixture
+def break_isam(monkeypatch):
+    def set_up(method: str, calls, error: Exception) -> None:
+        monkeypatch.setattr(gtsam, "ISAM2", BrokenIsam)
+        for name, value in (("method", method), ("calls", frozenset(calls)), ("error", error), ("failed", 0)):
+            monkeypatch.setattr(BrokenIsam, name, value)
+        monkeypatch.setattr(BrokenIsam, "number", count())
+
+    return set_up
+
+
+def near_the_truth(backend, data, factor: float = 1.0) -> None:
+    trajectory = backend.trajectory()
+    assert len(trajectory) == len(data.poses)
+    off = se3.log(se3.inverse(data.poses) @ trajectory.poses)
+    assert np.abs(off[:, 3:]).max() < factor * 0.05 and np.abs(off[:, :3]).max() < factor * 0.01
+    P = backend.estimate().covariance
+    assert np.isfinite(P).all() and np.linalg.eigvalsh(P).min() > 0
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_one_failure_costs_nothing(break_isam, name):
+    data, untouched = drive(), SmootherBackend(RIG, MODELS)
+    run(untouched, data)
+    break_isam("update", [12], ERRORS[name])
+    backend = SmootherBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert BrokenIsam.failed == 1
+    assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"
+    # The same measurements and models; what is left is how far ISAM2 lets a variable move before it linearises anew.
+    off = se3.log(se3.inverse(untouched.trajectory().poses) @ backend.trajectory().poses)
+    assert np.abs(off).max() < 1e-3
+    near_the_truth(backend, data)
+
+
+@pytest.mark.parametrize("failures", [2, 4, 12])
+def test_failures_on_end_cost_a_step_at_most(break_isam, failures):
+    data = drive()
+    break_isam("update", range(12, 12 + failures), ERRORS["indeterminate"])
+    backend = SmootherBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert BrokenIsam.failed == failures
+    failed = [r for r in reports if r.status is UpdateStatus.FAILED]
+    assert 1 <= len(failed) <= 4
+    for report in failed:
+        assert report.reason.startswith("smoother: gtsam: Indeterminant") and "\n" not in report.reason
+        assert not len(report.used)
+    assert all(r.status is UpdateStatus.OK for r in reports[-8:])
+    near_the_truth(backend, data, factor=2)
+
+
+@pytest.mark.parametrize("lag", [None, 12])
+def test_failure_after_failure(break_isam, lag):
+    data = drive(30)
+    break_isam("update", range(5, 60, 4), ERRORS["cheirality"])
+    backend = SmootherBackend(RIG, MODELS, lag=lag)
+    reports = run(backend, data)
+    assert BrokenIsam.failed > 8
+    assert all(r.status is UpdateStatus.OK for r in reports[1:])
+    near_the_truth(backend, data)
+
+
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        ("calculateEstimatePose3", "no such key"),
+        ("calculateEstimatePoint3", "no such value"),
+        ("calculateBestEstimate", "indeterminate"),
+    ],
+)
+def test_reading_back_fails(break_isam, method, name):
+    data = drive(20)
+    break_isam(method, [3, 4, 25, 26, 27], ERRORS[name])
+    backend = SmootherBackend(RIG, MODELS)
+    run(backend, data)
+    for _ in range(6):
+        backend.trajectory()
+    assert BrokenIsam.failed >= 2
+    near_the_truth(backend, data)
+
+
+@pytest.mark.parametrize(
+    ("calls", "error"),
+    [
+        ([5], ERRORS["indeterminate"]),
+        (range(5, 8), np.linalg.LinAlgError("singular matrix")),
+        (range(3, 100), ERRORS["no such key"]),
+    ],
+    ids=["once", "three times", "always"],
+)
+def test_covariance_queries_never_fail(monkeypatch, calls, error):
+    data = drive(14)
+    fails = Fails(monkeypatch, solver, "_root_of", calls, error)
+    backend = SmootherBackend(RIG, MODELS)
+    known: set[int] = set()
+    for stamp, _, seen in data:
+        assert step(backend, stamp, seen, known).status in (UpdateStatus.OK, UpdateStatus.EMPTY)
+        estimate = backend.estimate()
+        assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+        assert np.isfinite(estimate.covariances).all()
+    assert fails.failed
+    near_the_truth(backend, data)
+
+
+def test_a_covariance_that_is_none_is_not_handed_on(monkeypatch):
+    monkeypatch.setattr(solver, "_covariance_in", lambda variables, R, keys: np.full((6 * len(keys),) * 2, np.nan))
+    data = drive(15)
+    backend = SmootherBackend(RIG, MODELS)
+    run(backend, data)
+    near_the_truth(backend, data)
+    # Carried on by the motion alone, the uncertainty grows without measurements to bound it: large, but honest.
+    assert np.trace(backend.estimate().covariance[3:, 3:]) > 1e-4
+
+
+def test_the_whole_problem_cannot_be_solved_for_a_while(break_isam, monkeypatch):
+    data = drive()
+    fails = Fails(monkeypatch, rebuild, "optimise", range(3), solver.SolverError("no solution"))
+    monkeypatch.setattr(smoother.posegraph, "optimise", rebuild.optimise)
+    break_isam("update", [8, 14, 19], ERRORS["indeterminate"])
+    backend = SmootherBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert fails.failed == 3
+    assert all(r.status is UpdateStatus.OK for r in reports[-3:])
+    near_the_truth(backend, data, factor=2)
+
+
+def test_starting_over_keeps_the_path(break_isam):
+    """Nothing but the poses can be put into the solver: the path keeps its shape, and the run goes on."""
+    data = drive(30)
+    backend = SmootherBackend(RIG, MODELS)
+    known: set[int] = set()
+    for k, (stamp, _, seen) in enumerate(data):
+        if k == 15:
+            backend.records.forget_measurements()
+            backend._graph._rebuild(solved=False)
+            before = backend.trajectory().poses
+            off = se3.log(se3.inverse(data.poses[:15]) @ before)
+            assert np.abs(off).max() < 0.05
+        assert step(backend, stamp, seen, known).status in (UpdateStatus.OK, UpdateStatus.EMPTY)
+    assert backend.records.history.restarted == 15
+    near_the_truth(backend, data, factor=4)  # the first half's measurements are gone
+
+
+def test_recovery_is_the_same_every_time(break_isam):
+    data, ends = drive(), []
+    for _ in range(2):
+        break_isam("update", [6, 11, 12, 17], ERRORS["indeterminate"])
+        backend = SmootherBackend(RIG, MODELS)
+        run(backend, data)
+        assert BrokenIsam.failed == 4
+        ends.append((backend.trajectory().poses, backend.estimate()))
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    np.testing.assert_array_equal(ends[0][1].covariance, ends[1][1].covariance)
+    np.testing.assert_array_equal(ends[0][1].positions, ends[1][1].positions)
+
+
+def test_impossible_measurements_do_not_end_a_run():
+    """Random pixels for known landmarks, for some frames: gated, or solved as well as can be, but no exception."""
+    data = drive(30)
+    backend = SmootherBackend(RIG, MODELS)
+    known: set[int] = set()
+    rng = np.random.default_rng(0)
+    for k, (stamp, _, seen) in enumerate(data):
+        if 10 <= k < 15:
+            left = rng.uniform((0, 0), (RIG.width - 1, RIG.height - 1), (len(seen), 2))
+            right = left - np.stack([rng.uniform(-5, 60, len(seen)), np.zeros(len(seen))], axis=1)
+            old = np.isin(seen.ids, list(known))
+            backend.predict(stamp)
+            backend.update(Observations(seen.ids, left, right).select(old))
+        else:
+            step(backend, stamp, seen, known)
+        assert np.isfinite(backend.estimate().T_world_left).all()
+    off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate().T_world_left)
+    assert np.abs(off[3:]).max() < 0.2 and np.abs(off[:3]).max() < 0.05

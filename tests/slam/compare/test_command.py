@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+
+def slam(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "slam", *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+
+
+def test_the_command_leaves_report_and_tables_and_says_what_follows(tmp_path):
+    done = slam(
+        "compare", "synthetic:aisle?frames=6", "--backends", "ekf,smoother", "--frontends", "simulated", "--no-replay",
+        "--workers", 1, "--quick", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "ATE RMSE, online" in done.stdout
+    assert "One trial cannot tell" in done.stdout
+    assert "2 runs, 0 failed" in done.stdout
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"report.html", "runs.csv", "means.csv", "differences.csv", "timings.csv", "sweep.json", "runs"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["synthetic:nowhere"], "nowhere"),
+        (["synthetic:aisle", "--backends", "ekf,nothing"], "nothing"),
+        (["synthetic:aisle?seed=1"], "seed"),
+        (["synthetic:aisle", "--variant", "a:surf:b"], "form"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, arguments, word):
+    done = slam("compare", *arguments, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert word in lines[0]
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam import registry
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from slam.errors import ConfigurationError
+from slam.objects.config import ObjectsConfig
+from slam.objects.metrics import score_for
+from tests.slam.objects.double import FitBackend
+
+
+def system_for(sequence, objects=True, mode="detect", **settings):
+    config = SystemConfig.for_kind(sequence.kind, None)
+    config = replace(config, objects=replace(config.objects, mode=mode, **settings))
+    backend = registry.create("backends", "ekf", sequence.rig, models=config.models)
+    return slam.StereoSlam(sequence.rig, None, FitBackend(backend) if objects else backend, config=config)
+
+
+@pytest.fixture(scope="module")
+def box_run():
+    """The box of paper B's section 4.4, from rest to its second place."""
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system, score, results = system_for(sequence), score_for(sequence), []
+    for k in range(115):
+        seen = sequence.simulate(k)
+        results.append((system.process_features(seen.features), seen.objects))
+        score.add(k, results[-1][0], seen.objects)
+    return results, score
+
+
+def test_the_box_is_found_once_and_followed(box_run):
+    _, score = box_run
+    body = score.body(1)
+    assert body["ids"], "the box was not found"
+    # It starts to move at frame 60, and is a pixel away at 66; its motion is seen against a pose that it draws along.
+    assert body["delay [frames]"] <= 15
+    longest = max(score.lives.values(), key=lambda life: len(life.frames))
+    assert longest.truth == 1 and longest.frames[-1] == 114
+
+
+def test_nearly_no_still_feature_is_said_to_move(box_run):
+    _, score = box_run
+    assert score.summary()["features"]["precision"] > 0.95
+
+
+def test_moving_features_never_become_landmarks(box_run):
+    results, _ = box_run
+    for result, _ in results:
+        assert not np.isin(result.added_features, result.moving_features).any()
+
+
+def test_nothing_moves_in_a_still_world():
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system = system_for(sequence)
+    flagged = count = 0
+    for k in range(50):
+        result = system.process_features(sequence.observations(k))
+        flagged, count = flagged + len(result.moving_features), count + len(result.features)
+        assert not result.objects
+    assert flagged <= 0.002 * count
+
+
+def test_without_an_estimate_there_are_no_objects():
+    sequence = slam.open_sequence("synthetic:box?density=300")
+
+    class Plain:
+        """A back end that knows nothing of objects."""
+
+        def __init__(self, backend):
+            for name in ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"):
+                setattr(self, name, getattr(backend, name))
+
+    system = system_for(sequence, objects=False)
+    system.backend = Plain(system.backend)
+    for k in range(58, 80):
+        assert system.process_features(sequence.observations(k)).objects == ()
+
+
+def test_frames_with_nothing_to_see_are_no_error():
+    sequence = slam.open_sequence("synthetic:desk?frames=8")
+    system = system_for(sequence)
+    for k in range(8):
+        features = sequence.observations(k)
+        if k in (0, 3, 4):
+            features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1])
+        assert not len(system.process_features(features).moving_features)
+
+
+def test_off_detects_nothing():
+    sequence = slam.open_sequence("synthetic:desk?frames=3")
+    system = system_for(sequence, mode="off")
+    assert not any(len(system.process_features(sequence.observations(k)).moving_features) for k in range(3))
+
+
+def test_settings_are_checked():
+    with pytest.raises(ConfigurationError, match="mode"):
+        ObjectsConfig(mode="neural")
+    with pytest.raises(ConfigurationError, match="database"):
+        ObjectsConfig(mode="procedure1")
+    with pytest.raises(ConfigurationError, match="min_support"):
+        ObjectsConfig(min_support=2)

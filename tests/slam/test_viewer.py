@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from slam.config import SystemConfig
+from slam.errors import SlamError
+from slam.runner import RunOptions, run
+from slam.sequences import open_sequence
+from slam.viewer import Viewer, view_run
+
+
+def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(SlamError, match=r"pip install 'surf-stereo-slam\[viewer\]'"):
+        Viewer(str(tmp_path / "a.rrd"))
+
+
+def test_not_a_run(tmp_path):
+    with pytest.raises(SlamError, match="finished run"):
+        view_run(tmp_path, str(tmp_path / "a.rrd"))
+
+
+@pytest.mark.filterwarnings("default")  # Rerun's own
+def test_a_run_is_kept_for_rerun(tmp_path):
+    pytest.importorskip("rerun")
+    sequence = open_sequence("synthetic:aisle?frames=3")
+    live, after = tmp_path / "live.rrd", tmp_path / "after.rrd"
+    options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), tmp_path / "run")
+    with Viewer(str(live), sequence.rig, sequence.ground_truth) as viewer:
+        run(sequence, options, watch=viewer.show)
+    view_run(tmp_path / "run", str(after))
+    assert live.stat().st_size > 3 * 3000  # three images, compressed, are in it
+    assert after.stat().st_size > 1000

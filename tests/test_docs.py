@@ -1,0 +1,75 @@
+"""What the documentation shows is run as it stands there."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import slam
+from slam.interfaces import Backend
+from slam.metrics import absolute_errors
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+def pose_fit():
+    path = DOCS / "examples" / "pose_fit.py"
+    spec = importlib.util.spec_from_file_location("pose_fit", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.PoseFit
+
+
+def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
+    lines = [line for line in (DOCS / "examples" / "pose_fit.py").read_text().splitlines() if line.strip()]
+    assert len(lines) <= 50
+    sequence = slam.open_sequence("synthetic:aisle?frames=25")
+    system = slam.StereoSlam(sequence.rig, None, pose_fit()(sequence.rig))
+    assert isinstance(system.backend, Backend)
+    results = [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
+    assert all(result.status.value == "tracked" for result in results[1:])
+    errors = absolute_errors(system.trajectory(), sequence.ground_truth)
+    assert errors.translation_statistics.rmse < 0.02  # measured 4 mm, on 25 cm of path
+
+
+def test_the_back_end_in_50_lines_keeps_the_map():
+    sequence = slam.open_sequence("synthetic:aisle?frames=2")
+    backend = pose_fit()(sequence.rig)
+    system = slam.StereoSlam(sequence.rig, None, backend)
+    for k in range(2):
+        system.process_features(sequence.observations(k))
+    estimate = backend.estimate()
+    assert list(estimate.ids) == list(system.landmarks.ids)
+    backend.remove(estimate.ids[:3])
+    assert len(backend.estimate().ids) == len(estimate.ids) - 3
+    with pytest.raises(slam.SlamError, match="later"):
+        backend.predict(0.0)
+
+
+def test_a_recording_as_the_guide_has_it_opens(tmp_path):
+    import cv2
+
+    K, D = np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]]), np.array([-0.1, 0.01, 0, 0, 0])
+    rng = np.random.default_rng(0)
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for k in range(3):
+            cv2.imwrite(str(tmp_path / side / f"{k:06}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
+    code = re.search(r"```python\n(file = cv2.*?)```", (DOCS / "guide.md").read_text(), re.S).group(1)
+    code = code.replace('"calibration.yaml"', repr(str(tmp_path / "calibration.yaml")))
+    exec(code, {"cv2": cv2, "M1": K, "D1": D, "M2": K, "D2": D, "R": np.eye(3), "T": np.array([-0.12, 0, 0])})
+    sequence = slam.open_sequence(f"{tmp_path}?fps=30")
+    assert len(sequence) == 3
+    assert sequence.rig.baseline == pytest.approx(0.12)
+    assert [frame.stamp for frame in sequence] == pytest.approx([0, 1 / 30, 2 / 30])
+
+
+def test_every_page_in_the_documentation_links_to_what_exists():
+    for page in DOCS.rglob("*.md"):
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+            if not target.startswith(("http:", "https:", "mailto:")):
+                assert (page.parent / target).exists(), f"{page.relative_to(DOCS)}: {target}"

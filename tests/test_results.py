@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def results():
+    spec = importlib.util.spec_from_file_location("results_page", ROOT / "experiments" / "results.py")
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(__import__("sys").modules, "results_page", module)  # dataclasses look their module up
+        spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def scripts(results, tmp_path, monkeypatch):
+    """Three scripts: one that works, one that fails, one that is missing."""
+    folder = tmp_path / "experiments"
+    folder.mkdir()
+    (folder / "good.py").write_text(
+        "import sys\nfrom pathlib import Path\nout = Path(sys.argv[sys.argv.index('--out') + 1])\n"
+        "(out / 'a.png').write_bytes(b'picture')\n"
+        "print('# A heading\\n\\n| a |\\n| - |\\n| 1 |', '--quick' in sys.argv)\n"
+    )
+    (folder / "bad.py").write_text("print('half')\nraise SystemExit('no way')\n")
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    names = [results.Experiment("good", "Good", "the paper's"), results.Experiment("bad", "Bad")]
+    monkeypatch.setattr(results, "EXPERIMENTS", (*names, results.Experiment("none", "None")))
+    return tmp_path
+
+
+def test_every_section_is_on_the_page_also_those_that_failed(results, scripts, capsys):
+    page = scripts / "docs" / "results.md"
+    status = results.main(["--quick", "--out", str(scripts / "out"), "--page", str(page)])
+    assert status == 1
+    text = page.read_text()
+    for words in (
+        "## Good",
+        "**The paper:** the paper's",
+        "### A heading",
+        "| 1 | True",
+        "(images/results/good_a.png)",
+    ):
+        assert words in text
+    assert "**Failed:** exit status 1: no way" in text
+    assert "half" in text
+    assert "there is no such script" in text
+    assert (page.parent / "images" / "results" / "good_a.png").read_bytes() == b"picture"
+    assert "2 failed" in capsys.readouterr().err
+
+
+def test_one_alone(results, scripts, capsys):
+    page = scripts / "page.md"
+    assert results.main(["--only", "good", "--out", str(scripts / "out"), "--page", str(page)]) == 0
+    assert "short form" not in page.read_text()
