@@ -63,7 +63,7 @@ class SystemConfig:
 
     @classmethod
     def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:
-        """The default settings for a kind of motion (``"handheld"``, ``"driving"``), a front end and a back end by name.
+        """The default settings for a kind of motion (``"handheld"``, ``"driving"``), front end and back end by name.
 
         Raises:
             ConfigurationError: the kind is not known.

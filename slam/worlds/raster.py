@@ -29,7 +29,7 @@ _BLOCK = 160  # usual largest side of a block [samples]
 _SMALLEST = 32  # no block is made smaller than this because the distance changes [samples]
 _OVERLAP = 16  # width of the passage from one block to the next [samples]
 _SOFTEN = 2**0.25  # texels are that much larger than samples: then the samples of a view miss nothing of them
-_CHANGE = 1.15  # distance changes by about this factor within a block, and texels per sample by up to its square
+_CHANGE = 2.0  # distance changes by about this factor within a block, and texels per sample by up to its square
 
 
 def draw(
