@@ -17,8 +17,8 @@ from backends.smoother import SmootherBackend
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
 from backends.smoother.records import IndexArray
 from backends.smoother.solver import FAILURES, Change
-from backends.smoother.threads import one_blas_thread
 from backends.smoother.variables import landmark_key, pose_key
+from slam.blas import one_blas_thread
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.errors import ConfigurationError
 from slam.models import EstimatorModels

@@ -68,7 +68,7 @@ def scene(
     S = np.tile(np.eye(2) * (uncertainty**2 + SIGMA**2), (landmarks, 1, 1))
     ids, count = np.arange(landmarks), np.ones(landmarks, np.int64)
     prediction = Prediction(0.0, T, np.eye(6) * 1e-4, ids, expected, expected_right, S)
-    rows = LandmarkRows(ids, looks, signs, count, count, count, count, count)
+    rows = LandmarkRows(ids, looks, signs, count, count, count, count)
     return prediction, rows, points, frame
 
 

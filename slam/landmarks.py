@@ -21,7 +21,7 @@ class LandmarkRows:
         seen: number of frames in which it was measured (N,).
         in_view: number of frames in which it should have been detected or was (N,).
         missed: number of such frames since it was last measured (N,).
-        first_seen, last_seen: frame indices (N,).
+        last_seen: frame index (N,).
     """
 
     ids: IdArray
@@ -30,7 +30,6 @@ class LandmarkRows:
     seen: IdArray
     in_view: IdArray
     missed: IdArray
-    first_seen: IdArray
     last_seen: IdArray
 
     def __len__(self) -> int:
@@ -40,7 +39,7 @@ class LandmarkRows:
     def empty(cls, dimensions: int) -> LandmarkRows:
         """No landmarks, for descriptors of `dimensions` numbers."""
         none = np.zeros(0, np.int64)
-        return cls(none, np.zeros((0, dimensions), np.float32), np.zeros(0, np.int8), none, none, none, none, none)
+        return cls(none, np.zeros((0, dimensions), np.float32), np.zeros(0, np.int8), none, none, none, none)
 
     def rows(self, ids: IdArray) -> NDArray[np.intp]:
         """Row numbers of ids that are in the map."""
@@ -85,7 +84,6 @@ class LandmarkRows:
             once,
             once,
             once * 0,
-            once * frame,
             once * frame,
         )
         return LandmarkRows(

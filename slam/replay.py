@@ -173,14 +173,13 @@ class Recording:
         )
         ids, frame = ids[frame < frames], frame[frame < frames]
         unique, place, seen = np.unique(ids, return_inverse=True, return_counts=True)
-        first, last = np.full(len(unique), frames), np.zeros(len(unique), np.int64)
-        np.minimum.at(first, place, frame)
+        last = np.zeros(len(unique), np.int64)
         np.maximum.at(last, place, frame)
         kept = ~np.isin(unique, self._gone(frames))
-        unique, seen, first, last = unique[kept], seen[kept], first[kept], last[kept]
+        unique, seen, last = unique[kept], seen[kept], last[kept]
         none = np.zeros(len(unique), np.int64)
         looks = np.zeros((len(unique), 0), np.float32)
-        return LandmarkRows(unique, looks, none.astype(np.int8), seen, seen, none, first, last)
+        return LandmarkRows(unique, looks, none.astype(np.int8), seen, seen, none, last)
 
     def _gone(self, frames: int) -> IdArray:
         """Ids of landmarks that left the map in the first so many frames, and did not come back after that."""

@@ -186,10 +186,10 @@ def _drive(
             ended = f"stopped: {error or type(error).__name__}"
             raise
         finally:
+            summary = _finish(sequence, options, system, record, files, ended, score)
             if options.record is not None:
                 models, truth = options.config.models, sequence.ground_truth
                 save_recording(Recording.of(tape, sequence.rig, models, sequence.name, truth), options.record)
-            summary = _finish(sequence, options, system, record, files, ended, score)
             if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
                 save_map(options.save_map, system)
     return summary

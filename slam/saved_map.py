@@ -105,7 +105,7 @@ class SavedMap:
         """The map's bookkeeping at the start of a run, in which nothing has been seen yet."""
         none = np.zeros(len(self), np.int64)
         return LandmarkRows(
-            self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1, none - 1
+            self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1
         )  # fmt: skip
 
     @classmethod

@@ -236,11 +236,8 @@ class StereoSlam:
         recognised = len(report.used) >= least and 2 * len(report.used) >= len(found)
         return self._tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
 
-    def _view(self, estimate: Estimate, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
-        """The map from the pose after the update."""
-        return self._view_from(estimate.T_world_left, landmarks, features)
-
-    def _view_from(self, T_world_left: Array, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
+    def _view(self, T_world_left: Array, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
+        """The map as a camera at this pose sees it."""
         positions = self.backend.positions(landmarks.ids)
         return MapView.of(self.rig, T_world_left, positions, features, self.config.models.pixel_sigma)
 
@@ -254,7 +251,7 @@ class StereoSlam:
         judged: Judgement,
     ) -> tuple[LandmarkRows, Recognition, IdArray]:
         """The map after this frame: count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        view = self._view(estimate, landmarks, features)
+        view = self._view(estimate.T_world_left, landmarks, features)
         landmarks = self._count(landmarks, view, features, found, report)
         bad = bad_landmarks(landmarks, self.config.map) | np.isin(landmarks.ids, judged.landmarks)
         bad |= doubled_landmarks(view, landmarks, self.config.map)
@@ -336,7 +333,7 @@ class StereoSlam:
         if len(found) < _MINIMUM_TRACKED:
             return landmarks, added
         estimate = self.backend.estimate(landmarks=False)
-        view = self._view_from(estimate.T_world_left, landmarks, features)
+        view = self._view(estimate.T_world_left, landmarks, features)
         rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
         covariance = monocular.pose_covariance(estimate, view, landmarks, features, found)
         new = monocular.step(features, rows, estimate.T_world_left, covariance, self._index)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 from slam.errors import ConfigurationError
 
@@ -39,16 +38,3 @@ class EkfConfig:
             raise ConfigurationError(f"ekf: landmarks must be one of {LANDMARKS}, got {self.landmarks!r}")
         if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
             raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
-
-    @classmethod
-    def from_options(cls, options: dict[str, Any]) -> EkfConfig:
-        """The configuration of keyword options.
-
-        Raises:
-            ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
-        """
-        known = [f.name for f in fields(cls)]
-        unknown = sorted(set(options) - set(known))
-        if unknown:
-            raise ConfigurationError(f"ekf: unknown option {unknown[0]!r}; known: {', '.join(known)}")
-        return cls(**options)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, wraps
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.linalg.blas import dgemm, dgemv
-from threadpoolctl import ThreadpoolController
 
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
 from backends.ekf.config import EkfConfig
@@ -20,38 +18,21 @@ from backends.ekf.objects import ObjectFilter
 from backends.ekf.objects_body import CameraBelief
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam import se3
+from slam.blas import one_blas_thread
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.euler import angles, body_rate_matrix
 from slam.known_landmarks import require_known
 from slam.models import EstimatorModels
 from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.options import from_options
 from slam.rig import StereoRig
 from slam.se3 import Array
 from slam.trajectory import Trajectory
 
-_F = TypeVar("_F", bound=Callable[..., Any])
-
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
 _ENOUGH = 6  # observations that can be judged to agree with each other
-
-
-@lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    """The BLAS libraries that are loaded, looked up once."""
-    return ThreadpoolController()
-
-
-def _one_blas_thread(function: _F) -> _F:
-    """Run with one BLAS thread: the same sums in the same order on every machine, and no waiting on a busy one."""
-
-    @wraps(function)
-    def limited(*args: Any, **kwargs: Any) -> Any:
-        with _controller().limit(limits=1, user_api="blas"):
-            return function(*args, **kwargs)
-
-    return limited  # type: ignore[return-value]
 
 
 class EkfBackend:
@@ -74,7 +55,7 @@ class EkfBackend:
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.rig = rig
         self.models = models
-        self.config = EkfConfig.from_options(options)
+        self.config = from_options(EkfConfig, "ekf", options)
         self._stamps: list[float] = []
         self._poses: list[Array] = []
         self._landmarks = Landmarks(COORDINATES[self.config.landmarks])
@@ -85,7 +66,7 @@ class EkfBackend:
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
-    @_one_blas_thread
+    @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
         if not np.isfinite(stamp) or (self._stamps and stamp <= self._stamps[-1]):
@@ -97,7 +78,7 @@ class EkfBackend:
         self._poses.append(self._pose())
         return self._prediction()
 
-    @_one_blas_thread
+    @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
@@ -119,7 +100,7 @@ class EkfBackend:
         dof = int(np.isfinite(problem.z[used]).sum())
         return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], solution.nis, dof)
 
-    @_one_blas_thread
+    @one_blas_thread
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._require_started("add")
@@ -139,7 +120,7 @@ class EkfBackend:
         self._landmarks.remove(ids, holes, movers)
         self._objects.landmarks_dropped(holes, movers, len(self._landmarks))
 
-    @_one_blas_thread
+    @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
@@ -161,7 +142,7 @@ class EkfBackend:
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
-    @_one_blas_thread
+    @one_blas_thread
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("ekf", ids, positions, covariances)
@@ -170,7 +151,7 @@ class EkfBackend:
             D = self._landmarks.append(ids, far_charts(positions, covariances), positions)
             self._append(np.zeros((len(ids), 3, POSE)), D @ covariances @ D.transpose(0, 2, 1))
 
-    @_one_blas_thread
+    @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         self._require_started("place")
@@ -181,7 +162,7 @@ class EkfBackend:
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
-    @_one_blas_thread
+    @one_blas_thread
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")

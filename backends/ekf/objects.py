@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, 
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
 from slam.objects.points import Shape, first_frame, shape_of, with_shape
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse
@@ -37,15 +37,6 @@ from slam.se3 import Array, inverse
 _SURPRISES = (0.0, 3.0, 10.0)
 _ENOUGH = 4  # observations that can be judged to agree with each other
 _FAILURES = 3  # so many rejections running, and a point starts anew
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """What was made of a body's observations in one frame."""
-
-    measured: bool = False
-    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class ObjectFilter:
@@ -80,7 +71,7 @@ class ObjectFilter:
         dt, self._stamp, self._now = stamp - self._stamp, stamp, self._now + 1
         out = []
         for number in sorted({*self._bodies, *seen}):
-            body, sight = self._bodies.get(number), _Sight()
+            body, sight = self._bodies.get(number), Sight()
             if body is None:
                 body, sight = self._start(seen[number], camera)
             else:
@@ -145,14 +136,14 @@ class ObjectFilter:
             if o.id not in self._bodies and depths.sum() < 3:
                 raise MeasurementError(f"ekf: object {o.id} is new and has fewer than three points with a depth")
 
-    def _start(self, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, _Sight]:
+    def _start(self, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
         h = self._rig.triangulate(o.uv_left, o.uv_right)
         T, near = first_frame(camera.T_world_left, h)
         body = found(o.id, T, self._models.objects, len(camera.columns))
         body = self._join(body, o, near, camera)
-        return body, _Sight(True, np.sort(body.ids))
+        return body, Sight(True, np.sort(body.ids))
 
-    def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, _Sight]:
+    def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
         """Correct a body by its known points, then let the new ones join.
 
         Where nothing agrees with the body (or too little), it is not known where it is, and nothing joins.
@@ -162,7 +153,7 @@ class ObjectFilter:
         rows = np.array([place[i] for i in o.points[known].tolist()], np.intp)
         body, used = self._correct(body, o, known, rows, camera)
         if len(rows) and not used.any():
-            return body, _Sight(rejected=np.sort(o.points[known]))
+            return body, Sight(rejected=np.sort(o.points[known]))
         failures, seen = body.failures.copy(), body.seen.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         seen[rows] = self._now
@@ -170,7 +161,7 @@ class ObjectFilter:
         old = body.ids
         body = self._join(body, o, ~np.isin(o.points, old), camera)
         good = np.union1d(o.points[known][used], np.setdiff1d(body.ids, old))
-        return body, _Sight(bool(used.any()), good, np.setdiff1d(o.points[known][~used], good))
+        return body, Sight(bool(used.any()), good, np.setdiff1d(o.points[known][~used], good))
 
     def _correct(
         self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief
@@ -258,7 +249,7 @@ def _enough(solution: Solution, body: Body) -> bool:
     return bool(solution.used.sum() >= min(3, (len(body.ids) + 1) // 2))
 
 
-def _estimate(body: Body, stamp: float, sight: _Sight) -> ObjectEstimate:
+def _estimate(body: Body, stamp: float, sight: Sight) -> ObjectEstimate:
     P = body.covariance
     return ObjectEstimate(
         body.id, stamp, body.T.copy(), P[:6, :6].copy(), body.velocity.copy(), P[6:RIGID, 6:RIGID].copy(),

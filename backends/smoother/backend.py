@@ -24,13 +24,14 @@ from backends.smoother.prediction import (
 )
 from backends.smoother.records import IndexArray, Records
 from backends.smoother.stereo import RectifiedStereo
-from backends.smoother.threads import one_blas_thread
 from backends.smoother.uncertainty import quadratic
+from slam.blas import one_blas_thread
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.known_landmarks import require_known
 from slam.models import EstimatorModels
 from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.options import from_options
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse
 from slam.trajectory import Trajectory
@@ -54,7 +55,7 @@ class SmootherBackend:
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.rig = rig
         self.models = models
-        self.config = SmootherConfig.from_options(options)
+        self.config = from_options(SmootherConfig, "smoother", options)
         self._stereo = RectifiedStereo.of(rig)
         self._make = FactorMaker(self._stereo, models)
         self._graph = PoseGraph(self._make, self.config)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,19 +41,6 @@ class SmootherConfig:
         value = self.relinearise
         if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0):
             raise ConfigurationError(f"smoother: relinearise must be positive and finite, got {value!r}")
-
-    @classmethod
-    def from_options(cls, options: dict[str, Any]) -> SmootherConfig:
-        """The configuration of keyword options.
-
-        Raises:
-            ConfigurationError: an option is unknown (the message lists the known ones) or out of its range.
-        """
-        known = [f.name for f in fields(cls)]
-        unknown = sorted(set(options) - set(known))
-        if unknown:
-            raise ConfigurationError(f"smoother: unknown option {unknown[0]!r}; known: {', '.join(known)}")
-        return cls(**options)
 
 
 def _require_whole(value: object, name: str, least: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from backends.smoother.uncertainty import PoseSet
 from slam.data import BoolArray, IdArray, Observations
 from slam.errors import MeasurementError
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
 from slam.objects.points import Shape, first_frame, shape_of, with_shape
 from slam.se3 import Array, adjoint, inverse, transform
 
@@ -35,15 +35,6 @@ _ITERATIONS = 2
 _ENOUGH = 4  # points that show a shape
 _FAILURES = 3  # so many rejections running, and a point starts anew
 _JITTER = 1e-14  # [rad², m²] that keeps poses of the camera apart which are taken to move together
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """What was made of a body's observations in one frame."""
-
-    measured: bool = False
-    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class ObjectSmoother:
@@ -107,37 +98,35 @@ class ObjectSmoother:
             if number not in self._windows and measured.deep.sum() < 3:
                 raise MeasurementError(f"smoother: object {number} is new and has fewer than three points with a depth")
 
-    def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+    def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         frame, X = path.count - 1, path.poses[-1].copy()
         T, near = first_frame(X, seen.local)
         window = self._join(opened(frame, float(path.stamps[-1]), T, X), seen, near)
         window = self._solver.solved(window, _cameras(window.frames, path, camera))
-        return window, _Sight(True, np.sort(window.ids))
+        return window, Sight(True, np.sort(window.ids))
 
-    def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+    def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         """One more frame; where it cannot be solved with its observations, without them, or else anew."""
         for given in (seen, None):
             with suppress(np.linalg.LinAlgError):
                 return self._solved_step(window, given, path, camera)
         return self._restarted(window, seen, path, camera)
 
-    def _restarted(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, _Sight]:
+    def _restarted(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         """The body without its points, velocity and past, where it was last or where the guess has it."""
         T = window.T[-1] if seen is None or seen.guess is None else seen.guess
         spread = np.full(6, self._models.objects.initial_velocity_sigma**2)
         window = opened(path.count - 1, float(path.stamps[-1]), T, path.poses[-1].copy(), np.diag(spread))
-        return self._solver.solved(window, _cameras(window.frames, path, camera)), _Sight()
+        return self._solver.solved(window, _cameras(window.frames, path, camera)), Sight()
 
-    def _solved_step(
-        self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet
-    ) -> tuple[Window, _Sight]:
+    def _solved_step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         frame, stamp = path.count - 1, float(path.stamps[-1])
         if frame == window.frames[-1]:
-            return window, _Sight()
+            return window, Sight()
         cameras = _cameras(np.append(window.frames, frame), path, camera)
         expected = predicted(window, cameras, stamp, self._models.objects)
         if seen is None:
-            window, sight = with_frame(window, frame, stamp, expected.T, expected.X, 1.0), _Sight()
+            window, sight = with_frame(window, frame, stamp, expected.T, expected.X, 1.0), Sight()
         else:
             found, known, rows = self._agreement(window, expected, seen)
             window = with_frame(window, frame, stamp, found.T, expected.X, found.scale)
@@ -168,21 +157,21 @@ class ObjectSmoother:
 
     def _exchange(
         self, window: Window, seen: _Measured, known: BoolArray, rows: IndexArray, used: BoolArray
-    ) -> tuple[Window, _Sight]:
+    ) -> tuple[Window, Sight]:
         """Points that failed too often leave, new ones join.
 
         Where nothing agrees with the body, it is not known where it is, and nothing joins.
         """
         mine = seen.ids[known]
         if len(rows) and not used.any():
-            return window, _Sight(rejected=np.sort(mine))
+            return window, Sight(rejected=np.sort(mine))
         failures = window.failures.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         window = without_points(replace(window, failures=failures), failures >= _FAILURES)
         old = window.ids
         window = self._join(window, seen, ~np.isin(seen.ids, old))
         good = np.union1d(mine[used], np.setdiff1d(window.ids, old))
-        return window, _Sight(bool(used.any()), good, np.setdiff1d(mine[~used], good))
+        return window, Sight(bool(used.any()), good, np.setdiff1d(mine[~used], good))
 
     def _join(self, window: Window, seen: _Measured, wanted: BoolArray) -> Window:
         """With those of the wanted points that have a depth; points unseen for longest make room."""
@@ -210,7 +199,7 @@ class ObjectSmoother:
             return shape_of(h, inverse_J @ np.swapaxes(inverse_J, 1, 2)).seen_from(T_body_left)
         return shape_of(window.points, own)
 
-    def _estimate(self, number: int, window: Window, sight: _Sight) -> ObjectEstimate:
+    def _estimate(self, number: int, window: Window, sight: Sight) -> ObjectEstimate:
         models, P = self._models.objects, window.covariance
         last = FRAME * (len(window) - 1)
         velocity = np.zeros(6)

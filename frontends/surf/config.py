@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam.errors import ConfigurationError
+from slam.options import from_options
 
 
 @dataclass(frozen=True)
@@ -83,12 +84,8 @@ class SurfConfig:
         Raises:
             ConfigurationError: an option is not known or out of its range.
         """
-        known = {f.name: getattr(config, f.name) for f in fields(cls)} if config is not None else {}
-        for key in options:
-            if key not in {f.name for f in fields(cls)}:
-                names = ", ".join(f.name for f in fields(cls))
-                raise ConfigurationError(f"{key}: not an option of the surf front end; known: {names}")
-        return cls(**{**known, **options})
+        base = {} if config is None else {f.name: getattr(config, f.name) for f in fields(cls)}
+        return from_options(cls, "surf", {**base, **options})
 
 
 _RANGES = (

@@ -7,7 +7,7 @@ choice when written in world coordinates: ``H`` takes a point of the body from w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,21 @@ class ObjectObservations:
     def has_stereo(self) -> BoolArray:
         """Which observations have a right pixel (M,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a back end made of a body's observations in one frame.
+
+    Attributes:
+        measured: whether they measured the body.
+        used: ids of the points whose observations were used (K,).
+        rejected: ids of those that failed the gate (R,).
+    """
+
+    measured: bool = False
+    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True)

@@ -65,14 +65,7 @@ class MovingObjectDetector:
     def judge(
         self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
     ) -> Judgement:
-        """Follow all tracks into this frame, judge them, and find bodies.
-
-        Args:
-            features: of the frame.
-            estimate: the camera's pose after the update.
-            landmark: id of the landmark that each feature was recognised as (N,), −1 for none.
-            used: rows of the features that the back end used.
-        """
+        """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features, estimate)
         view = self._view(estimate, features, used)
         self._advance_bodies(times)

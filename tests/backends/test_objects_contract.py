@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from slam import registry
-from slam.testing_objects import OBJECT_CHECKS, check_object_backend
+from slam.testing.objects import OBJECT_CHECKS, check_object_backend
 from tests.backends.fixed_map import FixedMapBackend
 
 

@@ -143,7 +143,7 @@ def test_unusable_images(left, right, says):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"colour": 1}, "colour: not an option of the surf front end; known: features, "),
+        ({"colour": 1}, "surf: unknown option 'colour'; known: features, "),
         ({"features": 0}, "features: "),
         ({"features": 10.5}, "features: "),
         ({"features": "many"}, "features: "),

@@ -36,7 +36,7 @@ def chosen(features, occupied=(), config=CONFIG, free=None):
 
 def rows_with(**columns):
     n = len(next(iter(columns.values())))
-    base = {name: np.zeros(n, np.int64) for name in ("seen", "in_view", "missed", "first_seen", "last_seen")}
+    base = {name: np.zeros(n, np.int64) for name in ("seen", "in_view", "missed", "last_seen")}
     base.update({k: np.asarray(v) for k, v in columns.items()})
     return LandmarkRows(np.arange(n), np.zeros((n, 16), np.float32), np.ones(n, np.int8), **base)
 
@@ -137,7 +137,7 @@ def like(features, rows, seen):
     """Landmarks that look like some of the features."""
     n, none = len(rows), np.zeros(len(rows), np.int64)
     looks, signs = features.descriptors[rows], features.laplacian[rows]
-    return LandmarkRows(np.arange(n), looks, signs, np.asarray(seen), none, none, none, none)
+    return LandmarkRows(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
 
 
 def test_a_feature_that_is_a_landmark_already_is_known():

@@ -2,7 +2,7 @@
 
 As `slam.testing`, which it goes with::
 
-    from slam.testing_objects import OBJECT_CHECKS
+    from slam.testing.objects import OBJECT_CHECKS
 
     @pytest.mark.parametrize("check", OBJECT_CHECKS, ids=lambda check: check.__name__)
     def test_contract(check):
