@@ -15,15 +15,19 @@ from slam.selfcalibration import SelfCalibrationConfig
 #: what lies ahead that the looks change.
 MAPS = {
     "handheld": MapConfig(),
-    "driving": MapConfig(max_landmarks=300, renewal=1.0, confirmed=1, restart_after=5),
+    "driving": MapConfig(target_in_view=150, max_landmarks=300, renewal=1.0, confirmed=1, restart_after=5, spacing=0.0),
+}
+
+#: Association by kind of motion: the looks of what a car comes nearer to are renewed: it may be seen from anywhere.
+ASSOCIATIONS = {
+    "handheld": AssociationConfig(),
+    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),
 }
 
 #: Moving objects by kind of motion: what moves on a street is faster than what a hand or a robot moves.
 OBJECTS = {
     "handheld": ObjectsConfig(),
-    "driving": ObjectsConfig(
-        max_speed=25.0, min_speed=1.0, speed_floor=0.02, suspect=40.0, group_test=70.0, certain=150.0
-    ),
+    "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, group_test=70.0),
 }
 
 #: Options of a front end that suit a kind of motion: a car does not roll, a hand-held camera does.
@@ -71,6 +75,7 @@ class SystemConfig:
         models = models_for(kind)
         return cls(
             models=models,
+            association=ASSOCIATIONS[kind],
             map=MAPS[kind],
             objects=OBJECTS[kind],
             frontend=dict(FRONTENDS.get((kind, frontend), {})),

@@ -23,14 +23,22 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import ConfigurationError
-from slam.interfaces import Backend, Frontend, MapBackend
-from slam.known_map import MapSearch
+from slam.interfaces import Backend, Frontend, MapBackend, RevisingBackend
+from slam.known_map import MapSearch, models_at
 from slam.landmarks import LandmarkRows
-from slam.map_management import bad_landmarks, doubled_landmarks, known_features, new_landmarks, surplus_landmarks
+from slam.map_management import (
+    bad_landmarks,
+    crowded_landmarks,
+    doubled_landmarks,
+    known_features,
+    new_landmarks,
+    surplus_landmarks,
+)
 from slam.monocular import MonocularDepth, unclaimed
 from slam.objects.data import Judgement
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.recognition import Recogniser, Recognition, jump, median_deviation
+from slam.relocation import Sightings, hand_over
 from slam.rig import StereoRig
 from slam.saved_map import FIRST_FRAME, SavedMap
 from slam.se3 import Array
@@ -40,6 +48,7 @@ from slam.trajectory import Trajectory
 from slam.visibility import MapView, expected_landmarks
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
+_COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
 
 
 class StereoSlam:
@@ -104,6 +113,10 @@ class StereoSlam:
             if not isinstance(self.backend, MapBackend):
                 raise ConfigurationError("map.monocular: this back end cannot place landmarks")
             self._monocular = MonocularDepth(rig, c.models.pixel_sigma, c.map.max_depth_error)
+        self._backend_name = backend if isinstance(backend, str) else None
+        self._may_begin_anew = isinstance(backend, str) and isinstance(self.backend, MapBackend)
+        self._carried = Sightings()
+        self._past: list[Trajectory] = []  # the paths of back ends before the camera was carried off
         self._search: MapSearch | None = None
         if known_map is not None:
             self._search_in(known_map, backend)
@@ -130,12 +143,14 @@ class StereoSlam:
         if self._search is not None and not self._located(self._search, features):
             self._index += 1
             return self._search.lost(self._index, features)
+        shift = self._revise()
         prediction = self.backend.predict(features.stamp)
         self._index += 1
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         clock.lap("predict")
         measured, features = features, self.calibration.correct(features)
-        found = self._recognise(prediction, landmarks, features).without(self.objects.suspects)
+        prediction, found = self._recognise(prediction, landmarks, features)
+        found = found.without(self.objects.suspects)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
         report = self.backend.update(_observations(features, found), found.T_world_left)
@@ -167,7 +182,21 @@ class StereoSlam:
             milliseconds=clock.laps,
             moving_features=judged.moving,
             objects=objects,
+            shift=shift,
         )
+
+    def _revise(self) -> float:
+        """Take what has become known of the disparity's error into use, for what was given to the back end as well.
+
+        All its measurements are then to be weighed anew, so a back end that can do that waits for a change that counts.
+        """
+        if not isinstance(self.backend, RevisingBackend):
+            self.calibration.apply()
+            return 0.0
+        shift = self.calibration.apply(_COUNTS)
+        if shift:
+            self.backend.shift_right(shift)
+        return shift
 
     @property
     def unlocated_map(self) -> SavedMap | None:
@@ -176,7 +205,7 @@ class StereoSlam:
 
     def trajectory(self) -> Trajectory:
         """The left camera's path: the back end's last word on every frame (in a known map, from when it was found)."""
-        return self.backend.trajectory()
+        return Trajectory.joined([*self._past, self.backend.trajectory()])
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
@@ -187,7 +216,6 @@ class StereoSlam:
         if not isinstance(backend, str):
             raise ConfigurationError("a system that starts in a known map needs its back end by name")
         known_map.require_fits(self.frontend_name)
-        self._backend_name = backend
         self._search = MapSearch(known_map, self.rig, self._recogniser, self.config.models.initial_pose)
         self._search.fill(self.backend)
         self.landmarks = known_map.rows
@@ -198,22 +226,42 @@ class StereoSlam:
         T = search.locate(features, self._index + 1)
         if T is None:
             return False
-        c = self.config
-        models = search.models_at(c.models, T)
-        self.backend = registry.create("backends", self._backend_name, self.rig, models=models, **c.backend)
+        self.backend = self._new_backend(T)
         search.fill(self.backend)
         self._next_id = int(search.known.ids.max(initial=-1)) + 1
         self._search = None
         return True
 
-    def _recognise(self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures) -> Recognition:
-        """Landmarks in this frame (paper A, III and IV)."""
+    def _new_backend(self, T_world_left: Array) -> Backend:
+        """A back end of the same name that begins at a pose (4, 4) which is only roughly known."""
+        assert self._backend_name is not None
+        models = models_at(self.config.models, T_world_left)
+        return registry.create("backends", self._backend_name, self.rig, models=models, **self.config.backend)
+
+    def _recognise(
+        self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures
+    ) -> tuple[Prediction, Recognition]:
+        """Landmarks in this frame (paper A, III and IV); a new prediction where the camera was carried off."""
         positions = self.backend.positions(landmarks.ids)
         doubtful = self._tracking.unrecognised > 0
         found = self._recogniser.recognise(prediction, landmarks, positions, features, self._index, doubtful)
-        if found.T_world_left is not None and jump(prediction, found.T_world_left) > self.config.association.max_jump:
-            return Recognition.nothing()
-        return found
+        T, a = found.T_world_left, self.config.association
+        if T is None or jump(prediction, T) <= (a.lost_jump if doubtful else a.max_jump):
+            self._carried = Sightings()
+            return prediction, found
+        self._carried = self._carried.after(T, features.stamp, self.config.models)
+        if self._carried.count < a.carried_after or not self._may_begin_anew:
+            return prediction, Recognition.nothing()
+        prediction = self._begin_anew(T, features.stamp)
+        return prediction, self._recogniser.recognise(prediction, landmarks, positions, features, self._index)
+
+    def _begin_anew(self, T_world_left: Array, stamp: float) -> Prediction:
+        """A new back end in the same map: a motion that a carried camera did not make would spoil the old one's."""
+        new = self._new_backend(T_world_left)
+        self._past.append(hand_over(self.backend, new))
+        self.backend, self._carried = new, Sightings()
+        self.objects = detector_for(self.rig, self.config.objects, self.config.models)
+        return self.backend.predict(stamp)
 
     def _judge(
         self, features: StereoFeatures, estimate: Estimate, found: Recognition, report: UpdateReport
@@ -255,6 +303,7 @@ class StereoSlam:
         landmarks = self._count(landmarks, view, features, found, report)
         bad = bad_landmarks(landmarks, self.config.map) | np.isin(landmarks.ids, judged.landmarks)
         bad |= doubled_landmarks(view, landmarks, self.config.map)
+        bad |= crowded_landmarks(landmarks, view.positions, self.config.map)
         known = known_features(view, landmarks, features, self.config.map)
         landmarks, erased = self._erase(landmarks, bad)
         landmarks, added = self._add(landmarks, features, found, known, judged)
@@ -275,7 +324,9 @@ class StereoSlam:
         expected = landmarks.ids[:0]
         if not self._tracking.unrecognised:
             size = (self.rig.width, self.rig.height)
-            expected = landmarks.ids[expected_landmarks(view, features, size, m.view_margin, m.occlusion_radius)]
+            shown = expected_landmarks(view, features, size, m.view_margin, m.occlusion_radius)
+            shown &= self._recogniser.looks_alike(view.T_world_left, landmarks, view.positions)
+            expected = landmarks.ids[shown]
         ids, rows = found.ids[measured], found.rows[measured]
         return landmarks.after_frame(self._index, expected, ids, features, rows, m.renewal)
 
@@ -297,24 +348,21 @@ class StereoSlam:
     ) -> tuple[LandmarkRows, Recognition]:
         """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew.
 
-        What moves, or lies on a body that moves, becomes none. What has not been judged yet waits, unless most of
-        the landmarks themselves could not be judged: then the frames lie too far apart to follow anything.
+        What moves, or lies on a body that moves, becomes none, nor what is in doubt.
         """
         if len(landmarks) and not self._tracking.may_add(self.config.map):
             return landmarks, Recognition.nothing()
         free = ~known
         free[found.rows] = free[judged.moving] = False
-        still = free.copy()
-        unjudged = np.isin(found.rows, judged.undecided).sum()
-        if len(found) >= max(self.config.objects.enough, 2 * unjudged):
-            still[judged.undecided] = False
+        free[judged.undecided] = False
         occupied = features.uv_left[found.rows]
-        rows = new_landmarks(features, still, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
+        rows = new_landmarks(features, free, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
         ids = np.arange(self._next_id, self._next_id + len(rows), dtype=np.int64)
         added = Recognition(ids, rows)
         if len(added):
             self.backend.add(_observations(features, added))
-            landmarks = landmarks.with_new(self._index, ids, features, rows)
+            camera = self.backend.estimate(landmarks=False).T_world_left[:3, 3]
+            landmarks = landmarks.with_new(self._index, ids, features, rows, camera)
             self._next_id += len(added)
         if self._monocular is not None:
             return self._add_monocular(self._monocular, landmarks, features, found, added, free)
@@ -343,7 +391,8 @@ class StereoSlam:
             return landmarks, added
         ids = np.arange(self._next_id, self._next_id + len(best), dtype=np.int64)
         self.backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(self._index, ids, features, new.rows[best])
+        camera = estimate.T_world_left[:3, 3]
+        landmarks = landmarks.with_new(self._index, ids, features, new.rows[best], camera)
         self._next_id += len(ids)
         both = Recognition(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
         return landmarks, both

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.objects.data import ObjectEstimate
-from slam.objects.tracks import Tracks
+from slam.objects.tracks import Tracks, times_vectors
 from slam.se3 import Array, inverse, so3_exp, so3_log
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
@@ -36,6 +37,7 @@ class Body:
         seen: number of frames in which it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
+        proved: whether it has moved for certain.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -56,6 +58,7 @@ class Body:
     seen: int = 1
     measured: bool = True
     moving: bool = True
+    proved: bool = False
     estimate: ObjectEstimate | None = field(default=None, repr=False)
 
     def placed(self, T: Array, slot: int) -> Body:
@@ -133,20 +136,14 @@ def with_extent(body: Body, local: Array) -> Body:
     return replace(body, lower=lower, upper=upper, reach=reach)
 
 
-def in_body_axes(body: Body, tracks: Tracks) -> tuple[Array, Array, BoolArray]:
-    """Measurements of tracks that were kept in world coordinates, in the body's: points, information, both by slot.
+def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
+    """What tracks measured, in the body's coordinates: points, information, both by slot.
 
     Returns:
         points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).
     """
-    known = (tracks.dof > 0) & body.known
-    A = np.where(known[..., None, None], tracks.A, 0.0)
-    R = body.history[:, :3, :3]
-    ridge = 1e-6 * np.trace(A, axis1=2, axis2=3)[..., None, None] * np.eye(3) + 1e-9 * np.eye(3)
-    p = (
-        np.linalg.solve(A + ridge, np.where(known[..., None], tracks.b, 0.0)[..., None])[..., 0]
-        + tracks.anchor[:, None]
-    )
+    known = (tracks.dof[rows] > 0) & body.known
     back = inverse(body.history)
-    points = np.einsum("wij,nwj->nwi", back[:, :3, :3], p) + back[:, :3, 3]
-    return points, np.einsum("wji,nwjk,wkl->nwil", R, A, R), known
+    points = times_vectors(back[:, :3, :3], tracks.p[rows] + tracks.anchor[rows, None]) + back[:, :3, 3]
+    A = back[:, :3, :3] @ tracks.A[rows] @ body.history[:, :3, :3]
+    return points, np.where(known[..., None, None], A, 0.0), known

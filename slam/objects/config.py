@@ -22,16 +22,12 @@ class ObjectsConfig:
         max_speed: no point of a body is faster [m/s]; bounds the search for features that are not where a still point
             would be.
         min_speed: no body is taken for moving that is slower [m/s].
-        speed_floor: standard deviation of a still point's apparent velocity that no noise explains (calibration,
-            drift), as a share of the camera's own speed.
         search_radius: half size of the search windows of tracks, at least [px]; and
         search_limit: at most.
         d_match: largest descriptor distance in the search windows; ratio: of the best to the second best.
         wide_d_match, wide_ratio: the same for features far from where a still point would be.
         min_frames: a feature is judged from so many measurements on.
-        certain: χ²(3) of a track's displacement from which it is taken to move even alone.
-        doubtful: from which it becomes no landmark.
-        enough: with so many landmarks recognised, features become landmarks only when they were judged to be still.
+        doubtful: χ²(3) of a track's displacement from which it becomes no landmark.
         suspect: χ²(6) of a large cluster's motion against the rest of the scene's from which its landmarks measure the
             camera no more, and
         group_test: from which it moves; of small clusters more is asked for.
@@ -49,7 +45,6 @@ class ObjectsConfig:
     patience: int = 3
     max_speed: float = 1.5
     min_speed: float = 0.01
-    speed_floor: float = 0.01
     search_radius: float = 4.0
     search_limit: float = 25.0
     d_match: float = 0.5
@@ -57,13 +52,11 @@ class ObjectsConfig:
     wide_d_match: float = 0.45
     wide_ratio: float = 0.8
     min_frames: int = 4
-    certain: float = 60.0
     doubtful: float = 14.0
-    enough: int = 30
     suspect: float = 20.0
     group_test: float = 30.0
     min_support: int = 4
-    confirm: int = 2
+    confirm: int = 3
     max_points: int = 80
     forget_after: float = 8.0
     margin: float = 0.25

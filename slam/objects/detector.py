@@ -12,23 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
-from slam.gating import chi_square_limits
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
 from slam.objects import membership
 from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, with_extent
-from slam.objects.clusters import displacements, judge_scene, limit
 from slam.objects.config import ObjectsConfig
 from slam.objects.data import Judgement, MovingObject, ObjectObservations
+from slam.objects.displacements import displacements
 from slam.objects.following import follow
-from slam.objects.measurement import View, measure, pose_information
+from slam.objects.measurement import measure
 from slam.objects.recovery import locate
-from slam.objects.tracks import Tracks, fit, make_room, record
+from slam.objects.regions import judge_scene, limit
+from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, record
 from slam.objects.twists import fit_twist
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse, transform
 
-_DEPTH = 0.5  # weight of log-depth against directions [rad], where tracks are clustered
 _TRUST = 1.0  # a body is remembered for as long as it was seen, at most
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
@@ -51,13 +50,11 @@ class MovingObjectDetector:
         self.bodies: dict[int, Body] = {}
         self.tracks: Tracks | None = None
         self._stamps = np.full(config.window, np.nan)
-        self._centres = np.zeros((config.window, 3))  # of the camera
         self._frame = -1
         self._next_track = 0
         self._next_body = 1
         self._forgotten: list[int] = []
         self._estimated: set[int] = set()  # bodies that the back end knows
-        self._held = np.zeros(0, np.intp)
         self.suspects = np.zeros(0, np.int64)
 
     # ------------------------------------------------------------------------------------------- a step, first part
@@ -66,30 +63,28 @@ class MovingObjectDetector:
         self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
     ) -> Judgement:
         """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
-        times = self._begin(features, estimate)
-        view = self._view(estimate, features, used)
+        times = self._begin(features)
+        T_world_left = estimate.T_world_left
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
-        follow(tracks, self.bodies, view, features, self._dt(times), self.rig, self.sigma, self.config)
-        self._measure(tracks, features, view)
+        follow(tracks, self.bodies, T_world_left, features, self._dt(times), self.rig, self.sigma, self.config)
+        self._measure(tracks, features, T_world_left)
         seen = np.flatnonzero(tracks.seen)
         known = seen[landmark[tracks.row[seen]] >= 0]
         tracks.landmark[known] = landmark[tracks.row[known]]
-        free = np.flatnonzero((tracks.body < 0) & tracks.seen)
-        fit(tracks, free, times, self.config.max_speed, self._floor(times))
-        self._change_members(times, view)
-        self._find_bodies(times, view)
-        self._begin_tracks(features, view, landmark)
-        return self._judgement(features, view)
+        self._fit(tracks, times)
+        self._change_members()
+        self._find_bodies(times, T_world_left)
+        self._begin_tracks(features, T_world_left, landmark)
+        return self._judgement(features)
 
-    def _begin(self, features: StereoFeatures, estimate: Estimate) -> Array:
+    def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
         if self.tracks is None:
             self.tracks = Tracks.empty(features.descriptors.shape[1], self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
-        self._centres[self.slot] = estimate.T_world_left[:3, 3]
         return np.nan_to_num(self._stamps - features.stamp)
 
     @property
@@ -100,26 +95,6 @@ class MovingObjectDetector:
     def _dt(self, times: Array) -> float:
         """Time since the previous frame [s]."""
         return float(-times[(self.slot - 1) % self.config.window])
-
-    def _floor(self, times: Array) -> float:
-        """Standard deviation of a still point's apparent velocity that no noise explains [m/s]."""
-        oldest = int(np.argmin(times))
-        if times[oldest] == 0:
-            return 0.0
-        gone = np.linalg.norm(self._centres[self.slot] - self._centres[oldest])
-        return float(self.config.speed_floor * gone / -times[oldest])
-
-    def _view(self, estimate: Estimate, features: StereoFeatures, used: NDArray[np.intp]) -> View:
-        """The camera's pose with the covariance that matters within the window.
-
-        The drift that all frames of the window share cannot make a still point move. What differs from frame to frame
-        is what this frame's landmarks leave open; where they are few, the estimate's own covariance takes over.
-        """
-        rows = used[features.has_stereo[used]]
-        local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
-        measured = pose_information(self.rig, local, np.ones(len(rows), bool), np.sqrt(2.0) * self.sigma)
-        prior = np.linalg.inv(estimate.covariance + 1e-12 * np.eye(6))
-        return View(estimate.T_world_left, np.linalg.inv(measured + prior))
 
     def _advance_bodies(self, times: Array) -> None:
         """Predict all bodies; forget those that were not seen for long."""
@@ -134,128 +109,129 @@ class MovingObjectDetector:
         assert self.tracks is not None
         del self.bodies[id]
         self._forgotten.append(id)
-        self.tracks = self.tracks.select(self.tracks.body != id)
+        self.tracks.give_up(np.flatnonzero(self.tracks.body == id))
 
     # ------------------------------------------------------------------------------------------- measuring
 
-    def _measure(self, tracks: Tracks, features: StereoFeatures, view: View) -> None:
-        """Enter this frame's pixels into the tracks: free ones in world coordinates, others in their body's."""
+    def _measure(self, tracks: Tracks, features: StereoFeatures, T_world_left: Array) -> None:
+        """Find the bodies by their members, and enter this frame's pixels into the tracks, in world coordinates."""
         c = self.config
-        views = {-1: view}
         for body in list(self.bodies.values()):
-            located = locate(body, tracks, features, view, self.rig, self.sigma, c, self._frame)
+            located = locate(body, tracks, features, T_world_left, self.rig, self.sigma, c, self._frame)
             if located is not None:
-                self.bodies[body.id] = replace(body.placed(located.T_world_object, self.slot), measured=True,
-                                               seen_at=features.stamp, seen=body.seen + 1)  # fmt: skip
-                views[body.id] = located.view
-        make_room(tracks, self.slot)
-        for frame, seen_from in views.items():
-            mine = np.flatnonzero(tracks.seen & (tracks.body == frame))
-            at = tracks.position[mine] if frame < 0 else tracks.local[mine]
-            z = membership.measured(features, tracks.row[mine])
-            record(tracks, mine, self.slot, *measure(self.rig, seen_from.T_frame_left, at, z, self.sigma))
+                body = replace(body.placed(located, self.slot), measured=True, seen_at=features.stamp,
+                               seen=body.seen + 1)  # fmt: skip
+                self.bodies[body.id] = body
+            mine = tracks.body == body.id
+            tracks.position[mine] = transform(body.T, tracks.local[mine])
+            make_room(tracks, self.slot)
+        seen = np.flatnonzero(tracks.seen)
+        z = membership.measured(features, tracks.row[seen])
+        record(tracks, seen, self.slot, *measure(self.rig, T_world_left, tracks.position[seen], z, self.sigma))
+
+    def _fit(self, tracks: Tracks, times: Array) -> None:
+        """Positions of free tracks, and velocities of those that may move."""
+        free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+        count = tracks.count[free]
+        unsure = (count < self.config.min_frames) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
+        fit_positions(tracks, free)
+        fit_velocities(tracks, free[unsure & (count > 1)], times, self.config.max_speed)
 
     # ------------------------------------------------------------------------------------------- bodies and members
 
-    def _find_bodies(self, times: Array, view: View) -> None:
-        """Test every spatial cluster of free tracks against the rest; one that moves for long becomes a body."""
+    def _find_bodies(self, times: Array, T_world_left: Array) -> None:
+        """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        able = tracks.seen & (tracks.body < 0) & (tracks.count >= c.min_frames)
-        local = transform(inverse(view.T_frame_left), tracks.position)
-        depth_sigma = np.sqrt(np.maximum(np.trace(tracks.covariance, axis1=1, axis2=2), 0))
-        able &= local[:, 2] > _FARTHEST * depth_sigma
-        rows, local = np.flatnonzero(able), local[able]
+        rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
+        rows = rows[tracks.count[rows] >= c.min_frames]
+        local = transform(inverse(T_world_left), tracks.position[rows])
+        deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
+        rows, local = rows[local[:, 2] > _FARTHEST * deviation], local[local[:, 2] > _FARTHEST * deviation]
         ages = (self.slot - np.arange(c.window)) % c.window
-        moved = displacements(tracks, rows, ages, view.T_frame_left[:3, 3])
-        place = np.column_stack([local[:, :2] / local[:, 2:], _DEPTH * np.log(local[:, 2])])
+        moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
+        place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
         scene = judge_scene(moved, place, c.suspect, c.min_support)
-        tracks.moving &= ~able
-        tracks.moving[rows] = (scene.alone > c.certain) & (tracks.residual[rows] < _residual_limit(tracks)[rows])
-        tracks.doubtful &= ~able
+        tracks.doubtful[:] = False
         tracks.doubtful[rows] = scene.alone > c.doubtful
         alike = np.zeros(len(tracks), bool)
         suspects = [np.zeros(0, np.int64)]
-        for members, test, away in zip(scene.clusters, scene.tests, scene.away):
-            suspects.append(tracks.landmark[rows[members]])
-            if test > limit(c.group_test, len(members)) and away > _LAG * self._dt(times) * c.min_speed:
-                alike[rows[members]] = True
-                self._perhaps_found(rows[members], times)
-        tracks.streak = np.where(alike & (tracks.body < 0), tracks.streak + 1, 0)
-        suspects.append(tracks.landmark[tracks.moving])
+        for group in scene.groups:
+            members = rows[group.members]
+            tracks.doubtful[members] = True
+            suspects.append(tracks.landmark[members])
+            far = group.away > _LAG * self._dt(times) * c.min_speed
+            alike[members] = far and group.test > limit(c.group_test, len(members))
+        fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
+        tracks.streak[:] = np.where(alike, tracks.streak + 1, 0)
+        for group in scene.groups:
+            members = rows[group.members]
+            self._perhaps_found(members[tracks.streak[members] >= c.confirm], times)
         self.suspects = np.concatenate(suspects)
 
     def _perhaps_found(self, members: NDArray[np.intp], times: Array) -> None:
-        """Make a body of tracks that move alike, if they have done so for long enough."""
+        """Make a body of tracks that have moved alike for long enough, if they lie together."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        if (tracks.streak[members] + 1 >= c.confirm).sum() < c.min_support:
+        members = members[membership.compact(tracks.position[members])]
+        if len(members) < c.min_support:
             return
         whose = membership.overlapped(self.bodies, tracks, members)
         if whose is not None:
             membership.enter(whose, tracks, members)
             return
-        centre = tracks.position[members].mean(axis=0)
-        weight = np.linalg.inv(tracks.velocity_covariance[members])
-        twist, _ = fit_twist(tracks.position[members], tracks.velocity[members], weight, centre)
+        motion = even_motion(tracks, members, times, c.max_speed)
+        centre = motion.position.mean(axis=0)
+        twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot])
         self._next_body += 1
-        body = membership.found(body, tracks, members, times, self.slot)
-        body = with_extent(body, tracks.local[members])
-        membership.admit(body, tracks, self.slot, c)
-        self.bodies[body.id] = with_extent(body, tracks.local[tracks.body == body.id])
+        self.bodies[body.id] = membership.found(body, tracks, members, times, self.slot)
 
-    def _change_members(self, times: Array, view: View) -> None:
-        """Tracks that fit a body better than the still world join it; those that do not fit it any more leave."""
+    def _change_members(self) -> None:
+        """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
         tracks = self.tracks
         assert tracks is not None
         for body in list(self.bodies.values()):
-            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-            fit(tracks, mine, times, self.config.max_speed, 0.0)
-            membership.dismiss(body, tracks, mine, self.config)
-            if body.measured:
-                membership.admit(body, tracks, self.slot, self.config)
-                if body.moving:
-                    self.bodies[body.id] = with_extent(body, tracks.local[tracks.body == body.id])
-                if membership.never_moved(body, view, self.rig.left.fu):
-                    membership.leave(tracks, np.flatnonzero(tracks.body == body.id), body)
-                    del self.bodies[body.id]
-                    self._forgotten.append(body.id)
+            if not body.measured:
+                continue
+            gain = membership.regroup(body, tracks, self.slot, self.config)
+            kept = membership.proved(body, gain)
+            if kept is None:
+                membership.leave(tracks, np.flatnonzero(tracks.body == body.id), body)
+                del self.bodies[body.id]
+                self._forgotten.append(body.id)
+            else:
+                self.bodies[body.id] = with_extent(kept, tracks.local[tracks.body == body.id])
 
-    def _begin_tracks(self, features: StereoFeatures, view: View, landmark: IdArray) -> None:
+    def _begin_tracks(self, features: StereoFeatures, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""
         tracks = self.tracks
         assert tracks is not None
+        tracks.give_up(np.flatnonzero((tracks.missed > self.config.patience) & (tracks.body < 0)))
         taken = np.zeros(len(features), bool)
         taken[tracks.row[tracks.seen]] = True
         rows = np.flatnonzero(~taken & features.has_stereo)
         local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         rows, local = rows[np.isfinite(local[:, 0])], local[np.isfinite(local[:, 0])]
-        points = transform(view.T_frame_left, local)
+        points = transform(T_world_left, local)
         ids = np.arange(self._next_track, self._next_track + len(rows), dtype=np.int64)
         self._next_track += len(rows)
-        new = Tracks.new(ids, features, rows, points, self.config.window)
-        new.landmark[:] = landmark[rows]
+        new = tracks.begin(ids, features, rows, points)
+        tracks.landmark[new] = landmark[rows]
         z = membership.measured(features, rows)
-        p, A, dof = measure(self.rig, view.T_frame_left, points, z, self.sigma)
-        record(new, np.arange(len(rows)), self.slot, p, A, dof)
-        fit(new, np.arange(len(rows)), np.zeros(self.config.window), self.config.max_speed, 0.0)
-        keep = (tracks.missed <= self.config.patience) | (tracks.body >= 0)
-        self.tracks = tracks.select(keep).joined(new)
+        record(tracks, new, self.slot, *measure(self.rig, T_world_left, points, z, self.sigma))
+        fit_positions(tracks, new)
 
-    def _judgement(self, features: StereoFeatures, view: View) -> Judgement:
+    def _judgement(self, features: StereoFeatures) -> Judgement:
         tracks = self.tracks
         assert tracks is not None
-        c = self.config
-        moving = tracks.seen & (tracks.moving | (tracks.body >= 0))
-        self._held = membership.held(self.bodies, tracks, features, view, self.rig, self.sigma, self.config)
-        landmarks = np.unique(tracks.landmark[(tracks.moving | (tracks.body >= 0)) & (tracks.landmark >= 0)])
-        tracks.landmark[(tracks.moving | (tracks.body >= 0))] = -1
-        decided = tracks.seen & (tracks.count >= c.min_frames) & ~tracks.doubtful
-        undecided = np.ones(len(features), bool)
-        undecided[tracks.row[decided]] = False
-        moving_rows = np.unique(np.concatenate([tracks.row[moving], self._held]))
-        return Judgement(moving_rows, np.flatnonzero(undecided), landmarks)
+        on, near = membership.on_bodies(self.bodies, tracks, self.config.margin)
+        doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
+        landmarks = np.unique(tracks.landmark[tracks.body >= 0])
+        tracks.landmark[tracks.body >= 0] = -1
+        moving = np.unique(tracks.row[on])
+        undecided = np.setdiff1d(tracks.row[np.concatenate([near, doubtful])], moving)
+        return Judgement(moving, undecided, landmarks[landmarks >= 0])
 
     # ------------------------------------------------------------------------------------------- a step, second part
 
@@ -289,6 +265,7 @@ class MovingObjectDetector:
         tracks = self.tracks
         assert tracks is not None
         mine = np.flatnonzero((tracks.body == body.id) & tracks.seen & (tracks.misfit == 0))
+        mine = mine[np.argsort(tracks.ids[mine])]
         rows = tracks.row[mine]
         return ObjectObservations(body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], body.T)
 
@@ -301,9 +278,3 @@ class MovingObjectDetector:
             body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
             np.stack([body.lower, body.upper]), body.moving,
         )  # fmt: skip
-
-
-def _residual_limit(tracks: Tracks) -> Array:
-    """Largest χ² per degree of freedom that an even motion may leave (N,): 99.9 %."""
-    dof = np.maximum(tracks.dof.sum(axis=1).astype(int) - 6, 1)
-    return chi_square_limits(dof, 0.999) / dof

@@ -5,23 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.data import StereoFeatures
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far, match_near
-from slam.objects.measurement import View, predict
-from slam.objects.tracks import MOVES, Tracks
+from slam.objects.tracks import Tracks
 from slam.rig import StereoRig
 from slam.se3 import Array, hat, transform
 
 _SIGMAS = 3.0
+_RIGHT_SIGMAS = 4.0
+_UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
 
 def follow(
     tracks: Tracks,
     bodies: Mapping[int, Body],
-    view: View,
+    T_world_left: Array,
     features: StereoFeatures,
     dt: float,
     rig: StereoRig,
@@ -34,85 +36,82 @@ def follow(
     is left, and was not known for long enough to have a velocity, is looked for as far as `max_speed` allows.
     """
     tracks.row[:] = -1
-    if len(tracks) and len(features):
-        points, covariance = expected_points(tracks, bodies, dt)
-        expected = predict(rig, view, points, sigma)
-        spread = expected.S + expected.J @ covariance @ np.swapaxes(expected.J, 1, 2)
-        _near(tracks, features, expected.z, spread, config)
-        _check_right(tracks, features, expected.z, spread, points, dt, view, config, rig)
-        _far(tracks, features, points, dt, view, config, rig, sigma)
+    alive = np.flatnonzero(tracks.ids >= 0)
+    if len(alive) and len(features):
+        _advance(tracks, bodies, alive, dt)
+        R = T_world_left[:3, :3]
+        local = (tracks.position[alive] - T_world_left[:3, 3]) @ R
+        z, J = rig.project_stereo(local)
+        J = J @ R.T
+        spread = np.sqrt(((J @ tracks.covariance[alive]) * J).sum(axis=2) + sigma**2)
+        _near(tracks, alive, features, z, spread, config)
+        _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+        _far(tracks, T_world_left, features, dt, config, rig, sigma)
     seen = tracks.seen
     tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
     tracks.missed[:] = np.where(seen, 0, tracks.missed + 1)
 
 
-def expected_points(tracks: Tracks, bodies: Mapping[int, Body], dt: float) -> tuple[Array, Array]:
-    """World positions (N, 3) of all tracks in the next frame, and their covariances (N, 3, 3).
-
-    The free tracks' positions move on, in place.
-    """
-    free = tracks.body < 0
-    moves = free & (tracks.test > MOVES)
+def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp], dt: float) -> None:
+    """Where tracks are expected in this frame: positions and covariances move on, in place."""
+    moves = alive[(tracks.body[alive] < 0) & tracks.velocity[alive].any(axis=1)]
     tracks.position[moves] += dt * tracks.velocity[moves]
-    covariance = tracks.covariance.copy()
-    covariance[moves] += dt**2 * tracks.velocity_covariance[moves]
-    points = tracks.position.copy()
+    tracks.covariance[moves] += dt**2 * tracks.velocity_covariance[moves]
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
-        points[mine] = transform(body.T, tracks.local[mine])
-        R = body.T[:3, :3]
-        J = R @ np.concatenate([-hat(tracks.local[mine]), np.broadcast_to(np.eye(3), (len(mine), 3, 3))], axis=2)
+        R, local = body.T[:3, :3], tracks.local[mine]
+        tracks.position[mine] = transform(body.T, local)
+        J = R @ np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (len(mine), 3, 3))], axis=2)
         own = np.linalg.inv(tracks.local_information[mine] + 1e-6 * np.eye(3))
-        covariance[mine] = J @ body.covariance @ np.swapaxes(J, 1, 2) + R @ own @ R.T
-    return points, covariance
+        tracks.covariance[mine] = J @ body.covariance @ np.swapaxes(J, 1, 2) + R @ own @ R.T
 
 
-def _near(tracks: Tracks, features: StereoFeatures, z: Array, spread: Array, config: ObjectsConfig) -> None:
-    size = _SIGMAS * np.sqrt(np.maximum(spread[:, 0, 0], spread[:, 1, 1]))
-    least = np.where(tracks.doubtful | tracks.moving, 0.5 * config.search_limit, config.search_radius)
+def _near(
+    tracks: Tracks, alive: NDArray[np.intp], features: StereoFeatures, z: Array, spread: Array, config: ObjectsConfig
+) -> None:
+    size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
+    least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
     radius = np.clip(np.nan_to_num(size), least, config.search_limit)
     rows, columns = match_near(
-        z[:, :2], radius, tracks.descriptors, tracks.laplacian, features, config.d_match, config.ratio
+        z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], features, config.d_match, config.ratio
     )
-    tracks.row[rows] = columns
+    tracks.row[alive[rows]] = columns
 
 
 def _check_right(
-    tracks: Tracks, features: StereoFeatures, z: Array, spread: Array, points: Array, dt: float, view: View,
-    config: ObjectsConfig, rig: StereoRig,
+    tracks: Tracks, alive: NDArray[np.intp], features: StereoFeatures, expected: Array, spread: Array, depth: Array,
+    dt: float, config: ObjectsConfig, rig: StereoRig,
 ) -> None:  # fmt: skip
     """Drop matches whose right pixel says that it is another point, or a false stereo match."""
-    rows = np.flatnonzero(tracks.seen)
-    right = features.uv_right[tracks.row[rows], 0]
-    away = np.abs(right - z[rows, 2])
-    depth = np.maximum(((points[rows] - view.T_frame_left[:3, 3]) @ view.T_frame_left[:3, 2]), 1e-3)
-    allowance = 0.3 * config.max_speed * dt * rig.left.fu / depth
-    young = tracks.count[rows] < config.min_frames
-    allowance *= np.where(young, 3.0, 1.0)
-    bad = away > 4 * np.sqrt(spread[rows, 2, 2]) + allowance  # NaN compares false
-    tracks.row[rows[bad]] = -1
+    seen = np.flatnonzero(tracks.seen[alive])
+    rows = alive[seen]
+    away = np.abs(features.uv_right[tracks.row[rows], 0] - expected[seen])
+    allowance = _UNEVEN * config.max_speed * dt * rig.left.fu / np.maximum(depth[seen], 1e-3)
+    allowance *= np.where(tracks.count[rows] < config.min_frames, 1.0 / _UNEVEN, 1.0)
+    tracks.row[rows[away > _RIGHT_SIGMAS * spread[seen] + allowance]] = -1  # NaN compares false
 
 
 def _far(
-    tracks: Tracks, features: StereoFeatures, points: Array, dt: float, view: View, config: ObjectsConfig,
-    rig: StereoRig, sigma: float,
+    tracks: Tracks, T_world_left: Array, features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig,
+    sigma: float,
 ) -> None:  # fmt: skip
     """Look for tracks without a velocity yet anywhere that `max_speed` allows."""
-    reach = config.max_speed * dt
-    lost = (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0) & (tracks.count <= config.min_frames)
+    lost = (tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0)
     left = np.flatnonzero(lost)
+    left = left[tracks.count[left] <= config.min_frames]
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen]] = True
     free = np.flatnonzero(~taken & features.has_stereo)
     if not len(left) or not len(free):
         return
     local = rig.triangulate(features.uv_left[free], features.uv_right[free])
-    found = transform(view.T_frame_left, local)
-    noise = rig.triangulation_covariance(local, sigma)[:, 2, 2]
+    free, local = free[np.isfinite(local[:, 0])], local[np.isfinite(local[:, 0])]
+    found = transform(T_world_left, local)
+    deviation = local[:, 2] ** 2 * np.sqrt(2.0) * sigma / (rig.left.fu * rig.baseline)
     own = np.trace(tracks.covariance[left], axis1=1, axis2=2)
-    gap = np.linalg.norm(points[left][:, None] - found[None], axis=2)
-    with np.errstate(invalid="ignore"):
-        allowed = gap < reach + 3 * np.sqrt(own[:, None] + noise[None])
+    start = tracks.position[left]
+    squares = (start**2).sum(axis=1)[:, None] + (found**2).sum(axis=1) - 2 * start @ found.T
+    allowed = squares < (config.max_speed * dt + _SIGMAS * np.sqrt(own[:, None] + deviation**2)) ** 2
     rows, columns = match_far(
         tracks.descriptors[left], tracks.laplacian[left], features, free, allowed, config.wide_d_match,
         config.wide_ratio,

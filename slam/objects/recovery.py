@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,6 @@ from slam.data import StereoFeatures
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.measurement import View, pose_information
 from slam.objects.tracks import Tracks
 from slam.pose_solver import find_consensus, measurement_rows
 from slam.rig import StereoRig
@@ -23,31 +20,20 @@ _LEAST = 3  # points that fix a pose
 _LEAST_ANEW = 4  # points that must agree where a body is found again
 
 
-@dataclass(frozen=True)
-class Located:
-    """A body's place in this frame.
-
-    Attributes:
-        T_world_object: pose (4, 4).
-        view: the camera as seen from the body.
-    """
-
-    T_world_object: Array
-    view: View
-
-
 def locate(
-    body: Body, tracks: Tracks, features: StereoFeatures, view: View, rig: StereoRig, sigma: float,
+    body: Body, tracks: Tracks, features: StereoFeatures, T_world_left: Array, rig: StereoRig, sigma: float,
     config: ObjectsConfig, seed: int,
-) -> Located | None:  # fmt: skip
-    """Fit the body's pose to its tracks that are seen, or find it again; tracks that disagree are counted as misfits.
+) -> Array | None:  # fmt: skip
+    """The body's pose T_world_object (4, 4) by a fit to its tracks that are seen, or found again.
+
+    Tracks that disagree are counted as misfits, in place.
 
     Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree.
     """
     mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-    found = _fit(body, tracks, mine, features, view, rig, sigma, seed)
+    found = _fit(body, tracks, mine, features, T_world_left, rig, sigma, seed)
     if found is None or 2 * len(found[1]) < len(mine):
-        again = _anew(body, tracks, features, view, rig, sigma, config, seed)
+        again = _anew(body, tracks, features, T_world_left, rig, sigma, config, seed)
         if again is not None and (found is None or len(again[1]) > len(found[1])):
             found, mine = again, again[1]
     if found is None:
@@ -58,14 +44,11 @@ def locate(
     tracks.misfit[outside] += 1
     tracks.row[outside] = -1
     tracks.misfit[agreeing] = 0
-    rows = tracks.row[agreeing]
-    local = transform(inverse(T_body_left), tracks.local[agreeing])
-    known = pose_information(rig, local, features.has_stereo[rows], sigma) + 1e-3 * np.eye(6)
-    return Located(view.T_frame_left @ inverse(T_body_left), View(T_body_left, np.linalg.inv(known)))
+    return np.asarray(T_world_left @ inverse(T_body_left))
 
 
 def _fit(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, view: View, rig: StereoRig,
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, T_world_left: Array, rig: StereoRig,
     sigma: float, seed: int, least: int = _LEAST,
 ) -> tuple[Array, NDArray[np.intp]] | None:  # fmt: skip
     """Pose T_body_left and the tracks that agree with it."""
@@ -73,7 +56,7 @@ def _fit(
         return None
     rows = tracks.row[mine]
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
-    guess = inverse(body.T) @ view.T_frame_left
+    guess = inverse(body.T) @ T_world_left
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
     agreeing = mine[fit.inliers]
     stereo = features.has_stereo[tracks.row[agreeing]]
@@ -81,7 +64,7 @@ def _fit(
 
 
 def _anew(
-    body: Body, tracks: Tracks, features: StereoFeatures, view: View, rig: StereoRig, sigma: float,
+    body: Body, tracks: Tracks, features: StereoFeatures, T_world_left: Array, rig: StereoRig, sigma: float,
     config: ObjectsConfig, seed: int,
 ) -> tuple[Array, NDArray[np.intp]] | None:  # fmt: skip
     """Find a body by its points' looks, no farther from where it is expected than it can have gone."""
@@ -92,7 +75,7 @@ def _anew(
     if len(mine) < _LEAST_ANEW or len(free) < _LEAST_ANEW:
         return None
     local = rig.triangulate(features.uv_left[free], features.uv_right[free])
-    points = transform(view.T_frame_left, local)
+    points = transform(T_world_left, local)
     reach = config.max_speed * max(features.stamp - body.seen_at, 0.1) + np.linalg.norm(body.upper - body.lower)
     near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + 0.2 * np.abs(local[:, 2])
     allowed = np.broadcast_to(near, (len(mine), len(free)))
@@ -103,7 +86,7 @@ def _anew(
     before = tracks.row[mine].copy()
     tracks.row[mine] = -1
     tracks.row[mine[rows]] = columns
-    found = _fit(body, tracks, mine[rows], features, view, rig, sigma, seed, _LEAST_ANEW)
+    found = _fit(body, tracks, mine[rows], features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
     if found is None:
         tracks.row[mine] = before
     return found

@@ -1,9 +1,8 @@
 """Features followed from frame to frame: what a track remembers, and how it fits a fixed point or an even motion.
 
-Every measurement is kept as information about a point in world coordinates: a matrix ``A = Jᵀ S⁻¹ J`` (3, 3) and a
-vector ``A p``, p being the point that the pixels say, relative to the track's own anchor. S holds the pixel noise and
-the camera pose's uncertainty. Sums over the window give the least-squares fixed point, the least-squares point with an
-even velocity, and the χ² of both.
+Every measurement is kept as a point in world coordinates with its information: the point ``p`` that the pixels say,
+relative to the track's own anchor, and ``A = Jᵀ J / σ²``. Sums over the window give the least-squares fixed point, the
+least-squares point with an even velocity, and the χ² of both.
 """
 
 from __future__ import annotations
@@ -18,15 +17,16 @@ from slam.se3 import Array
 
 _RIDGE = 1e-9
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-MOVES = 12.0  #: χ²(3) of the velocity from which it counts in the position: 1 % of still points
+_MOVES = 12.0  # χ²(3) of the velocity from which it counts: 1 % of still points
+_ROOM = 1000  # rows that a table begins with
 
 
 @dataclass
 class Tracks:
-    """Tracks, a row each; the one mutable table of the detector.
+    """A table of tracks; the one mutable thing of the detector. Rows of tracks that were given up are used again.
 
     Attributes:
-        ids: (N,), ascending, never used twice.
+        ids: (N,), never used twice; −1 for unused rows, which are neither seen nor of a body.
         descriptors, laplacian: as last seen (N, D) float32, (N,) int8.
         row: row of the feature in this frame (N,), −1 where not seen.
         landmark: id of the landmark that it is (N,), −1 for none.
@@ -34,20 +34,16 @@ class Tracks:
         missed: frames since it was last seen (N,).
         anchor: origin of the track's own coordinates, in world axes (N, 3).
         A: information (N, W, 3, 3), zero where there is no measurement; slot ``frame % W``.
-        b: ``A p`` (N, W, 3) with p relative to the anchor.
-        c: ``pᵀ A p`` (N, W).
+        p: the point that the pixels say (N, W, 3), relative to the anchor.
         dof: numbers measured (N, W): 3, 2 or 0.
-        older_A, older_b: fading sums of what has left the window (N, 3, 3), (N, 3), and
+        older_A, older_b: fading sums of A and ``A p`` of what has left the window (N, 3, 3), (N, 3), and
         older_age: of the ages of these measurements in frames, each times the trace of its A (N,).
         position: where it is now, in world coordinates (N, 3).
-        velocity: of the fit with an even velocity (N, 3) [m/s]; zero where there are too few measurements.
         covariance: of the position (N, 3, 3).
-        velocity_covariance: (N, 3, 3).
-        test: χ²(3) of the velocity: of "still" against "even velocity" (N,).
-        residual: χ² left by the even velocity, per degree of freedom (N,).
+        velocity: of those that a fixed point does not explain (N, 3) [m/s]; zero for the others.
+        velocity_covariance: (N, 3, 3), of those that have one.
         streak: frames in a row in which it was part of a group that moves alike (N,).
-        moving: judged to move without belonging to a body (N,).
-        doubtful: neither still nor moving for certain (N,).
+        doubtful: not still for certain (N,).
         local: point in the body's coordinates (N, 3), and
         local_information: its information (N, 3, 3).
         misfit: how often lately it disagreed with its body (N,).
@@ -62,44 +58,34 @@ class Tracks:
     missed: IdArray
     anchor: Array
     A: Array
-    b: Array
-    c: Array
+    p: Array
     dof: NDArray[np.int8]
     older_A: Array
     older_b: Array
     older_age: Array
     position: Array
-    velocity: Array
     covariance: Array
+    velocity: Array
     velocity_covariance: Array
-    test: Array
-    residual: Array
     streak: IdArray
-    moving: BoolArray
     doubtful: BoolArray
     local: Array
     local_information: Array
     misfit: IdArray
 
     @classmethod
-    def new(cls, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array, window: int) -> Tracks:
-        """Tracks begun at features whose points in world coordinates are `points` (N, 3); no measurement yet."""
-        n = len(rows)
-        none, zero = np.full(n, -1, np.int64), np.zeros(n, np.int64)
+    def empty(cls, dimensions: int, window: int, rows: int = _ROOM) -> Tracks:
+        """A table without tracks."""
+        none, zero = np.full(rows, -1, np.int64), np.zeros(rows, np.int64)
+        vector, matrix = np.zeros((rows, 3)), np.zeros((rows, 3, 3))
         return cls(
-            ids, features.descriptors[rows], features.laplacian[rows], rows.astype(np.intp), none, none.copy(), zero,
-            points, np.zeros((n, window, 3, 3)), np.zeros((n, window, 3)), np.zeros((n, window)),
-            np.zeros((n, window), np.int8), np.zeros((n, 3, 3)), np.zeros((n, 3)),
-            np.zeros(n), points.copy(), np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3)),
-            np.zeros(n), np.zeros(n), zero.copy(), np.zeros(n, bool), np.zeros(n, bool), np.zeros((n, 3)),
-            np.zeros((n, 3, 3)), zero.copy(),
+            none.copy(), np.zeros((rows, dimensions), np.float32), np.zeros(rows, np.int8), none.astype(np.intp),
+            none.copy(), none.copy(), zero.copy(), vector.copy(), np.zeros((rows, window, 3, 3)),
+            np.zeros((rows, window, 3)), np.zeros((rows, window), np.int8), matrix.copy(), vector.copy(),
+            np.zeros(rows),
+            vector.copy(), matrix.copy(), vector.copy(), matrix.copy(), zero.copy(), np.zeros(rows, bool),
+            vector.copy(), matrix.copy(), zero.copy(),
         )  # fmt: skip
-
-    @classmethod
-    def empty(cls, dimensions: int, window: int) -> Tracks:
-        """No tracks."""
-        nothing = StereoFeatures.empty(0.0, dimensions)
-        return cls.new(np.zeros(0, np.int64), nothing, np.zeros(0, np.intp), np.zeros((0, 3)), window)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -114,76 +100,109 @@ class Tracks:
         """Number of measurements in the window (N,)."""
         return (self.dof > 0).sum(axis=1)
 
-    def select(self, keep: NDArray) -> Tracks:
-        """Some of the rows, in order."""
-        return Tracks(*(getattr(self, f.name)[keep] for f in fields(Tracks)))
+    def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
+        """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""
+        unused = np.flatnonzero(self.ids < 0)
+        if len(unused) < len(rows):
+            more = Tracks.empty(self.descriptors.shape[1], self.dof.shape[1], max(len(self), len(rows)))
+            for f in fields(Tracks):
+                setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(more, f.name)]))
+            unused = np.flatnonzero(self.ids < 0)
+        new = unused[: len(rows)]
+        self.ids[new], self.row[new], self.missed[new] = ids, rows, 0
+        self.descriptors[new], self.laplacian[new] = features.descriptors[rows], features.laplacian[rows]
+        self.anchor[new] = self.position[new] = points
+        self.landmark[new] = -1
+        self.forget_past(new)
+        return new
 
-    def joined(self, others: Tracks) -> Tracks:
-        """These rows and others below."""
-        return Tracks(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)]) for f in fields(Tracks)))
+    def give_up(self, rows: NDArray[np.intp]) -> None:
+        """Make rows unused."""
+        self.ids[rows] = self.row[rows] = self.body[rows] = self.landmark[rows] = -1
+        self.dof[rows] = 0
+
+    def forget_past(self, rows: NDArray[np.intp]) -> None:
+        """Make tracks free and without measurements."""
+        self.body[rows], self.misfit[rows], self.streak[rows], self.doubtful[rows] = -1, 0, 0, False
+        for array in (self.A, self.p, self.dof, self.older_A, self.older_b, self.older_age, self.velocity):
+            array[rows] = 0
 
 
 def make_room(tracks: Tracks, slot: int) -> None:
     """Let what `slot` held leave the window, in place."""
+    A = tracks.A[:, slot]
     weight = np.trace(tracks.older_A, axis1=1, axis2=2)
-    tracks.older_age[:] = _MEMORY * (tracks.older_age + weight)
-    tracks.older_age += tracks.A.shape[1] * np.trace(tracks.A[:, slot], axis1=1, axis2=2)
-    tracks.older_A[:] = _MEMORY * tracks.older_A + tracks.A[:, slot]
-    tracks.older_b[:] = _MEMORY * tracks.older_b + tracks.b[:, slot]
-    for array in (tracks.A, tracks.b, tracks.c, tracks.dof):
+    tracks.older_age[:] = _MEMORY * (tracks.older_age + weight) + tracks.A.shape[1] * np.trace(A, axis1=1, axis2=2)
+    tracks.older_b[:] = _MEMORY * tracks.older_b + times_vectors(A, tracks.p[:, slot])
+    tracks.older_A[:] = _MEMORY * tracks.older_A + A
+    for array in (tracks.A, tracks.p, tracks.dof):
         array[:, slot] = 0
 
 
 def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, information: Array, dof: NDArray) -> None:
     """Enter measurements of this frame: points (M, 3) with information (M, 3, 3), in place; see `make_room`."""
-    p = points - tracks.anchor[rows]
-    Ap = np.einsum("nij,nj->ni", information, p)
     tracks.A[rows, slot] = information
-    tracks.b[rows, slot] = Ap
-    tracks.c[rows, slot] = np.einsum("ni,ni->n", p, Ap)
+    tracks.p[rows, slot] = points - tracks.anchor[rows]
     tracks.dof[rows, slot] = dof
 
 
-def fit(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float, floor: float) -> None:
-    """Fit position and velocity of tracks to their windows, in place.
+def fit_positions(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+    """Fit fixed points to the windows of tracks, in place."""
+    A = tracks.A[rows]
+    M = A.sum(axis=1)
+    P = np.linalg.inv(M + _ridge(M))
+    tracks.position[rows] = tracks.anchor[rows] + times_vectors(P, times_vectors(A, tracks.p[rows]).sum(axis=1))
+    tracks.covariance[rows] = P
+    tracks.velocity[rows] = 0
+
+
+@dataclass(frozen=True)
+class EvenMotion:
+    """Points with an even velocity, a row each: position now (N, 3), velocity (N, 3) [m/s], covariances (N, 3, 3)."""
+
+    position: Array
+    covariance: Array
+    velocity: Array
+    velocity_covariance: Array
+
+
+def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> EvenMotion:
+    """Points with an even velocity, fitted to the windows of tracks.
 
     Args:
         tracks: all tracks.
         rows: which of them.
         times: of the window's slots less the present (W,) [s].
         max_speed: deviation of velocities before anything is known [m/s].
-        floor: standard deviation [m/s] of a still point's apparent velocity, beyond what the noise explains.
     """
-    if not len(rows):
-        return
-    A, b = tracks.A[rows], tracks.b[rows]
+    A = tracks.A[rows]
+    b = times_vectors(A, tracks.p[rows])
     n, w = len(rows), A.shape[1]
     powers = np.stack([np.ones(w), times, times * times])
     M0, M1, M2 = (powers @ A.reshape(n, w, 9)).reshape(n, 3, 3, 3).transpose(1, 0, 2, 3)
     B0, B1 = (powers[:2] @ b).transpose(1, 0, 2)
-    M0 = M0 + _ridge(M0)
-    P0 = np.linalg.inv(M0)
+    P0 = np.linalg.inv(M0 + _ridge(M0))
     G = P0 @ M1
-    S = M2 - np.swapaxes(G, 1, 2) @ M1
-    u = B1 - np.einsum("nji,nj->ni", G, B0)
-    judged = (tracks.dof[rows] > 0).sum(axis=1) >= 2
-    S = S + np.eye(3) / max_speed**2
-    PV = np.zeros((n, 3, 3))
-    PV[judged] = np.linalg.inv(S[judged] + _ridge(S[judged]))
-    V = np.einsum("nij,nj->ni", PV, u)
-    tracks.velocity[rows] = V
-    tracks.velocity_covariance[rows] = PV
-    still = np.einsum("nij,nj->ni", P0, B0)
-    explained = np.einsum("ni,ni->n", B0, still) + np.einsum("ni,ni->n", u, V)
-    dof = np.maximum(tracks.dof[rows].sum(axis=1) - 6, 1)
-    tracks.residual[rows] = np.maximum(tracks.c[rows].sum(axis=1) - explained, 0) / dof
-    test = np.zeros(n)
-    loose = np.linalg.inv(PV[judged] + floor**2 * np.eye(3))
-    test[judged] = np.einsum("ni,nij,nj->n", V[judged], loose, V[judged])
-    tracks.test[rows] = test
-    moves = (test > MOVES)[:, None]
-    tracks.position[rows] = tracks.anchor[rows] + still - moves * np.einsum("nij,nj->ni", G, V)
-    tracks.covariance[rows] = P0 + moves[..., None] * (G @ PV @ np.swapaxes(G, 1, 2))
+    S = M2 - np.swapaxes(G, 1, 2) @ M1 + np.eye(3) / max_speed**2
+    PV = np.linalg.inv(S + _ridge(S))
+    V = times_vectors(PV, B1 - times_vectors(np.swapaxes(G, 1, 2), B0))
+    position = tracks.anchor[rows] + times_vectors(P0, B0) - times_vectors(G, V)
+    return EvenMotion(position, P0 + G @ PV @ np.swapaxes(G, 1, 2), V, PV)
+
+
+def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> None:
+    """Give tracks their even motion, in place, where a fixed point does not explain them; see `even_motion`."""
+    m = even_motion(tracks, rows, times, max_speed)
+    test = (m.velocity * np.linalg.solve(m.velocity_covariance, m.velocity[..., None])[..., 0]).sum(axis=1)
+    moves = test > _MOVES
+    tracks.velocity[rows[moves]] = m.velocity[moves]
+    tracks.velocity_covariance[rows[moves]] = m.velocity_covariance[moves]
+    tracks.position[rows[moves]], tracks.covariance[rows[moves]] = m.position[moves], m.covariance[moves]
+
+
+def times_vectors(M: Array, v: Array) -> Array:
+    """Products (..., 3) of matrices (..., 3, 3) and vectors (..., 3)."""
+    return np.asarray((M @ v[..., None])[..., 0])
 
 
 def _ridge(M: Array) -> Array:

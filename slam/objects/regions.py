@@ -1,0 +1,234 @@
+"""Which tracks moved together, against the rest of the scene: the test that a wrong camera pose cannot fool.
+
+Each track brings a displacement ``d_i`` (3,): where its last few frames see it, less where the frames before did. A
+camera pose that is off moves all still points by one small rigid motion ``d_i = ρ + θ × (p_i − c)``; so does a body's
+own motion, but for its points alone. Therefore no displacement is judged by itself: the tracks inside a window of
+directions and depths, for windows of every size, are tested against the rest of them. The common motion that the window
+says and the one that the rest says are compared with the covariance of both,
+
+    (ξ_w − ξ_r)ᵀ (Λ_w⁻¹ + Λ_r⁻¹)⁻¹ (ξ_w − ξ_r)  ~  χ²(6),
+
+Λ being sums of ``Jᵀ W J`` over the tracks. It matters where a body is nearer than all else: then it rules the camera's
+pose, the estimate follows it, and it is the still world that seems to move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray
+from slam.objects.displacements import Displacements
+from slam.se3 import Array, hat
+
+_PULL = 16.0  # no track brings more χ² than this: single false ones find no company
+_POWERS = (0.5, 0.5, 0.5, 1.0, 1.0)  # rounds of reweighting: Huber's first, which has one minimum, then a sharper one
+_LARGEST = 0.4  # share of all tracks that a body may have: the still world has most
+_PRIOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
+_FITS = 14.2  # χ²(3) at 99.7 %
+_BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
+_BETTER_AROUND = 6.0  # where it lies outside the window
+_EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
+_TAIL = 3.0  # tracks; see `limit`
+_MEDIAN = 2.37  # of χ²(3)
+_SIZES = ((0.1, 0.2), (0.2, 0.4), (0.4, 0.8))  # of windows: directions (x/z, y/z), and logarithm of the depth
+_OFFSETS = 0.5 * np.array(list(np.ndindex(2, 2, 2)))  # windows begin every half a width, along every axis
+_CELLS = 2**16  # more than there are windows along an axis
+_AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
+_MOST = 6  # windows looked into in a frame
+
+
+@dataclass(frozen=True)
+class Group:
+    """Tracks that moved alike, and otherwise than the rest.
+
+    Attributes:
+        members: their rows (K,).
+        test: χ²(6) of their motion against the rest's.
+        away: how far they went against the rest, in the mean [m].
+    """
+
+    members: NDArray[np.intp]
+    test: float
+    away: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the displacements say.
+
+    Attributes:
+        groups: those that moved on their own, the clearest first.
+        alone: χ²(3) of every track's displacement against the rest's common motion (N,).
+    """
+
+    groups: list[Group]
+    alone: Array
+
+
+def limit(test: float, size: Array | int) -> Array:
+    """χ²(6) from which a group of so many tracks moved: small groups have the heavier tails of single tracks."""
+    return test * (1.0 + _TAIL / np.maximum(size, 1.0))
+
+
+def judge_scene(moved: Displacements, place: Array, test: float, support: int) -> Scene:
+    """Groups that moved on their own, and every track's displacement against the rest.
+
+    Args:
+        moved: displacements of the tracks.
+        place: where tracks are seen (N, 3): x/z, y/z, and log z.
+        test: χ²(6) from which a large group moved; see `limit`.
+        support: least number of tracks in a group.
+    """
+    n = len(moved.d)
+    if n < 3 * support:
+        return Scene([], np.zeros(n))
+    problem = _Problem.of(moved)
+    windows = _Windows.over(place, support)
+    rest: BoolArray = np.ones(n, bool)
+    alone: Array = np.zeros(n)
+    groups: list[Group] = []
+    for _ in range(_MOST):
+        common = problem.common_motion(rest)
+        alone = problem.squares(common)
+        scale = max(1.0, float(np.median(alone[rest])) / _MEDIAN)
+        alone = alone / scale
+        found = _clearest(windows, problem, alone, scale, rest, test, support)
+        if found is None:
+            break
+        seeds, near = rest & windows.inside(found[0]), rest & windows.around(found[0], place)
+        common = problem.common_motion(rest & ~seeds)
+        members = _members(problem, seeds, near, problem.squares(common) / scale, scale, support)
+        if len(members) < support:
+            rest &= ~seeds  # nothing holds together there: judged no more
+            continue
+        groups.append(Group(members, found[1], problem.mean_gap(members, common)))
+        rest[members] = False
+        if rest.sum() < n / 3:
+            break
+    return Scene(groups, alone)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Displacements as a linear problem in a common motion [θ, ρ] (6,): `J` (N, 3, 6), and the normal equations' parts.
+
+    `L` (N, 36) holds ``Jᵀ W J`` of every track, `eta` (N, 6) ``Jᵀ W d``.
+    """
+
+    moved: Displacements
+    J: Array
+    L: Array
+    eta: Array
+
+    @classmethod
+    def of(cls, moved: Displacements) -> _Problem:
+        """Of displacements; the motion is by frame."""
+        n = len(moved.d)
+        J = np.concatenate([-hat(moved.points), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
+        J = moved.lag[:, None, None] * J
+        JW = np.swapaxes(J, 1, 2) @ moved.W
+        return cls(moved, J, (JW @ J).reshape(n, 36), (JW @ moved.d[:, :, None])[:, :, 0])
+
+    def common_motion(self, rows: BoolArray) -> Array:
+        """The motion (6,) on which tracks agree, by robust least squares."""
+        weight = np.ones(len(rows))
+        for power in _POWERS:
+            w = weight * rows
+            common = np.linalg.solve((w @ self.L).reshape(6, 6) + _PRIOR, w @ self.eta)
+            weight = np.minimum(1.0, _PULL / np.maximum(self.squares(common), 1e-9)) ** power
+        return common
+
+    def squares(self, common: Array) -> Array:
+        """χ²(3) of every displacement (N,) against a common motion."""
+        gap = self.moved.d - self.J @ common
+        return np.asarray(((gap[:, None] @ self.moved.W)[:, 0] * gap).sum(axis=1))
+
+    def mean_gap(self, rows: NDArray[np.intp], common: Array) -> float:
+        """How far tracks went against a common motion, in the weighted mean [m]."""
+        W, gap = self.moved.W[rows], (self.moved.d - self.J @ common)[rows]
+        mean = np.linalg.solve(W.sum(axis=0), (W @ gap[:, :, None]).sum(axis=0)[:, 0])
+        return float(np.linalg.norm(mean))
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Windows of directions and depths with enough tracks: who is inside (sparse M, N), centres and widths (M, 3)."""
+
+    members: Any
+    centres: Array
+    widths: Array
+
+    @classmethod
+    def over(cls, place: Array, support: int) -> _Windows:
+        """Windows of every size, each half a width from the next, along every axis."""
+        from scipy.sparse import csr_matrix
+
+        n = len(place)
+        rows, columns, centres, widths = [], [], [], []
+        first = 0
+        for across, deep in _SIZES:
+            width = np.array([across, across, deep])
+            cell = np.floor(place / width + _OFFSETS[:, None]).astype(np.int64)  # (8, N, 3)
+            code = (cell + _CELLS // 2) @ np.array([_CELLS**2, _CELLS, 1]) + _CELLS**3 * np.arange(8)[:, None]
+            _, one, which, count = np.unique(code.ravel(), return_index=True, return_inverse=True, return_counts=True)
+            full = count >= support
+            inside = np.flatnonzero(full[which])
+            rows.append(first + (np.cumsum(full) - 1)[which[inside]])
+            columns.append(inside % n)
+            centres.append((cell.reshape(-1, 3)[one[full]] + 0.5 - _OFFSETS[one[full] // n]) * width)
+            widths.append(np.broadcast_to(width, (full.sum(), 3)))
+            first += int(full.sum())
+        row, column = np.concatenate(rows), np.concatenate(columns)
+        members = csr_matrix((np.ones(len(row)), (row, column)), shape=(first, len(place)))
+        return cls(members, np.concatenate(centres), np.concatenate(widths))
+
+    def inside(self, window: int) -> BoolArray:
+        """Which tracks are inside a window (N,)."""
+        return np.asarray(self.members[[window]].toarray()[0] > 0)
+
+    def around(self, window: int, place: Array) -> BoolArray:
+        """Which tracks are inside a window or near it (N,)."""
+        away = np.abs(place - self.centres[window]) / self.widths[window]
+        return np.asarray((away < 0.5 + _AROUND).all(axis=1))
+
+
+def _clearest(
+    windows: _Windows, problem: _Problem, alone: Array, scale: float, rest: BoolArray, test: float, support: int
+) -> tuple[int, float] | None:
+    """The window that differs most from the rest of the scene, and its χ²(6), if that is enough."""
+    weight = rest * np.minimum(1.0, _PULL / np.maximum(alone, 1e-9))
+    size = windows.members @ rest.astype(float)
+    asked = limit(test, size)
+    most = windows.members @ (weight * alone)
+    able = np.flatnonzero((size >= support) & (size <= _LARGEST * rest.sum()) & (most > asked))
+    if not len(able):
+        return None
+    inside, weight = windows.members[able], weight / scale
+    L, eta = weight[:, None] * problem.L, weight[:, None] * problem.eta
+    total, total_eta = L.sum(axis=0).reshape(6, 6), eta.sum(axis=0)
+    Lw, eta_w = (inside @ L).reshape(-1, 6, 6), inside @ eta
+    Lr = total - Lw + _PRIOR
+    Lw = Lw + _PRIOR
+    gap = np.linalg.solve(Lw, eta_w[..., None]) - np.linalg.solve(Lr, (total_eta - eta_w)[..., None])
+    both = Lw @ np.linalg.inv(total + 2 * _PRIOR) @ Lr
+    values = (np.swapaxes(gap, 1, 2) @ both @ gap)[:, 0, 0]
+    best = int(np.argmax(values - asked[able]))
+    return (int(able[best]), float(values[best])) if values[best] > asked[able][best] else None
+
+
+def _members(
+    problem: _Problem, seeds: BoolArray, near: BoolArray, alone: Array, scale: float, support: int
+) -> NDArray[np.intp]:
+    """Tracks that fit the motion of a window's tracks (`seeds`), and better than the rest's, in it or `near` it."""
+    members: BoolArray = seeds
+    asked = np.where(seeds, _BETTER, _BETTER_AROUND)
+    for _ in range(2):
+        if members.sum() < support:
+            break
+        fits = problem.squares(problem.common_motion(members)) / scale
+        members = np.asarray(near & (fits < np.maximum(_FITS, _EXPLAINED * alone)) & (alone - fits > asked))
+    return np.flatnonzero(members)

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import numpy as np
+
+from slam.objects.displacements import Displacements
+from slam.objects.regions import judge_scene
+from slam.se3 import hat
+
+RNG = np.random.default_rng(3)
+
+
+def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise=1e-3):
+    """A wall with a group of nearer points before it; the pose error displaces all, the shift the near ones."""
+    points = np.column_stack([RNG.uniform(-1, 1, (count, 2)), RNG.uniform(2.0, 2.4, count)])
+    points[:near] = np.column_stack([RNG.uniform(-0.1, 0.1, (near, 2)), RNG.uniform(0.95, 1.05, near)])
+    pose_error = np.asarray(pose_error)
+    d = pose_error[3:] - np.einsum("nij,j->ni", hat(points), pose_error[:3]) + noise * RNG.standard_normal((count, 3))
+    d[:near] += shift
+    W = np.repeat(np.eye(3)[None] / noise**2, count, axis=0)
+    view = np.column_stack([points[:, :2] / points[:, 2:], np.log(points[:, 2])])
+    return Displacements(points, d, W, np.ones(count)), view
+
+
+def test_a_wrong_pose_moves_nothing():
+    """A rotation of 20 mrad and a shift of 2 cm displace every point by more than ten deviations."""
+    moved, view = scene(pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
+    found = judge_scene(moved, view, 30.0, 4)
+    assert not found.groups
+    assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
+
+
+def test_the_near_group_is_found_though_the_pose_is_wrong():
+    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
+    found = judge_scene(moved, view, 30.0, 4)
+    assert len(found.groups) == 1
+    assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
+    assert abs(found.groups[0].away - 0.006) < 0.002
+
+
+def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
+    """The pose follows the box, so that its own points stand still and the wall is displaced."""
+    moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
+    found = judge_scene(moved, view, 30.0, 4)
+    assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
+
+
+def test_too_few_tracks_say_nothing():
+    moved, view = scene(count=8, near=4, shift=(0.1, 0, 0))
+    assert not judge_scene(moved, view, 30.0, 4).groups
+
+
+def test_single_false_tracks_find_no_company():
+    """Three tracks that jumped, each its own way: no window holds enough that moved alike."""
+    moved, view = scene()
+    for row, jump in zip((20, 40, 60), np.eye(3)):
+        moved.d[row] += 0.5 * jump
+    found = judge_scene(moved, view, 30.0, 4)
+    assert not found.groups
+    assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
+
+
+def test_two_groups_that_move_differently_are_two():
+    moved, view = scene(count=120, near=12, shift=(0.006, 0.0, 0.0))
+    second = np.arange(12, 24)
+    moved.points[second] = np.column_stack([RNG.uniform(0.4, 0.5, (12, 2)), RNG.uniform(0.95, 1.05, 12)])
+    view[second] = np.column_stack(
+        [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
+    )
+    moved.d[second] += (0.0, -0.008, 0.0)
+    found = judge_scene(moved, view, 30.0, 4)
+    assert len(found.groups) == 2
+    assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}
