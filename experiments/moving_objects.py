@@ -41,7 +41,7 @@ def features_with_labels(sequence: Any, system: slam.StereoSlam, k: int, images:
         seen = sequence.simulate(k)
         return seen.features, seen.objects
     features = system.frontend.extract(sequence.frame(k))
-    return features, labels_in_images(sequence, k, features.uv_left)
+    return features, labels_in_images(sequence, k, features)
 
 
 def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:

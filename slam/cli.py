@@ -106,6 +106,9 @@ def run_command(
     viewer: Annotated[
         str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
     ] = None,
+    draw: Annotated[
+        Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
 ) -> None:
     """Run one sequence through one back end."""
@@ -124,13 +127,17 @@ def run_command(
     options = RunOptions(backend, frontend, config, out, start, stop, record, known_map, save_map, mono)
     progress = Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet)
     with ExitStack() as stack:
-        watch = None
+        watches = []
         if viewer is not None:
             from slam.viewer import Viewer
 
-            watch = stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show
+            watches.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
+        if draw is not None:
+            from slam.objects.drawing import FramePictures
+
+            watches.append(stack.enter_context(FramePictures(draw)).show)
         end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame))
-        summary = run(opened, options, end_of_frame, watch=watch)
+        summary = run(opened, options, end_of_frame, watches=watches)
     if not quiet:
         print_summary([summary], out)
 

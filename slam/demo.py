@@ -7,7 +7,8 @@ from typing import Any
 
 from slam.config import SystemConfig
 from slam.display import Progress, print_summary
-from slam.figures import RunData, draw_errors, draw_features, draw_map_3d, draw_top_view
+from slam.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.objects.drawing import draw_objects
 from slam.outputs import write_json
 from slam.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -26,6 +27,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         frames: number of frames.
         quiet: show nothing.
     """
+    import cv2
     import matplotlib
 
     matplotlib.use("Agg")
@@ -47,8 +49,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         draw_errors(runs, truth, out / "errors.png")
     if last is not None:
         frame = next(iter(open_sequence(world).frames(frames - 1)))
-        uv = last.features.uv_left
-        draw_features(frame.left, uv[last.matched_features], uv[last.added_features], out / "frame.png")
+        cv2.imwrite(str(out / "frame.png"), draw_objects(frame.left, last, open_sequence(world).rig))
     if not quiet:
         print_summary(summaries, out)
     return summaries

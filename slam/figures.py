@@ -146,20 +146,6 @@ def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
     _save(figure, path)
 
 
-def draw_features(image: np.ndarray, tracked: Array, added: Array, path: Path) -> None:
-    """One left image with measured landmarks (yellow) and new ones (green); pixels (N, 2)."""
-    import cv2
-
-    picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    scale = max(1, round(960 / picture.shape[1]))
-    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    for pixels, colour in ((tracked, (0, 220, 255)), (added, (80, 200, 80))):
-        for u, v in pixels:
-            centre = (round(scale * (u + 0.5)), round(scale * (v + 0.5)))
-            cv2.circle(picture, centre, 3 * scale, colour, 1, cv2.LINE_AA)
-    cv2.imwrite(str(path), picture)
-
-
 def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:
     """The true path, aligned to the estimated one."""
     if truth is None:

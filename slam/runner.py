@@ -104,7 +104,7 @@ def run(
     options: RunOptions,
     on_frame: Callable[[FrameResult], None] | None = None,
     frontend: Frontend | None = None,
-    watch: Watch | None = None,
+    watches: Iterable[Watch] = (),
 ) -> dict[str, Any]:
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
@@ -116,7 +116,7 @@ def run(
         options: names, settings, folder, range of frames.
         on_frame: called after every frame, for a progress display.
         frontend: used in place of the one that the options name.
-        watch: called after every step with its images, its result and the system, for a viewer.
+        watches: called after every step with its images, its result and the system, to show or to draw it.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -135,7 +135,7 @@ def run(
     system = StereoSlam(
         sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
     )
-    return _drive(sequence, options, system, _processed(system, frames, watch), RunRecord(), on_frame)
+    return _drive(sequence, options, system, _processed(system, frames, tuple(watches)), RunRecord(), on_frame)
 
 
 def run_recording(
@@ -177,7 +177,7 @@ def _drive(
                 record.add(number, result)
                 files.write_frame(number, result)
                 if score is not None:
-                    score.add(number, result, labels_in_images(sequence, number, result.features.uv_left))
+                    score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
                     tape.append(RecordedFrame.of(result, number))
                 if on_frame is not None:
@@ -196,13 +196,13 @@ def _drive(
 
 
 def _processed(
-    system: StereoSlam, frames: Iterator[StereoFrame], watch: Watch | None
+    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]
 ) -> Iterator[tuple[int, FrameResult]]:
     """Each frame's number and what the system did with it."""
     for frame, elapsed in _timed(frames):
         result = system.process(frame)
         result.milliseconds["read"] = elapsed  # type: ignore[index]
-        if watch is not None:
+        for watch in watches:
             watch(frame, result, system)
         yield frame.index, result
 

@@ -1,4 +1,7 @@
-"""Frames with what moves drawn into them: beacons yellow, object features black (paper B, Fig. 10), boxes and axes."""
+"""Frames with what is seen drawn in: beacons yellow, new ones green, object features black, boxes and axes.
+
+The colours are those of paper B, Fig. 10.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import FrameResult
+from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.objects.data import MovingObject
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse, transform
 
-_BEACON, _MOVING, _RING = (0, 230, 255), (0, 0, 0), (255, 255, 255)  # BGR
+_BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
 _BOXES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
@@ -21,7 +24,7 @@ _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 
 
 def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
-    """The left image (BGR uint8), enlarged to about `width`, with beacons, moving features, boxes and axes.
+    """The left image (BGR uint8), enlarged to about `width`, with landmarks, moving features, boxes and axes.
 
     Args:
         image: left image of the frame.
@@ -39,8 +42,9 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     moving = np.zeros(len(result.features), bool)
     moving[result.moving_features] = True
     beacons = result.matched_features[~moving[result.matched_features]]
-    for u, v in result.features.uv_left[beacons]:
-        cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _BEACON, 1, cv2.LINE_AA)
+    for rows, colour in ((beacons, _BEACON), (result.added_features, _NEW)):
+        for u, v in result.features.uv_left[rows]:
+            cv2.circle(picture, _pixel(u, v, scale), 2 * scale, colour, 1, cv2.LINE_AA)
     for u, v in result.features.uv_left[moving]:
         cv2.circle(picture, _pixel(u, v, scale), 2 * scale + 1, _RING, 1, cv2.LINE_AA)
         cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _MOVING, 2, cv2.LINE_AA)
@@ -101,31 +105,51 @@ def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
 class FramePictures:
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
+    The video's rate is that of the first two frames.
+
+    Args:
+        path: folder or video.
+
     Raises:
         SlamError: the video cannot be written.
     """
 
-    def __init__(self, path: Path, rate: float) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.rate = rate
+        self._first: tuple[float, np.ndarray] | None = None
         self._video: Any = None
         (path.parent if path.suffix == ".mp4" else path).mkdir(parents=True, exist_ok=True)
 
-    def add(self, number: int, picture: np.ndarray) -> None:
-        """Append one picture, `number` in its sequence."""
+    def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
+        """Append a step's picture; a `slam.runner.Watch`."""
+        self.add(frame.index, frame.stamp, draw_objects(frame.left, result, system.rig))
+
+    def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
+        """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
         import cv2
 
         if self.path.suffix != ".mp4":
             cv2.imwrite(str(self.path / f"{number:06d}.png"), picture)
-            return
-        if self._video is None:
-            size = (picture.shape[1], picture.shape[0])
-            self._video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.rate, size)
-            if not self._video.isOpened():
+        elif self._video is not None:
+            self._video.write(picture)
+        elif self._first is None:
+            self._first = (stamp, picture)
+        else:
+            rate, size = 1.0 / (stamp - self._first[0]), (picture.shape[1], picture.shape[0])
+            video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+            if not video.isOpened():
                 raise SlamError(f"cannot write the video {self.path}")
-        self._video.write(picture)
+            video.write(self._first[1])
+            video.write(picture)
+            self._video = video
 
     def close(self) -> None:
         """Finish the video."""
         if self._video is not None:
             self._video.release()
+
+    def __enter__(self) -> FramePictures:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

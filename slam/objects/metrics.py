@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import FrameResult
+from slam.data import FrameResult, StereoFeatures
 from slam.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
 
 _SINGULAR = 1e-14  # smallest eigenvalue of a covariance that counts
+_OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
 _SUPPORT = 4  # stereo features from which a body counts as in view
 
 
@@ -247,8 +248,16 @@ def score_for(sequence: Any) -> ObjectScore | None:
     return ObjectScore(poses, sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu)
 
 
-def labels_in_images(sequence: Any, frame: int, uv: Array) -> NDArray[np.int64]:
-    """The body that is seen at left pixels (N, 2) of a rendered frame, 0 for the still world."""
+def labels_in_images(sequence: Any, frame: int, features: StereoFeatures) -> NDArray[np.int64]:
+    """The body that each feature (N,) of a rendered frame is seen on, 0 for the still world.
+
+    −1 for features on an outline, which are of neither: those that within a quarter of their size see both.
+    """
     image = sequence.object_ids(frame)
-    column, row = np.clip(np.round(uv).astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
-    return np.asarray(image[row, column], np.int64)
+    angles = np.arange(8) * np.pi / 4
+    ring = np.concatenate([np.zeros((1, 2)), np.column_stack([np.cos(angles), np.sin(angles)])])
+    uv = features.uv_left[:, None] + _OUTLINE * features.scale[:, None, None] * ring
+    limits = (image.shape[1] - 1, image.shape[0] - 1)
+    column, row = np.moveaxis(np.clip(np.round(uv).astype(int), 0, limits), 2, 0)
+    labels = image[row, column].astype(np.int64)
+    return np.where((labels == labels[:, :1]).all(axis=1), labels[:, 0], -1)

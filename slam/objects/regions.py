@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.objects.displacements import Displacements
+from slam.objects.tracks import times_vectors
 from slam.se3 import Array, hat
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
@@ -114,15 +115,16 @@ def judge_scene(moved: Displacements, place: Array, test: float, support: int) -
 
 @dataclass(frozen=True)
 class _Problem:
-    """Displacements as a linear problem in a common motion [θ, ρ] (6,): `J` (N, 3, 6), and the normal equations' parts.
+    """Displacements as a linear problem in a common motion ξ = [θ, ρ] (6,): each track's normal equations.
 
-    `L` (N, 36) holds ``Jᵀ W J`` of every track, `eta` (N, 6) ``Jᵀ W d``.
+    The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ``, with ``Λ = Jᵀ W J`` (N, 36), ``η = Jᵀ W d`` (N, 6).
     """
 
     moved: Displacements
     J: Array
     L: Array
     eta: Array
+    dWd: Array
 
     @classmethod
     def of(cls, moved: Displacements) -> _Problem:
@@ -131,7 +133,8 @@ class _Problem:
         J = np.concatenate([-hat(moved.points), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
         J = moved.lag[:, None, None] * J
         JW = np.swapaxes(J, 1, 2) @ moved.W
-        return cls(moved, J, (JW @ J).reshape(n, 36), (JW @ moved.d[:, :, None])[:, :, 0])
+        Wd = times_vectors(moved.W, moved.d)
+        return cls(moved, J, (JW @ J).reshape(n, 36), times_vectors(JW, moved.d), (moved.d * Wd).sum(axis=1))
 
     def common_motion(self, rows: BoolArray) -> Array:
         """The motion (6,) on which tracks agree, by robust least squares."""
@@ -144,13 +147,12 @@ class _Problem:
 
     def squares(self, common: Array) -> Array:
         """χ²(3) of every displacement (N,) against a common motion."""
-        gap = self.moved.d - self.J @ common
-        return np.asarray(((gap[:, None] @ self.moved.W)[:, 0] * gap).sum(axis=1))
+        return np.asarray(self.dWd - 2 * self.eta @ common + self.L @ np.outer(common, common).ravel())
 
     def mean_gap(self, rows: NDArray[np.intp], common: Array) -> float:
         """How far tracks went against a common motion, in the weighted mean [m]."""
         W, gap = self.moved.W[rows], (self.moved.d - self.J @ common)[rows]
-        mean = np.linalg.solve(W.sum(axis=0), (W @ gap[:, :, None]).sum(axis=0)[:, 0])
+        mean = np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))
         return float(np.linalg.norm(mean))
 
 
@@ -188,7 +190,9 @@ class _Windows:
 
     def inside(self, window: int) -> BoolArray:
         """Which tracks are inside a window (N,)."""
-        return np.asarray(self.members[[window]].toarray()[0] > 0)
+        inside = np.zeros(self.members.shape[1], bool)
+        inside[self.members.indices[self.members.indptr[window] : self.members.indptr[window + 1]]] = True
+        return inside
 
     def around(self, window: int, place: Array) -> BoolArray:
         """Which tracks are inside a window or near it (N,)."""

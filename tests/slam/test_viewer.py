@@ -29,7 +29,7 @@ def test_a_run_is_kept_for_rerun(tmp_path):
     live, after = tmp_path / "live.rrd", tmp_path / "after.rrd"
     options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), tmp_path / "run")
     with Viewer(str(live), sequence.rig, sequence.ground_truth) as viewer:
-        run(sequence, options, watch=viewer.show)
+        run(sequence, options, watches=[viewer.show])
     view_run(tmp_path / "run", str(after))
     assert live.stat().st_size > 3 * 3000  # three images, compressed, are in it
     assert after.stat().st_size > 1000
