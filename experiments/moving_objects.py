@@ -46,7 +46,7 @@ def features_with_labels(sequence: Any, system: slam.StereoSlam, k: int, images:
 
 def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:
     frontend = "surf" if images else None
-    config = SystemConfig.for_kind(sequence.kind, frontend, backend).with_settings(["objects.mode=detect", *settings])
+    config = SystemConfig.for_kind(sequence.kind, frontend, backend).with_settings(settings)
     return slam.StereoSlam(sequence.rig, frontend, backend, config=config)
 
 

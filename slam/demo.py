@@ -36,7 +36,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
     last = None
     for backend in BACKENDS:
         sequence = open_sequence(world)
-        config = SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings(["objects.mode=detect"])
+        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
         with Progress(len(sequence), f"{sequence.name} · {backend}", quiet) as progress:
             summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), progress.frame))
             last = progress.last

@@ -40,7 +40,7 @@ class ObjectsConfig:
         margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal.
     """
 
-    mode: str = "off"
+    mode: str = "detect"
     window: int = 12
     patience: int = 3
     max_speed: float = 1.5

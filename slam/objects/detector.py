@@ -59,9 +59,7 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
-    def judge(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
-    ) -> Judgement:
+    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         T_world_left = estimate.T_world_left

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.interfaces import Backend
@@ -25,16 +24,13 @@ class ObjectDetector(Protocol):
         """Ids of landmarks that may move: they do not measure the camera's next pose."""
         ...
 
-    def judge(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
-    ) -> Judgement:
+    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Say which features move, before any of them becomes a landmark.
 
         Args:
             features: of the frame.
             estimate: the camera's pose after the update.
             landmark: id of the landmark that each feature was recognised as (N,), -1 for none.
-            used: rows of the features that the back end used.
         """
         ...
 
@@ -48,9 +44,7 @@ class NoDetector:
 
     suspects: IdArray = np.zeros(0, np.int64)
 
-    def judge(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
-    ) -> Judgement:
+    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
         return Judgement(none, none, np.zeros(0, np.int64))

@@ -230,9 +230,7 @@ class Procedure1Detector:
         self._covariance: Array = np.eye(6)
         self._last: tuple[float, Array] | None = None
 
-    def judge(
-        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, used: NDArray[np.intp]
-    ) -> Judgement:
+    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Recognise the object's features and find its motion; no other feature is judged."""
         c, d = self.config, self.database
         free = np.flatnonzero(features.has_stereo)

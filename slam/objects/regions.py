@@ -211,8 +211,8 @@ def _clearest(
     able = np.flatnonzero((size >= support) & (size <= _LARGEST * rest.sum()) & (most > asked))
     if not len(able):
         return None
-    inside, weight = windows.members[able], weight / scale
-    L, eta = weight[:, None] * problem.L, weight[:, None] * problem.eta
+    inside, share = windows.members[able], (weight / scale)[:, None]
+    L, eta = share * problem.L, share * problem.eta
     total, total_eta = L.sum(axis=0).reshape(6, 6), eta.sum(axis=0)
     Lw, eta_w = (inside @ L).reshape(-1, 6, 6), inside @ eta
     Lr = total - Lw + _PRIOR
@@ -234,5 +234,6 @@ def _members(
         if members.sum() < support:
             break
         fits = problem.squares(problem.common_motion(members)) / scale
-        members = np.asarray(near & (fits < np.maximum(_FITS, _EXPLAINED * alone)) & (alone - fits > asked))
+        fit = (fits < np.maximum(_FITS, _EXPLAINED * alone)) & (alone - fits > asked)
+        members = np.logical_and(near, fit)
     return np.flatnonzero(members)
