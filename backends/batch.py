@@ -88,6 +88,12 @@ class BatchBackend:
         self._smoother.place(ids, local, covariances)
         self._solution = None
 
+    @one_blas_thread
+    def shift_right(self, shift: float) -> None:
+        """See `slam.interfaces.RevisingBackend.shift_right`."""
+        self._smoother.shift_right(shift)
+        self._solution = None
+
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
         self._smoother.remove(ids)

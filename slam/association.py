@@ -20,7 +20,7 @@ from slam.se3 import Array
 Descriptors = NDArray[np.float32]
 
 _NONE = np.float32(np.inf)
-_BAND = 16.0  # height of the bands that features are sorted into [px]
+_CELL = 24.0  # side of the cells that features are sorted into [px]
 _LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
 
 
@@ -45,8 +45,17 @@ class AssociationConfig:
             against the whole map.
         tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
             matches suffice, and no second search is made.
-        max_jump: landmarks that agree on a pose further than this from the prediction, in its standard deviations, are
-            not believed yet: a camera that was carried off is found again when the prediction has become vague enough.
+        max_jump, lost_jump: landmarks that agree on a pose further than this from the prediction, in its standard
+            deviations, are not believed at once: while landmarks are recognised in every frame, and after frames in
+            which none was. The prediction allows for what the motion model knows; what is further off was carried.
+        carried_after: where such poses agree with each other in so many successive frames, the camera was carried off,
+            and the back end begins anew at that place in the map.
+        view_angle, view_ratio: landmarks are looked for where the line of sight has turned by no more than this since
+            they were first seen [degrees], and where the distance has not changed by more than this factor: beyond,
+            what is found is not the same point any more. 180 and a large factor for never mind.
+        again_after: those that were outside of the image for so many frames are looked for from wherever: what they
+            tell about the drift meanwhile is worth more than what the point may have slid. Found, they count as first
+            seen from there.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
     """
 
@@ -66,6 +75,11 @@ class AssociationConfig:
     wide_hypotheses: int = 1000
     tight_window: float = 12.0
     max_jump: float = 15.0
+    lost_jump: float = 6.0
+    carried_after: int = 3
+    view_angle: float = 20.0
+    view_ratio: float = 1.4
+    again_after: int = 10
     refined_window: float = 3.0
 
     __pydantic_config__ = FORBID_UNKNOWN
@@ -84,8 +98,12 @@ class AssociationConfig:
             raise ConfigurationError("association: 0 < window_min <= window_max is required")
         if not (0 < self.ratio <= 1 and 0 < self.wide_ratio <= 1):
             raise ConfigurationError("association: ratios must lie in (0, 1]")
+        if self.view_ratio < 1:
+            raise ConfigurationError("association: view_ratio must be at least 1")
         if min(self.hypotheses, self.wide_hypotheses) < 1 or self.minimum_consistent < 3:
             raise ConfigurationError("association: hypotheses >= 1 and minimum_consistent >= 3 are required")
+        if self.carried_after < 1:
+            raise ConfigurationError("association: carried_after must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -114,30 +132,35 @@ def match_in_windows(
     laplacian: NDArray[np.int8],
     features: StereoFeatures,
     config: AssociationConfig,
+    among: NDArray[np.intp] | None = None,
 ) -> Matches:
     """Match predicted landmarks (M) to features (N) inside size-variable windows.
 
     Args:
         prediction: landmarks in the angle of view, their pixels and innovation covariances.
-        descriptors: of those landmarks (M, D).
-        laplacian: signs of their Laplacians (M,).
+        descriptors: of those landmarks (M, D), or of more of which they are the rows `among` (M,).
+        laplacian: signs of their Laplacians, likewise.
         features: of the frame.
         config: settings.
+        among: see `descriptors`.
     """
     if not len(prediction.ids) or not len(features):
         return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
+    if among is None:
+        among = np.arange(len(prediction.ids))
     windows = search_windows(prediction, config)
     if windows.are_large(features.uv_left):
         limit = max(config.d_match) / config.ratio  # beyond that no feature is the nearest, nor near enough to doubt it
-        rows, columns = _alike(descriptors, laplacian, features, limit)
+        rows, columns = _alike(descriptors[among], laplacian[among], features, limit)
     else:
         rows, columns = pairs_in_boxes(prediction.uv_left, windows.reach, features.uv_left)
-        same = laplacian[rows] == features.laplacian[columns]
+        same = laplacian.take(among.take(rows)) == features.laplacian.take(columns)
         rows, columns = rows[same], columns[same]
-    level = windows.level(rows, (features.uv_left[columns] - prediction.uv_left[rows]).astype(np.float32))
+    offset = features.uv_left.take(columns, axis=0) - prediction.uv_left.take(rows, axis=0)
+    level = windows.level(rows, offset.astype(np.float32))
     inside = level < len(config.d_match)
     rows, columns, level = rows[inside], columns[inside], level[inside]
-    distance = _distances(descriptors, features.descriptors, rows, columns)
+    distance = _distances(descriptors, features.descriptors, among.take(rows), columns)
     return _by_levels(_Pairs(rows, columns, distance), level, (len(prediction.ids), len(features)), config)
 
 
@@ -170,15 +193,16 @@ class SearchWindows:
 
     def are_large(self, uv: Array) -> bool:
         """Whether the boxes around the largest windows hold a good part of the pixels (N, 2), on average."""
-        extent = np.ptp(uv, axis=0) + 1.0
-        return bool((np.minimum(2 * self.reach, extent) / extent).prod(axis=1).mean() > _LARGE)
+        width, height = (1.0 + np.ptp(uv[:, i]) for i in (0, 1))
+        area = np.dot(np.minimum(2 * self.reach[:, 0], width), np.minimum(2 * self.reach[:, 1], height))
+        return bool(area > _LARGE * len(self.reach) * width * height)
 
     def level(self, rows: NDArray[np.intp], offset: NDArray[np.float32]) -> NDArray[np.intp]:
         """The smallest window (P,) of the landmarks `rows` (P,) that holds a pixel this far off (P, 2)."""
         du, dv = offset[:, 0], offset[:, 1]
         if self.shape is None:
             return np.searchsorted(self.sizes, np.maximum(np.abs(du), np.abs(dv)))
-        uu, uv, vv = self.shape[rows].T
+        uu, uv, vv = self.shape.take(rows, axis=0).T
         return np.searchsorted(np.square(self.sizes), uu * du * du + 2 * uv * du * dv + vv * dv * dv)
 
 
@@ -190,12 +214,13 @@ def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchW
     smallest, largest = config.window_sigmas[0], config.window_sigmas[-1]
     S = prediction.innovation
     # Eigenvalues and axes of the symmetric 2x2 matrices in closed form; half axes bounded as the settings say.
-    mean, half = 0.5 * (S[:, 0, 0] + S[:, 1, 1]), 0.5 * (S[:, 0, 0] - S[:, 1, 1])
-    radius = np.hypot(half, S[:, 0, 1])
-    angle = 0.5 * np.arctan2(S[:, 0, 1], half)
+    mean, half, cross = 0.5 * (S[:, 0, 0] + S[:, 1, 1]), 0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1]
+    radius = np.hypot(half, cross)
+    safe = np.maximum(radius, np.finfo(float).tiny)
+    c2, cs = 0.5 + 0.5 * half / safe, 0.5 * cross / safe  # cos², cos · sin of the long axis' angle
+    s2 = 1 - c2
     low, high = (config.window_min / smallest) ** 2, (config.window_max / smallest) ** 2
     long, short = np.clip(mean + radius, low, high), np.clip(mean - radius, low, high)
-    c2, s2, cs = np.cos(angle) ** 2, np.sin(angle) ** 2, np.cos(angle) * np.sin(angle)
     shape = np.stack([c2 / long + s2 / short, cs / long - cs / short, s2 / long + c2 / short], axis=1)
     reach = largest * np.sqrt(np.stack([c2 * long + s2 * short, s2 * long + c2 * short], axis=1))
     return SearchWindows(config.window_sigmas, reach, shape.astype(np.float32))
@@ -204,25 +229,47 @@ def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchW
 def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending row of the centres.
 
-    Pixels are sorted into bands of rows, by column within each, so that few pairs have to be looked at.
+    Pixels are sorted into square cells, by rows of cells, so that few pairs have to be looked at.
     """
-    first = int(np.floor(uv[:, 1].min() / _BAND))
-    bands = int(np.floor(uv[:, 1].max() / _BAND)) - first + 1
-    stride = float(uv[:, 0].max() - uv[:, 0].min()) + 1.0
-    left = float(uv[:, 0].min())
-    key = (np.floor(uv[:, 1] / _BAND) - first) * stride + uv[:, 0] - left
-    order = np.argsort(key)
-    top = np.clip(np.floor((centres[:, 1] - reach[:, 1]) / _BAND) - first, 0, bands).astype(int)
-    bottom = np.clip(np.floor((centres[:, 1] + reach[:, 1]) / _BAND) - first, -1, bands - 1).astype(int)
-    rows, band = _expand(top, bottom + 1)
-    low = np.clip(centres[rows, 0] - reach[rows, 0] - left, 0, stride)
-    high = np.clip(centres[rows, 0] + reach[rows, 0] - left, -1e-9, stride - 1e-9)
-    begin = np.searchsorted(key[order], band * stride + low)
-    end = np.searchsorted(key[order], band * stride + high, side="right")
-    which, member = _expand(begin, end)
-    rows, columns = rows[which], order[member]
-    near = np.abs(uv[columns, 1] - centres[rows, 1]) <= reach[rows, 1]
-    return rows[near], columns[near]
+    x, y = _Cells.of(centres[:, 0], reach[:, 0], uv[:, 0]), _Cells.of(centres[:, 1], reach[:, 1], uv[:, 1])
+    cell = y.cell * x.count + x.cell
+    order = np.argsort(cell, kind="stable")
+    begin = np.zeros(y.count * x.count + 1, np.intp)
+    np.cumsum(np.bincount(cell, minlength=y.count * x.count), out=begin[1:])
+    rows, line = _expand(y.low, np.where(x.high > x.low, y.high, y.low))
+    line *= x.count
+    which, member = _expand(begin.take(line + x.low.take(rows)), begin.take(line + x.high.take(rows)))
+    rows, members = rows.take(which), order.take(member)
+    near = np.flatnonzero(x.near(rows, members) & y.near(rows, members))
+    return rows.take(near), members.take(near)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Where pixels (N,) and intervals (M,) lie along one axis, in cells counted from the first pixel's."""
+
+    centres: Array
+    reach: Array
+    pixels: Array
+    cell: NDArray[np.intp]  # of each pixel (N,)
+    count: int
+    low: NDArray[np.intp]  # first cell of each interval (M,), and
+    high: NDArray[np.intp]  # the one after the last
+
+    @classmethod
+    def of(cls, centres: Array, reach: Array, pixels: Array) -> _Cells:
+        pixels, centres, scale = np.ascontiguousarray(pixels), np.ascontiguousarray(centres), 1 / _CELL
+        first = pixels.min()
+        cell = ((pixels - first) * scale).astype(np.intp)
+        count = int(cell.max()) + 1
+        middle, half = (centres - first) * scale, reach * scale
+        low = np.minimum(np.maximum(middle - half, 0), count).astype(np.intp)
+        high = np.minimum(np.maximum(middle + half + 1, 0), count).astype(np.intp)
+        return cls(centres, np.ascontiguousarray(reach), pixels, cell, count, low, high)
+
+    def near(self, rows: NDArray[np.intp], members: NDArray[np.intp]) -> BoolArray:
+        """Which pixels `members` (P,) lie in the intervals `rows` (P,)."""
+        return np.asarray(np.abs(self.pixels.take(members) - self.centres.take(rows)) <= self.reach.take(rows))
 
 
 def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -246,7 +293,7 @@ def _distances(
     a: Descriptors, b: Descriptors, rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> NDArray[np.float32]:
     """Euclidean distances (P,) of unit descriptors a[rows] and b[columns] (paper A, Eq. 12)."""
-    product = np.einsum("pd,pd->p", a[rows], b[columns])
+    product = np.einsum("pd,pd->p", a.take(rows, axis=0), b.take(columns, axis=0))
     return np.asarray(np.sqrt(np.maximum(2 - 2 * product, 0)))
 
 

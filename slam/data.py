@@ -249,6 +249,7 @@ class FrameResult:
         moving_features: rows of features that are judged to move (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
         located: False where the camera has not been found yet in the map that it was started with: its pose is none.
+        shift: before the step, the right pixels of all earlier frames were moved by so much (`RevisingBackend`) [px].
     """
 
     index: int
@@ -268,3 +269,4 @@ class FrameResult:
     moving_features: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     objects: tuple[MovingObject, ...] = ()
     located: bool = True
+    shift: float = 0.0

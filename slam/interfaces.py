@@ -125,6 +125,19 @@ class ObjectBackend(Protocol):
 
 
 @runtime_checkable
+class RevisingBackend(Protocol):
+    """What a back end offers besides, where it can mend measurements that it was given long ago."""
+
+    def shift_right(self, shift: float) -> None:
+        """Move the right pixels of all measurements so far by `shift` along the rectified row [rectified px].
+
+        Called before `Backend.predict`, when more has become known of a constant error of the disparity. A back end
+        without this goes on with what it made of the measurements as they were.
+        """
+        ...
+
+
+@runtime_checkable
 class MapBackend(Protocol):
     """What a back end offers besides, where it can start in a map that is known beforehand."""
 

@@ -61,15 +61,6 @@ class MapSearch:
             return None
         return found_landmarks.T_world_left
 
-    def models_at(self, models: EstimatorModels, T_world_left: Array) -> EstimatorModels:
-        """The models of an estimator that begins at a pose (4, 4) which is only roughly known."""
-        return replace(
-            models,
-            T_world_left=T_world_left.tolist(),
-            initial_position_sigma=POSITION_SIGMA,
-            initial_rotation_sigma=ROTATION_SIGMA,
-        )
-
     def fill(self, backend: Backend) -> None:
         """Give a back end the map.
 
@@ -107,6 +98,16 @@ class MapSearch:
             map_size=len(self.known),
             located=False,
         )
+
+
+def models_at(models: EstimatorModels, T_world_left: Array) -> EstimatorModels:
+    """The models of an estimator that begins at a pose (4, 4) which is only roughly known."""
+    return replace(
+        models,
+        T_world_left=T_world_left.tolist(),
+        initial_position_sigma=POSITION_SIGMA,
+        initial_rotation_sigma=ROTATION_SIGMA,
+    )
 
 
 def nowhere(stamp: float, T_world_left: Array) -> Prediction:

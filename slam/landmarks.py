@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.se3 import Array
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class LandmarkRows:
         in_view: number of frames in which it should have been detected or was (N,).
         missed: number of such frames since it was last measured (N,).
         last_seen: frame index (N,).
+        seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
+        away: number of frames in which it was outside of the image since it was last measured (N,).
     """
 
     ids: IdArray
@@ -31,6 +34,14 @@ class LandmarkRows:
     in_view: IdArray
     missed: IdArray
     last_seen: IdArray
+    seen_from: Array = field(default=None)  # type: ignore[arg-type]
+    away: IdArray = field(default=None)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        if self.away is None:
+            object.__setattr__(self, "away", np.zeros(len(self.ids), np.int64))
+        if self.seen_from is None:
+            object.__setattr__(self, "seen_from", np.full((len(self.ids), 3), np.nan))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -53,11 +64,15 @@ class LandmarkRows:
         features: StereoFeatures,
         feature_rows: NDArray[np.intp],
         renewal: float = 1.0,
+        camera: Array | None = None,
+        in_image: BoolArray | None = None,
+        again_after: int = 0,
     ) -> LandmarkRows:
         """Count what one frame showed: which ids were in view, which were measured, by which features.
 
         `renewal` is the weight of the measured features' descriptors against the landmarks': 1 for the last look, 0 for
-        the first.
+        the first. `in_image` says which landmarks (N,) lie inside the image. Where the place of the camera (3,) is
+        given, those that are seen again after `again_after` frames outside of it count as first seen now, from there.
         """
         view, hit = self.rows(in_view), self.rows(measured)
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
@@ -70,12 +85,28 @@ class LandmarkRows:
         descriptors = self.descriptors.copy()
         look = (1 - renewal) * descriptors[hit] + renewal * features.descriptors[feature_rows]
         descriptors[hit] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
-        return replace(self, seen=seen, in_view=views, missed=missed, last_seen=last_seen, descriptors=descriptors)
+        seen_from = self.seen_from.copy()
+        if camera is not None:
+            again = self.long_away(again_after)[hit]
+            seen_from[hit[again]] = camera
+            descriptors[hit[again]] = features.descriptors[feature_rows[again]]
+        away = self.away + (0 if in_image is None else ~in_image)
+        away[hit] = 0
+        return LandmarkRows(self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, away)
+
+    def long_away(self, after: int) -> BoolArray:
+        """Which landmarks (N,) were outside of the image for `after` frames, or are of an earlier run."""
+        return np.asarray((self.last_seen < 0) | (self.away >= after))
 
     def with_new(
-        self, frame: int, ids: IdArray, features: StereoFeatures, feature_rows: NDArray[np.intp]
+        self,
+        frame: int,
+        ids: IdArray,
+        features: StereoFeatures,
+        feature_rows: NDArray[np.intp],
+        camera: Array | None = None,
     ) -> LandmarkRows:
-        """The rows with new landmarks appended; their ids must be larger than all others."""
+        """The rows with new landmarks appended, seen from `camera` (3,); their ids must be larger than all others."""
         once = np.ones(len(ids), np.int64)
         new = LandmarkRows(
             ids,
@@ -85,6 +116,7 @@ class LandmarkRows:
             once,
             once * 0,
             once * frame,
+            None if camera is None else np.tile(camera, (len(ids), 1)),  # type: ignore[arg-type]
         )
         return LandmarkRows(
             *(np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(LandmarkRows))

@@ -34,6 +34,9 @@ class MapConfig:
         erase_share: where it was measured in less than this share of the frames in view (judged from
             `erase_missed` frames on). Frames in which it may be hidden, or lies near the image's border, do not count.
         confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
+        spacing: of landmarks out of view (or hidden, or seen from elsewhere) that lie nearer to each other than this
+            share of the distance that they were first seen from, the one measured in most frames stays; 0 for all: a
+            map that grows with every look at the same place.
         forget_after: landmarks not measured for so many frames are erased wherever they are, so that nothing is seen
             again; 0 for never: the map lasts.
         view_margin: distance from the border [px] within which a landmark is not sure to be detected.
@@ -49,13 +52,14 @@ class MapConfig:
         monocular: features without a stereo match become landmarks too, when two views give their depth (paper B, 2.2).
     """
 
-    target_in_view: int = 150
+    target_in_view: int = 80
     grid: tuple[int, int] = (8, 4)
     separation: float = 8.0
     max_depth_error: float = 0.2
     erase_missed: int = 5
     erase_share: float = 0.3
     confirmed: int = 6
+    spacing: float = 0.1
     forget_after: int = 0
     view_margin: float = 16.0
     occlusion_radius: float = 12.0
@@ -88,12 +92,37 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     lost = landmarks.missed >= config.erase_missed
     judged = landmarks.in_view > config.erase_missed
     rare = judged & (landmarks.seen < config.erase_share * landmarks.in_view)
-    times = np.unique(landmarks.last_seen)  # frames in which nothing was seen do not count
-    later = len(times) - 1 - np.searchsorted(times, landmarks.last_seen)
-    unconfirmed = (landmarks.seen < config.confirmed) & (later > config.erase_missed)
+    unconfirmed = (landmarks.seen < config.confirmed) & (_frames_since(landmarks) > config.erase_missed)
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
     forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
     return np.asarray(lost | rare | unconfirmed | forgotten)
+
+
+def _frames_since(landmarks: LandmarkRows) -> NDArray[np.intp]:
+    """For how many frames each landmark (N,) was not measured; frames in which nothing was do not count."""
+    times = np.unique(landmarks.last_seen)
+    return len(times) - 1 - np.searchsorted(times, landmarks.last_seen)
+
+
+def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConfig) -> BoolArray:
+    """Which landmarks (N,) at `positions` (N, 3) the map can do without, now that they are out of view; see `spacing`.
+
+    Those are compared that have just gone out of view, with each other and with all that did before.
+    """
+    out = np.zeros(len(landmarks), bool)
+    later = _frames_since(landmarks)
+    gone = np.flatnonzero((later > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
+    just = gone[later[gone] <= 2 * config.erase_missed]
+    if not len(just) or not config.spacing:
+        return out
+    reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)
+    gap = positions[just][:, None] - positions[gone][None]
+    near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[just][:, None], reach[gone][None]) ** 2
+    rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # of equals the older one is the better
+    first, second = np.nonzero(near & (just[:, None] != gone[None]))
+    one, other = just[first], gone[second]
+    out[np.where(rank[one] < rank[other], one, other)] = True
+    return out
 
 
 def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:

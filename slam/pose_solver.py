@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.rig import StereoRig
-from slam.se3 import Array, exp, hat, inverse
+from slam.se3 import Array, exp, inverse
 
 _MINIMAL = 3  # stereo points that fix a pose
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
@@ -21,7 +21,8 @@ _POLISHING_ROUNDS = 5
 _BATCH = 50  # hypotheses tried at once
 _APPROACHES = 3
 _ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
-_CONVERGED = 1e-6  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
+_EYE = np.eye(6)
+_CONVERGED = 1e-4  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
 
 
 @dataclass(frozen=True)
@@ -193,24 +194,28 @@ def _reprojection(rig: StereoRig, points: Array, measured: Array, T_left_world: 
     `points` and `measured` are (K, 3), or (H, K, 3) with a set for each pose. Unusable entries are zero in both.
     """
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
-    shape = local.shape[:2]
     z, J_point = rig.project_stereo(local.reshape(-1, 3))
-    residual = measured - z.reshape(*shape, 3)
-    motion = np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (*shape, 3, 3))], axis=-1)
-    J = J_point.reshape(*shape, 3, 3) @ motion
+    residual = measured - z.reshape(local.shape)
+    J = np.empty((*local.shape, 6))
+    J[..., 3:] = J_point.reshape(*local.shape, 3)
+    x, y, w = (local[..., None, i] for i in range(3))
+    a, b, c = (J[..., 3 + i] for i in range(3))
+    J[..., 0], J[..., 1], J[..., 2] = y * c - w * b, w * a - x * c, x * b - y * a  # local × the row of J_point
     unusable = ~np.isfinite(residual)
-    residual = np.where(unusable, 0.0, residual)
-    J = np.where(unusable[..., None], 0.0, J)
+    if unusable.any():
+        residual[unusable] = 0.0
+        J[unusable] = 0.0
     return residual, J
 
 
 def _gauss_newton_step(residual: Array, J: Array) -> Array:
     """Steps (H, 6); lightly damped so that a degenerate set yields a bad pose, not an error."""
-    count = len(J)
-    J = J.reshape(count, -1, 6)
-    normal = np.swapaxes(J, 1, 2) @ J
-    normal += np.eye(6) * (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12)
-    return np.linalg.solve(normal, np.swapaxes(J, 1, 2) @ residual.reshape(count, -1, 1))[..., 0]
+    J = J.reshape(len(J), -1, 6)
+    Jt = np.swapaxes(J, 1, 2)
+    normal = Jt @ J
+    trace = np.einsum("hii->h", normal)
+    normal += _EYE * (1e-9 * trace[:, None, None] + 1e-12)
+    return np.linalg.solve(normal, Jt @ residual.reshape(len(J), -1, 1))[..., 0]
 
 
 def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:
@@ -222,8 +227,8 @@ def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Arr
 def _errors(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
-    left, right = rig.project(local.reshape(-1, 3))
-    z = np.concatenate([left, right[:, :1]], axis=1).reshape(*local.shape[:2], 3)
+    z = rig.project_stereo(local.reshape(-1, 3), jacobian=False)[0].reshape(local.shape)
     error = np.abs(measured - z)
-    error[..., 2] = np.where(np.isfinite(measured[:, 2]), error[..., 2], 0.0)
-    return np.asarray(error.max(axis=-1))
+    right = error[..., 2]
+    right[:, np.isnan(measured[:, 2])] = 0.0
+    return np.asarray(np.maximum(np.maximum(error[..., 0], error[..., 1]), right))

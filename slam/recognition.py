@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.association import AssociationConfig, Matches, match_everywhere, match_in_windows
-from slam.data import IdArray, Prediction, StereoFeatures
+from slam.data import BoolArray, IdArray, Prediction, StereoFeatures
 from slam.landmarks import LandmarkRows
 from slam.pose_solver import PoseConsensus, find_consensus, measurement_rows
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse, log, transform
+from slam.visibility import seen_alike
 
 _TINY = 1e-12
 
@@ -88,7 +89,8 @@ class Recogniser:
         if not len(landmarks) or not len(features):
             return Recognition.nothing()
         rows = landmarks.rows(prediction.ids)
-        matches = self._in_windows(prediction, landmarks, rows, features)
+        looked_for = self._looked_for(prediction.T_world_left, landmarks, positions)[rows]
+        matches = self._in_windows(_select(prediction, looked_for), landmarks, rows[looked_for], features)
         consensus = self._consensus(matches, positions, features, prediction.T_world_left, seed)
         tight = median_deviation(prediction) <= self.config.tight_window
         least = 0.0
@@ -107,13 +109,22 @@ class Recogniser:
                 return Recognition.nothing()
         return _recognition(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
 
+    def looks_alike(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+        """Which landmarks (N,) at `positions` look from this pose (4, 4) as they did at first sight."""
+        limits = self.config.view_angle, self.config.view_ratio
+        return seen_alike(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
+
+    def _looked_for(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+        """Which landmarks (N,) are looked for in windows: those that look as they did, and those long away."""
+        alike = self.looks_alike(T_world_left, landmarks, positions)
+        return alike | landmarks.long_away(self.config.again_after)
+
     def _in_windows(
         self, prediction: Prediction, landmarks: LandmarkRows, rows: NDArray[np.intp], features: StereoFeatures
     ) -> Matches:
         """Matches by rows of the whole map."""
-        found = match_in_windows(
-            prediction, landmarks.descriptors[rows], landmarks.laplacian[rows], features, self.config
-        )
+        looks = (landmarks.descriptors, landmarks.laplacian)
+        found = match_in_windows(prediction, *looks, features, self.config, among=rows)
         return Matches(rows[found.landmarks], found.features)
 
     def _consensus(
@@ -131,7 +142,8 @@ class Recogniser:
     ) -> Prediction:
         """What would be seen from another pose, in small windows."""
         left, right = self.rig.project(transform(inverse(T_world_left), positions))
-        view = np.flatnonzero(self.rig.left.in_image(left))
+        looked_for = self._looked_for(T_world_left, landmarks, positions)
+        view = np.flatnonzero(self.rig.left.in_image(left) & looked_for)
         innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
         return replace(
             prediction,
@@ -158,6 +170,14 @@ class Recogniser:
         if consensus_anew.inliers.sum() < consensus.inliers.sum():
             return matches, consensus
         return matches_anew, consensus_anew
+
+
+def _select(prediction: Prediction, keep: BoolArray) -> Prediction:
+    """Some of the landmarks of a prediction."""
+    p = prediction
+    return replace(
+        p, ids=p.ids[keep], uv_left=p.uv_left[keep], uv_right=p.uv_right[keep], innovation=p.innovation[keep]
+    )
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:

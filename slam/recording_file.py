@@ -1,8 +1,9 @@
 """Recordings as files: an .npz of plain arrays, without pickled objects, with a version.
 
 Keys: ``format``, ``version``, ``name``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``, ``observed_…`` and
-``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, and, where the true path is
-known, ``truth_stamps`` and ``truth_poses``. Meanings: `slam.replay.Recording`.
+``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where earlier frames were
+mended ``shift``, and, where the true path is known, ``truth_stamps`` and ``truth_poses``. Meanings:
+`slam.replay.Recording`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     }
     for what, rows in (("observed", r.observed), ("added", r.added)):
         arrays.update({f"{what}_{key}": getattr(rows, key) for key in _ROWS})
+    if r.shift is not None and r.shift.any():
+        arrays["shift"] = r.shift
     if r.ground_truth is not None:
         arrays.update(truth_stamps=r.ground_truth.stamps, truth_poses=r.ground_truth.poses)
     path = Path(path)
@@ -101,6 +104,7 @@ def _recording(arrays: Mapping[str, np.ndarray]) -> Recording:
         _array(arrays, "removed_frame", 1, np.int64),
         _array(arrays, "removed", 1, np.int64),
         truth,
+        shift=_array(arrays, "shift", 1, float) if "shift" in arrays else None,
     )
     _check_lives(recording)
     return recording

@@ -25,7 +25,7 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import MeasurementError
-from slam.interfaces import Backend
+from slam.interfaces import Backend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
 from slam.pose_solver import find_consensus, measurement_rows
@@ -47,6 +47,7 @@ class RecordedFrame:
         observed: landmarks of the map, as measured.
         added: landmarks that joined the map, at their first sight.
         removed: ids of those that left it (R,).
+        shift: before the frame, the right pixels of all earlier ones were moved by so much [px].
     """
 
     number: int
@@ -54,6 +55,7 @@ class RecordedFrame:
     observed: Observations
     added: Observations
     removed: IdArray
+    shift: float = 0.0
 
     @classmethod
     def of(cls, result: FrameResult, number: int | None = None) -> RecordedFrame:
@@ -65,6 +67,7 @@ class RecordedFrame:
             Observations(result.matched, f.uv_left[seen], f.uv_right[seen]),
             Observations(result.added, f.uv_left[new], f.uv_right[new]),
             result.erased,
+            result.shift,
         )
 
 
@@ -118,6 +121,7 @@ class Recording:
         added: first measurements of those that joined it.
         removed_frame, removed: row of `stamps`, ascending, and id of each landmark that left the map (R,).
         ground_truth: the left camera's true path, where it is known.
+        shift: of the right pixels of all earlier frames, before each (F,) [px]; None for none at all.
 
     Raises:
         MeasurementError: arrays do not fit each other, stamps do not increase, or a value is not finite.
@@ -134,6 +138,7 @@ class Recording:
     removed: IdArray
     ground_truth: Trajectory | None = None
     warnings: list[str] = field(default_factory=list)
+    shift: Array | None = None
 
     format: ClassVar[str] = "recording"
 
@@ -141,6 +146,8 @@ class Recording:
         count = len(self.stamps)
         if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
+        if self.shift is not None and (self.shift.shape != (count,) or not np.isfinite(self.shift).all()):
+            raise MeasurementError("recording: shift must be finite, with a value for each stamp")
         if self.removed.shape != self.removed_frame.shape:
             raise MeasurementError("recording: removed and removed_frame differ in length")
         frames = {"observed": self.observed.frame, "added": self.added.frame, "removed": self.removed_frame}
@@ -159,7 +166,9 @@ class Recording:
     def frame(self, k: int) -> RecordedFrame:
         """What was given in frame k."""
         gone = self.removed[slice(*np.searchsorted(self.removed_frame, [k, k + 1]))]
-        return RecordedFrame(int(self.numbers[k]), float(self.stamps[k]), self.observed.at(k), self.added.at(k), gone)
+        number, stamp = int(self.numbers[k]), float(self.stamps[k])
+        shift = 0.0 if self.shift is None else float(self.shift[k])
+        return RecordedFrame(number, stamp, self.observed.at(k), self.added.at(k), gone, shift)
 
     def map_size(self, k: int) -> int:
         """Number of landmarks in the map after frame k."""
@@ -210,6 +219,7 @@ class Recording:
             np.repeat(np.arange(len(every)), [len(f.removed) for f in every]),
             np.concatenate([np.zeros(0, np.int64), *(np.asarray(f.removed, np.int64) for f in every)]),
             ground_truth,
+            shift=np.array([f.shift for f in every]),
         )
 
 
@@ -273,6 +283,8 @@ def _step(
 ) -> FrameResult:
     """One frame."""
     times = [time.perf_counter()]
+    if frame.shift and isinstance(backend, RevisingBackend):
+        backend.shift_right(frame.shift)
     prediction = backend.predict(frame.stamp)
     times.append(time.perf_counter())
     guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
@@ -300,6 +312,7 @@ def _step(
         added_features=np.arange(seen, seen + new),
         erased=frame.removed,
         map_size=recording.map_size(k),
+        shift=frame.shift,
         milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
     )
 

@@ -11,7 +11,7 @@ import io
 import json
 import os
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from slam.system import StereoSlam
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 1
+_VERSION = 2
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.
@@ -36,7 +36,7 @@ FIRST_FRAME = "left camera at the first frame"
 
 _TYPES = {
     "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,
-    "laplacian": np.int8, "seen": np.int64, "in_view": np.int64,
+    "laplacian": np.int8, "seen": np.int64, "in_view": np.int64, "seen_from": np.float64,
 }  # fmt: skip
 
 
@@ -55,6 +55,7 @@ class SavedMap:
         frontend: name of the front end that the descriptors are from; empty where it is not known.
         world_frame: what the world's axes are, for people.
         written_by: name and version of the program.
+        seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
 
     Raises:
@@ -72,9 +73,12 @@ class SavedMap:
     world_frame: str = FIRST_FRAME
     written_by: str = ""
     source: str = "the map"
+    seen_from: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         n = len(self.ids)
+        if self.seen_from is None:
+            object.__setattr__(self, "seen_from", np.full((n, 3), np.nan))
         for name, dtype in _TYPES.items():
             array = getattr(self, name)
             if array.dtype != dtype or len(array) != n:
@@ -83,6 +87,8 @@ class SavedMap:
             getattr(self, a).ndim != 1 for a in ("ids", "laplacian", "seen", "in_view")
         ):
             raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
+        if self.seen_from.shape != (n, 3):
+            raise SlamError(f"{self.source}: seen_from must be {n} rows of 3 numbers")
         if n and (self.ids[0] < 0 or (np.diff(self.ids) <= 0).any()):
             raise SlamError(f"{self.source}: landmark ids must ascend from 0 on")
         if not np.isfinite(self.descriptors).all():
@@ -105,7 +111,7 @@ class SavedMap:
         """The map's bookkeeping at the start of a run, in which nothing has been seen yet."""
         none = np.zeros(len(self), np.int64)
         return LandmarkRows(
-            self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1
+            self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1, self.seen_from
         )  # fmt: skip
 
     @classmethod
@@ -126,7 +132,7 @@ class SavedMap:
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, marks.descriptors.astype(np.float32),
             marks.laplacian.astype(np.int8), marks.seen, marks.in_view, system.frontend_name, system.world_frame,
-            f"surf-stereo-slam {__version__}",
+            f"surf-stereo-slam {__version__}", seen_from=marks.seen_from,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:

@@ -4,10 +4,14 @@ A rotation is a (3, 3) float64 matrix, a pose ``T_a_b`` a (4, 4) one taking coor
 A tangent vector of SE(3) is ``[rotation (3), translation (3)]`` in radians and metres, and perturbs on the right:
 ``T ← T exp(ξ)``; so do all pose covariances in this package. Functions accept leading batch dimensions where the
 docstring says (..., 3).
+
+A single rotation or pose is worked out in Python's floats, which takes a tenth of the time that NumPy needs for as many
+operations on arrays of three numbers.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,11 +21,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision
+_SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken
 
 
 def hat(w: Array) -> Array:
     """Skew-symmetric matrices (..., 3, 3) of vectors (..., 3): ``hat(a) @ b = a × b``."""
     w = np.asarray(w, float)
+    if w.ndim == 1:
+        x, y, z = w.tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     out = np.zeros((*w.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
     out[..., 1, 0], out[..., 1, 2] = w[..., 2], -w[..., 0]
@@ -36,13 +44,15 @@ def _coefficients(theta: Array) -> tuple[Array, Array, Array]:
     t2 = theta**2
     a = np.where(small, 1 - t2 / 6, np.sin(t) / t)
     b = np.where(small, 0.5 - t2 / 24, 2 * np.sin(t / 2) ** 2 / t**2)
-    c = np.where(theta < 1e-2, 1 / 6 - t2 / 120 + t2**2 / 5040, (t - np.sin(t)) / t**3)
+    c = np.where(theta < _SMALL_CUBIC, 1 / 6 - t2 / 120 + t2**2 / 5040, (t - np.sin(t)) / t**3)
     return a, b, c
 
 
 def so3_exp(w: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
     w = np.asarray(w, float)
+    if w.ndim == 1:
+        return np.array(_polynomial(w.tolist(), *_coefficients_of_one(w.tolist())[:2]))
     a, b, _ = _coefficients(np.linalg.norm(w, axis=-1))
     W = hat(w)
     return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
@@ -50,6 +60,9 @@ def so3_exp(w: Array) -> Array:
 
 def so3_log(R: Array) -> Array:
     """Rotation vectors (..., 3) [rad], angle in [0, π], of rotation matrices (..., 3, 3)."""
+    R = np.asarray(R, float)
+    if R.ndim == 2:
+        return np.array(_rotation_vector(R.tolist()))
     q = quaternion(R)
     vector, scalar = q[..., :3], q[..., 3]
     sine = np.linalg.norm(vector, axis=-1)
@@ -61,6 +74,8 @@ def so3_log(R: Array) -> Array:
 def so3_left_jacobian(w: Array) -> Array:
     """Left Jacobian (..., 3, 3) of SO(3): ``exp(w + δ) ≈ exp(J δ) exp(w)``."""
     w = np.asarray(w, float)
+    if w.ndim == 1:
+        return np.array(_polynomial(w.tolist(), *_coefficients_of_one(w.tolist())[1:]))
     _, b, c = _coefficients(np.linalg.norm(w, axis=-1))
     W = hat(w)
     return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
@@ -69,6 +84,8 @@ def so3_left_jacobian(w: Array) -> Array:
 def quaternion(R: Array) -> Array:
     """Unit quaternions (..., 4) as (x, y, z, w), w ≥ 0, of rotation matrices (..., 3, 3)."""
     R = np.asarray(R, float)
+    if R.ndim == 2:
+        return np.array(_quaternion_of_one(R.tolist()))
     m = R.reshape(-1, 3, 3)
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     # The largest of x², y², z², w² is found first: dividing by it never loses accuracy.
@@ -110,6 +127,10 @@ def nearest_rotation(M: Array) -> Array:
 def pose(R: Array, t: Array) -> Array:
     """Pose (..., 4, 4) from rotation (..., 3, 3) and translation (..., 3)."""
     R, t = np.asarray(R, float), np.asarray(t, float)
+    if R.ndim == 2 and t.ndim == 1:
+        T = np.zeros((4, 4))
+        T[:3, :3], T[:3, 3], T[3, 3] = R, t, 1.0
+        return T
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     T[..., :3, :3] = R
     T[..., :3, 3] = t
@@ -119,6 +140,8 @@ def pose(R: Array, t: Array) -> Array:
 
 def inverse(T: Array) -> Array:
     """Inverse poses (..., 4, 4)."""
+    if T.ndim == 2:
+        return pose(T[:3, :3].T, -(T[:3, 3] @ T[:3, :3]))
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return pose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
@@ -131,12 +154,20 @@ def transform(T: Array, points: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Poses (..., 4, 4) of tangent vectors (..., 6) = [rotation, translation]."""
     xi = np.asarray(xi, float)
-    V = so3_left_jacobian(xi[..., :3])
-    return pose(so3_exp(xi[..., :3]), (V @ xi[..., 3:, None])[..., 0])
+    if xi.ndim == 1:
+        return np.array(_exp_of_one(*xi.tolist()))
+    a, b, c = (x[..., None, None] for x in _coefficients(np.linalg.norm(xi[..., :3], axis=-1)))
+    W = hat(xi[..., :3])
+    W2 = W @ W
+    R, V = np.eye(3) + a * W + b * W2, np.eye(3) + b * W + c * W2
+    return pose(R, (V @ xi[..., 3:, None])[..., 0])
 
 
 def log(T: Array) -> Array:
     """Tangent vectors (..., 6) = [rotation, translation] of poses (..., 4, 4)."""
+    T = np.asarray(T, float)
+    if T.ndim == 2:
+        return np.array(_log_of_one(T.tolist()))
     w = so3_log(T[..., :3, :3])
     t = np.linalg.solve(so3_left_jacobian(w), T[..., :3, 3, None])[..., 0]
     return np.concatenate([w, t], axis=-1)
@@ -154,3 +185,83 @@ def adjoint(T: Array) -> Array:
 def rotation_angle(R: Array) -> Array:
     """Geodesic angles (...,) [rad] of rotation matrices (..., 3, 3)."""
     return np.linalg.norm(so3_log(R), axis=-1)
+
+
+# --- one rotation or pose, in Python's floats ---
+
+
+def _coefficients_of_one(w: list[float]) -> tuple[float, float, float]:
+    """`_coefficients` of one rotation vector; NaN where it is not finite."""
+    theta = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    if not math.isfinite(theta):
+        return math.nan, math.nan, math.nan
+    t2 = theta * theta
+    if theta < _SMALL:
+        return 1 - t2 / 6, 0.5 - t2 / 24, 1 / 6 - t2 / 120
+    sine, half = math.sin(theta), math.sin(theta / 2)
+    c = 1 / 6 - t2 / 120 + t2 * t2 / 5040 if theta < _SMALL_CUBIC else (theta - sine) / (t2 * theta)
+    return sine / theta, 2 * half * half / t2, c
+
+
+def _polynomial(w: list[float], a: float, b: float) -> list[list[float]]:
+    """``1 + a W + b W²`` (3, 3) with ``W = hat(w)``."""
+    x, y, z = w
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    xx, yy, zz = b * x * x, b * y * y, b * z * z
+    ax, ay, az = a * x, a * y, a * z
+    return [[1 - yy - zz, xy - az, xz + ay], [xy + az, 1 - xx - zz, yz - ax], [xz - ay, yz + ax, 1 - xx - yy]]
+
+
+def _quaternion_of_one(R: list[list[float]]) -> tuple[float, float, float, float]:
+    """`quaternion` of one rotation."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    trace = a + e + i
+    largest = max(a, e, i, trace)
+    if largest == a:
+        q = (1 + a - e - i, d + b, g + c, h - f)
+    elif largest == e:
+        q = (b + d, 1 + e - a - i, h + f, c - g)
+    elif largest == i:
+        q = (c + g, f + h, 1 + i - a - e, d - b)
+    else:
+        q = (h - f, c - g, d - b, 1 + trace)
+    scale = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[3] < 0:
+        scale = -scale
+    return q[0] / scale, q[1] / scale, q[2] / scale, q[3] / scale
+
+
+def _rotation_vector(R: list[list[float]]) -> tuple[float, float, float]:
+    """`so3_log` of one rotation."""
+    x, y, z, w = _quaternion_of_one(R)
+    sine2 = x * x + y * y + z * z
+    sine = math.sqrt(sine2)
+    factor = 2.0 + sine2 / 3 if sine < _SMALL else 2 * math.atan2(sine, w) / sine
+    return factor * x, factor * y, factor * z
+
+
+def _exp_of_one(x: float, y: float, z: float, u: float, v: float, w: float) -> list[list[float]]:
+    """`exp` of one twist: rotation vector [x, y, z], translation [u, v, w]."""
+    a, b, c = _coefficients_of_one([x, y, z])
+    first, second, third = _polynomial([x, y, z], a, b)
+    along, t2 = x * u + y * v + z * w, x * x + y * y + z * z
+    first.append(u + b * (y * w - z * v) + c * (x * along - u * t2))
+    second.append(v + b * (z * u - x * w) + c * (y * along - v * t2))
+    third.append(w + b * (x * v - y * u) + c * (z * along - w * t2))
+    return [first, second, third, [0.0, 0.0, 0.0, 1.0]]
+
+
+def _log_of_one(T: list[list[float]]) -> tuple[float, float, float, float, float, float]:
+    """`log` of one pose; the inverse of the left Jacobian is ``1 − W/2 + k W²``."""
+    x, y, z = _rotation_vector([row[:3] for row in T[:3]])
+    u, v, w = T[0][3], T[1][3], T[2][3]
+    t2 = x * x + y * y + z * z
+    half = math.sqrt(t2) / 2
+    k = 1 / 12 + t2 / 720 + t2 * t2 / 30240 if 2 * half < _SMALL_CUBIC else (1 - half / math.tan(half)) / t2
+    along = x * u + y * v + z * w
+    return (
+        x, y, z,
+        u - (y * w - z * v) / 2 + k * (x * along - u * t2),
+        v - (z * u - x * w) / 2 + k * (y * along - v * t2),
+        w - (x * v - y * u) / 2 + k * (z * along - w * t2),
+    )  # fmt: skip

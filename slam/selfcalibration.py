@@ -94,6 +94,18 @@ class SelfCalibration:
         self._information = config.prior_sigma**-2  # of the offset, given that there is one
         self._mean = 0.0
         self._first: _View | None = None
+        self.applied = 0.0  # the offset that features are corrected by [px]
+
+    def apply(self, least: float = 0.0) -> float:
+        """Correct features by the offset as it is known now; returns by how much it changes [px].
+
+        Where it would be by less than `least` standard deviations, features are corrected as before.
+        """
+        change = self.offset - self.applied
+        if not self.config.enabled or abs(change) <= least * self.sigma:
+            return 0.0
+        self.applied = self.offset
+        return change
 
     @property
     def probability(self) -> float:
@@ -114,10 +126,10 @@ class SelfCalibration:
         return float(self._information**-0.5)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with right pixels moved along the rectified row, so that disparities lose the offset."""
-        if not self.config.enabled or self.offset == 0.0:
+        """Features with right pixels moved along the rectified row, so that disparities lose the applied offset."""
+        if not self.config.enabled or self.applied == 0.0:
             return features
-        shift = np.array([self.offset, 0.0])
+        shift = np.array([self.applied, 0.0])
         if self.rig.is_rectified:
             return replace(features, uv_right=features.uv_right + shift)
         twin = self.rig.rectified

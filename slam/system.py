@@ -158,7 +158,7 @@ class StereoSlam:
         self._tracking = self._tracked(prediction, features, found, report)
         estimate = self.backend.estimate(landmarks=False)
         clock.lap("estimate")
-        judged = self._judge(features, estimate, found, report)
+        judged = self.objects.judge(features, estimate, _landmark_ids(features, found))
         objects = self.objects.update(self.backend, features)
         clock.lap("objects")
         landmarks, added, erased = self._keep(landmarks, estimate, features, found, report, judged)
@@ -263,14 +263,6 @@ class StereoSlam:
         self.objects = detector_for(self.rig, self.config.objects, self.config.models)
         return self.backend.predict(stamp)
 
-    def _judge(
-        self, features: StereoFeatures, estimate: Estimate, found: Recognition, report: UpdateReport
-    ) -> Judgement:
-        """Which features move; before any of them becomes a landmark."""
-        landmark = np.full(len(features), -1, np.int64)
-        landmark[found.rows] = found.ids
-        return self.objects.judge(features, estimate, landmark, found.rows[np.isin(found.ids, report.used)])
-
     def _tracked(
         self, prediction: Prediction, features: StereoFeatures, found: Recognition, report: UpdateReport
     ) -> Tracking:
@@ -328,7 +320,8 @@ class StereoSlam:
             shown &= self._recogniser.looks_alike(view.T_world_left, landmarks, view.positions)
             expected = landmarks.ids[shown]
         ids, rows = found.ids[measured], found.rows[measured]
-        return landmarks.after_frame(self._index, expected, ids, features, rows, m.renewal)
+        place = view.T_world_left[:3, 3], view.in_image, self.config.association.again_after
+        return landmarks.after_frame(self._index, expected, ids, features, rows, m.renewal, *place)
 
     def _erase(self, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
         """Drop landmarks from the map and from the back end."""
@@ -406,6 +399,13 @@ class StereoSlam:
             return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
         reason = report.reason or f"only {len(report.used)} landmarks recognised"
         return (FrameStatus.LOST if self._tracking.lost else FrameStatus.PREDICTED), reason
+
+
+def _landmark_ids(features: StereoFeatures, found: Recognition) -> IdArray:
+    """Id of the landmark that each feature was recognised as (N,), −1 for none."""
+    ids = np.full(len(features), -1, np.int64)
+    ids[found.rows] = found.ids
+    return ids
 
 
 def _observations(features: StereoFeatures, found: Recognition) -> Observations:

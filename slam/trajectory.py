@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,6 +49,11 @@ class Trajectory:
     def length(self) -> float:
         """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
+        """Paths that follow each other in time, as one."""
+        return cls(np.concatenate([p.stamps for p in parts]), np.concatenate([p.poses for p in parts]))
 
     def write_tum(self, path: str | Path) -> None:
         """Write ``stamp tx ty tz qx qy qz qw`` lines."""

@@ -50,6 +50,24 @@ class MapView:
         return cls(T_world_left, positions, local, uv, rig.left.in_image(uv), points, np.sqrt(variance))
 
 
+def seen_alike(positions: Array, seen_from: Array, camera: Array, angle: float, ratio: float) -> BoolArray:
+    """Which landmarks (N,) look from `camera` (3,) as they did when they were first seen.
+
+    What a descriptor describes slides over the surface, and then changes, as it is seen from elsewhere.
+
+    Args:
+        positions: of the landmarks (N, 3) [m].
+        seen_from: where the camera was then (N, 3); NaN for unknown: then nothing is ruled out.
+        camera: where it is now, in the same world.
+        angle: largest angle between both lines of sight [degrees].
+        ratio: largest ratio of both distances.
+    """
+    then, now = positions - seen_from, positions - camera
+    before, after = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
+    turned = np.einsum("ij,ij->i", then, now) < np.cos(np.deg2rad(angle)) * before * after
+    return np.asarray(~(turned | (after > ratio * before) | (before > ratio * after)))
+
+
 def expected_landmarks(
     view: MapView, features: StereoFeatures, size: tuple[int, int], margin: float, radius: float
 ) -> BoolArray:

@@ -20,8 +20,11 @@ class EkfConfig:
             updates where the first is not linear to within the noise.
         landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
+        consistent: keep what nothing measures, where the world's origin is and which way it faces, from seeming to be
+            measured, by referring the covariance to the corrected state after each update. With stereo measurements
+            only, and until the first moving body is observed.
 
-    The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``.
+    The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``, printed as it is there.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -30,6 +33,7 @@ class EkfConfig:
     measurement: str = "stereo"
     iterations: int = 5
     landmarks: str = "inverse_depth"
+    consistent: bool = True
 
     def __post_init__(self) -> None:
         if self.measurement not in MEASUREMENTS:
@@ -38,3 +42,5 @@ class EkfConfig:
             raise ConfigurationError(f"ekf: landmarks must be one of {LANDMARKS}, got {self.landmarks!r}")
         if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
             raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
+        if not isinstance(self.consistent, bool):
+            raise ConfigurationError(f"ekf: consistent must be true or false, got {self.consistent!r}")

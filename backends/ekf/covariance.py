@@ -1,15 +1,27 @@
-"""The filter's covariance matrix: one triangle of a padded buffer, changed in place.
+"""The filter's covariance matrix: exact, but the part far from the camera is brought up to date only when needed.
 
-Only the lower triangle is kept, in Fortran order, so that BLAS updates it in place (``dsyrk``) and the camera's
-columns are contiguous. Above the diagonal stand zeros, always. The buffer has a few rows more than the state, all
-zero, so that landmarks come and go without copying the rest; zero rows add nothing to any product.
+An update of a few landmarks changes every entry of the matrix, but until one of the others is measured nobody looks at
+most of these. So the camera and the landmarks measured of late, the local part L, are kept as a small dense matrix;
+what the updates have done to the rest b follows from small matrices that are carried along (the compressed filter of
+Guivant and Nebot, IEEE Transactions on Robotics and Automation 17 (2001)):
+
+    P_bL = X_b Φᵀ,        P_bb = P⁰_bb − X_b Ψ X_bᵀ.
+
+P⁰ is the matrix as it was stored last, X its columns of the variables that were local then or became so since. Once the
+local part has grown too large all is stored anew (`_store`), by one ``dsyrk``. Nothing is neglected: it is the same
+matrix, to rounding.
+
+Of P⁰ only the lower triangle is kept, in Fortran order, so that BLAS updates it in place; above the diagonal stand
+zeros, always. Its buffer has a few rows more than the state, all zero, so that landmarks come and go without copying
+the rest.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import dgemm, dsyrk
+from scipy.linalg.lapack import dpstrf
 
 from slam.se3 import Array
 
@@ -18,7 +30,10 @@ POSE = 6  #: its part [r, φ] that measurements depend on
 
 SlotArray = NDArray[np.intp]
 
-_LOWER = np.tri(CAMERA)
+_LOCAL = 150  # rows of the local part that are never too many
+_THREE = np.arange(3)
+_LATER = np.maximum(_THREE[:, None], _THREE)  # row of an entry in the lower triangle of a symmetric block
+_EARLIER = np.minimum(_THREE[:, None], _THREE)
 
 
 class Covariance:
@@ -30,8 +45,13 @@ class Covariance:
 
     def __init__(self, camera: Array) -> None:
         self.count = 0
-        self._P = np.zeros((CAMERA, CAMERA), order="F")
-        self._P[:CAMERA, :CAMERA] = np.tril(camera)
+        self._P = np.zeros((CAMERA, CAMERA), order="F")  # P⁰
+        self._local: Array = np.array(camera, float)  # P_LL
+        self._slots = np.zeros(0, np.intp)  # of the local landmarks
+        self._place = np.zeros(0, np.intp)  # of each landmark among them, −1 for the others
+        self._X: Array = np.zeros((CAMERA, 0))
+        self._Phi: Array = np.zeros((CAMERA, 0))
+        self._Psi: Array = np.zeros((0, 0))
 
     @property
     def size(self) -> int:
@@ -46,85 +66,126 @@ class Covariance:
     @property
     def camera(self) -> Array:
         """The camera's block (12, 12)."""
-        return _mirrored(self._P[:CAMERA, :CAMERA])
+        return self._local[:CAMERA, :CAMERA].copy()
 
     @property
     def pose(self) -> Array:
         """The block of [r, φ] (6, 6)."""
-        return _mirrored(self._P[:POSE, :POSE])
+        return self._local[:POSE, :POSE].copy()
 
     def full(self) -> Array:
         """The whole symmetric matrix (size, size): a copy."""
-        return _mirrored(self._P[: self.size, : self.size])
+        self._store()
+        lower = self._P[: self.size, : self.size]
+        full = lower + lower.T
+        np.fill_diagonal(full, lower.diagonal())
+        return full
 
-    def blocks(self, slots: SlotArray) -> Array:
-        """Marginal covariances (M, 3, 3) of landmarks."""
-        out = np.empty((len(slots), 3, 3))
-        for below in range(3):
-            diagonal = self._P.diagonal(-below)[CAMERA : self.size]
-            for i in range(3 - below):
-                out[:, i + below, i] = out[:, i, i + below] = diagonal[i::3][slots]
-        return out
+    def of_landmarks(self, slots: SlotArray) -> tuple[Array, Array]:
+        """Marginal covariances (M, 3, 3) of landmarks, and their covariances (M, 3, 6) with the camera's [r, φ]."""
+        place = self._place[slots]
+        near, far = place >= 0, place < 0
+        blocks, cross = np.empty((len(slots), 3, 3)), np.empty((len(slots), 3, POSE))
+        rows = CAMERA + 3 * place[near][:, None] + _THREE
+        blocks[near] = self._local[rows[:, :, None], rows[:, None, :]]
+        cross[near] = self._local[rows, :POSE]
+        first = CAMERA + 3 * slots[far][:, None, None]
+        X = self._X[first[:, 0] + _THREE]
+        by_base = X.reshape(3 * len(X), len(self._Psi)) @ np.concatenate([self._Psi, self._Phi[:POSE].T], axis=1)
+        by_base = by_base.reshape(len(X), 3, len(self._Psi) + POSE)
+        blocks[far] = self._P[first + _LATER, first + _EARLIER] - by_base[..., :-POSE] @ X.transpose(0, 2, 1)
+        cross[far] = by_base[..., -POSE:]
+        return blocks, cross
 
-    def cross(self, slots: SlotArray) -> Array:
-        """Covariances (M, 3, 6) of landmarks with the camera's [r, φ]."""
-        return self._P[CAMERA : self.size, :POSE].reshape(-1, 3, POSE)[slots]
+    @property
+    def local(self) -> SlotArray:
+        """Slots of the local landmarks, in the order in which they became so."""
+        return self._slots
+
+    def make_local(self, slots: SlotArray) -> SlotArray:
+        """Let landmarks join the local part, which is stored first where it gets too large; returns who has joined."""
+        far = slots[self._place[slots] < 0]
+        most = max(_LOCAL, self.size // 8, 3 * (CAMERA + 3 * len(slots)) // 2)
+        if len(self._local) + 3 * len(far) > most:
+            self._store()
+            far = slots
+        if len(far):
+            self._fetch(far)
+        if len(self._slots) == self.count:  # there is no rest
+            self._X, self._Phi, self._Psi = self._X[:, :0], self._Phi[:, :0], self._Psi[:0, :0]
+        return far
+
+    def marginal(self, slots: SlotArray) -> Array:
+        """The covariance (6 + 3M, 6 + 3M) of ``g = [r, φ, landmarks]``; these are local."""
+        g = self._rows(slots)
+        return self._local[g[:, None], g]
+
+    def columns(self, slots: SlotArray) -> Array:
+        """Covariance (size, 6 + 3M) of the whole state with ``g = [r, φ, landmarks]``; these are local."""
+        g = self._rows(slots)
+        out = self._X[: self.size] @ self._Phi[g].T
+        out[self._own_rows()] = self._local[:, g]
+        return np.asarray(out)
+
+    def times(self, slots: SlotArray, s: Array) -> Array:
+        """``P[:, g] s`` (size,), g as above."""
+        g = self._rows(slots)
+        out = self._X[: self.size] @ (s @ self._Phi[g])
+        out[self._own_rows()] = self._local[:, g] @ s
+        return np.asarray(out)
+
+    def subtract(self, slots: SlotArray, B: Array) -> None:
+        """``P ← P − W Wᵀ`` with ``W = P[:, g] B``, g as above; B (6 + 3M, K)."""
+        g = self._rows(slots)
+        W, V = B.T @ self._local[g], B.T @ self._Phi[g]  # transposed
+        self._local -= W.T @ W
+        if V.size:
+            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=self._Phi.T, trans_b=1, overwrite_c=1).T
+            self._Psi += V.T @ V
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
-        P, camera = self._P, self.camera
-        P[CAMERA:, :POSE] += dt * P[CAMERA:, POSE:CAMERA]
-        camera[:POSE] += dt * camera[POSE:]
-        camera[:, :POSE] += dt * camera[:, POSE:]
-        P[:CAMERA, :CAMERA] = (camera + noise) * _LOWER
+        P = self._local
+        P[:POSE] += dt * P[POSE:CAMERA]
+        P[:, :POSE] += dt * P[:, POSE:CAMERA]
+        P[:CAMERA, :CAMERA] = _symmetric(P[:CAMERA, :CAMERA] + noise)
+        self._Phi[:POSE] += dt * self._Phi[POSE:CAMERA]
 
     def transform_camera(self, J: Array) -> None:
         """``P ← J P Jᵀ`` for a change of the camera's state (12, 12)."""
-        self._P[CAMERA:, :CAMERA] = self._P[CAMERA:, :CAMERA] @ J.T
-        self._P[:CAMERA, :CAMERA] = np.tril(J @ self.camera @ J.T)
+        rows = J @ self._local[:CAMERA]
+        rows[:, :CAMERA] = _symmetric(rows[:, :CAMERA] @ J.T)
+        self._local[:CAMERA], self._local[:, :CAMERA] = rows, rows.T
+        self._Phi[:CAMERA] = J @ self._Phi[:CAMERA]
 
-    def gather(self, slots: SlotArray) -> Array:
-        """Columns (capacity, 6 + 3M) of the camera's [r, φ] and of landmarks, in Fortran order."""
-        P = self._P
-        rows = np.empty((POSE + 3 * len(slots), len(P)))  # the transposed result: each row is written in one go
-        rows[:POSE] = P[:, :POSE].T
-        rows[:POSE, :POSE] = self.pose
-        starts = CAMERA + 3 * slots
-        for row, start in zip(range(POSE, len(rows), 3), starts.tolist()):
-            rows[row : row + 3, :start] = P[start : start + 3, :start]
-            rows[row : row + 3, start:] = P[start:, start : start + 3].T
-        own = POSE + 3 * np.arange(len(slots))
-        for i, j in ((1, 0), (2, 0), (2, 1)):
-            rows[own + i, starts + j] = P[starts + i, starts + j]
-        return rows.T
-
-    def subtract(self, W: Array) -> None:
-        """``P ← P − W Wᵀ`` in place; W (capacity, K) in Fortran order."""
-        self._P = dsyrk(-1.0, W, beta=1.0, c=self._P, lower=1, overwrite_c=1)
+    def transform_landmarks(self, K: Array) -> None:
+        """``Y ← Y + K [r, φ]`` for a change of coordinates of those landmarks that became local last; K (M, 3, 6)."""
+        by_pose, P = K.reshape(-1, POSE), self._local
+        rows = slice(len(P) - len(by_pose), len(P))
+        P[rows] += by_pose @ P[:POSE]
+        P[:, rows] += P[:, :POSE] @ by_pose.T
+        self._Phi[rows] += by_pose @ self._Phi[:POSE]
 
     def append(self, J: Array, noise: Array) -> None:
-        """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``.
+        """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
 
         Args:
             J: derivatives (M, 3, 6) of the landmarks by [r, φ].
             noise: covariances (M, 3, 3) of what does not hang on it.
         """
-        n, new = self.size, slice(self.size, self.size + 3 * len(J))
-        if new.stop > len(self._P):
-            self._resize(new.stop)
-        by_pose = J.reshape(-1, POSE)
-        cross = by_pose @ self.gather(np.zeros(0, np.intp))[:n].T
+        by_pose, new = J.reshape(-1, POSE), np.arange(self.count, self.count + len(J))
+        cross = by_pose @ self._local[:POSE]
         own = cross[:, :POSE] @ by_pose.T
         for i, block in enumerate(noise):
             own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
-        self._P[new, :n] = cross
-        self._P[new, new] = np.tril(own)
+        self._place = np.concatenate([self._place, np.zeros(len(J), np.intp)])
         self.count += len(J)
+        if self.size > len(self._P):
+            self._resize()
+        self._join(new, cross, own, by_pose @ self._Phi[:POSE])
 
     def drop(self, slots: SlotArray) -> tuple[SlotArray, SlotArray]:
         """Take landmarks out; the last ones move into their slots.
-
-        Moving a landmark costs its rows alone, so that only where most of a map goes would copying the rest be faster.
 
         Args:
             slots: of the landmarks (M,), each once.
@@ -136,13 +197,87 @@ class Covariance:
         gone = np.zeros(self.count, bool)
         gone[slots] = True
         holes, movers = np.flatnonzero(gone[:left]), left + np.flatnonzero(~gone[left:])
+        stay = ~gone[self._slots]
+        if not stay.all():
+            rows = np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)])
+            self._local, self._Phi = self._local[np.ix_(rows, rows)], self._Phi[rows]
+            self._slots = self._slots[stay]
         for hole, mover in zip(holes.tolist(), movers.tolist()):
             self._move(CAMERA + 3 * hole, CAMERA + 3 * mover)
-        self._P[CAMERA + 3 * left : self.size] = 0.0
+        self._slots[self._slots >= left] = holes[np.searchsorted(movers, self._slots[self._slots >= left])]
+        self._P[CAMERA + 3 * left : self.size] = self._X[CAMERA + 3 * left : self.size] = 0.0
         self.count = left
+        self._place = np.full(left, -1)
+        self._place[self._slots] = np.arange(len(self._slots))
         if len(self._P) > self.size + 4 * _spare(self.size):
-            self._resize(self.size)
+            self._resize()
         return holes, movers
+
+    # --- the local part ---
+
+    def _rows(self, slots: SlotArray) -> SlotArray:
+        """Rows (6 + 3M,) of [r, φ, landmarks] in the local part."""
+        g = np.empty(POSE + 3 * len(slots), np.intp)
+        g[:POSE] = np.arange(POSE)
+        g[POSE:].reshape(-1, 3)[:] = CAMERA + 3 * self._place[slots][:, None] + _THREE
+        return g
+
+    def _own_rows(self) -> SlotArray:
+        """Rows of the whole state that the local part holds."""
+        return np.concatenate([np.arange(CAMERA), (CAMERA + 3 * self._slots[:, None] + _THREE).reshape(-1)])
+
+    def _fetch(self, slots: SlotArray) -> None:
+        """Landmarks of the rest join the local part."""
+        rows = (CAMERA + 3 * slots[:, None] + _THREE).reshape(-1)
+        X = self._X[rows]
+        stored = self._gather(slots)
+        by_base = -X @ self._Psi
+        self._X = np.concatenate([self._X, stored], axis=1)
+        Phi, Psi = self._Phi, self._Psi
+        n, k = len(Psi), len(rows)
+        self._Phi, self._Psi = np.zeros((len(Phi), n + k)), np.zeros((n + k, n + k))
+        self._Phi[:, :n], self._Psi[:n, :n] = Phi, Psi
+        self._join(slots, X @ Phi.T, stored[rows] + by_base @ X.T, np.concatenate([by_base, np.eye(k)], axis=1))
+
+    def _join(self, slots: SlotArray, cross: Array, own: Array, Phi: Array) -> None:
+        """Enlarge the local part by landmarks with covariances `cross` with it and `own`."""
+        self._local = np.block([[self._local, cross.T], [cross, _symmetric(own)]])
+        self._Phi = np.concatenate([self._Phi, Phi])
+        self._place[slots] = len(self._slots) + np.arange(len(slots))
+        self._slots = np.concatenate([self._slots, slots])
+
+    def _store(self) -> None:
+        """Bring P⁰ up to date. Only the camera stays local."""
+        mine, P = self._own_rows(), self._P
+        C = _square_root(self._Psi)
+        X = self._X.copy()
+        X[mine] = 0.0
+        if C.shape[1]:
+            P = self._P = dsyrk(-1.0, dgemm(1.0, X.T, C, trans_a=1), beta=1.0, c=P, lower=1, overwrite_c=1)
+        columns = np.zeros((len(self._local), len(P)))  # transposed: each row is read in one go
+        columns[:, : self.size] = self._Phi @ X[: self.size].T
+        columns[:, mine] = self._local
+        for row, start in zip(range(0, len(mine), 3), mine[::3].tolist()):
+            P[start : start + 3, :start] = columns[row : row + 3, :start]
+            P[start:, start : start + 3] = columns[row : row + 3, start:].T
+            P[start, start + 1] = P[start, start + 2] = P[start + 1, start + 2] = 0.0
+        self._local = self.camera
+        self._slots, self._place = np.zeros(0, np.intp), np.full(self.count, -1)
+        self._X, self._Phi, self._Psi = columns[:CAMERA].T.copy(), np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
+
+    # --- the stored matrix ---
+
+    def _gather(self, slots: SlotArray) -> Array:
+        """Columns (capacity, 3M) of P⁰."""
+        P, starts = self._P, CAMERA + 3 * slots
+        rows = np.empty((3 * len(slots), len(P)))  # the transposed result: each row is written in one go
+        for row, start in zip(range(0, len(rows), 3), starts.tolist()):
+            rows[row : row + 3, :start] = P[start : start + 3, :start]
+            rows[row : row + 3, start:] = P[start:, start : start + 3].T
+        own = 3 * np.arange(len(slots))
+        for i, j in ((1, 0), (2, 0), (2, 1)):
+            rows[own + i, starts + j] = P[starts + i, starts + j]
+        return rows.T
 
     def _move(self, to: int, row: int) -> None:
         """Copy a landmark's rows and columns, which start at `row`, to `to` < `row`."""
@@ -151,22 +286,34 @@ class Covariance:
         P[to + 3 : row, to : to + 3] = P[row : row + 3, to + 3 : row].T
         P[row + 3 : self.size, to : to + 3] = P[row + 3 : self.size, row : row + 3]
         P[to : to + 3, to : to + 3] = P[row : row + 3, row : row + 3]
+        self._X[to : to + 3] = self._X[row : row + 3]
 
-    def _resize(self, rows: int) -> None:
-        """Make the buffer hold `rows` rows, with a little room to grow."""
-        capacity = rows + _spare(rows)
-        P = np.zeros((capacity, capacity), order="F")
-        P[: self.size, : self.size] = self._P[: self.size, : self.size]
-        self._P = P
+    def _resize(self) -> None:
+        """Make the buffers hold the state, with a little room to grow."""
+        capacity, old = self.size + _spare(self.size), min(self.size, len(self._P))
+        P, X = np.zeros((capacity, capacity), order="F"), np.zeros((capacity, self._X.shape[1]))
+        P[:old, :old], X[:old] = self._P[:old, :old], self._X[:old]
+        self._P, self._X = P, X
 
 
 def _spare(rows: int) -> int:
     """Spare rows: few, as BLAS works through them, but a share of all, so that growing seldom copies the matrix."""
-    return max(24, rows // 24)
+    return max(24, rows // 40)
 
 
-def _mirrored(lower: Array) -> Array:
-    """The symmetric matrix of a lower triangle with zeros above."""
-    full = lower + lower.T
-    np.fill_diagonal(full, lower.diagonal())
-    return full
+def _symmetric(M: Array) -> Array:
+    """Without what rounding has made unequal."""
+    return np.asarray(0.5 * (M + M.T))
+
+
+def _square_root(M: Array) -> Array:
+    """C (N, R) with ``C Cᵀ = M`` for a positive semidefinite M (N, N) of rank R, by pivoted Cholesky."""
+    scale = np.sqrt(np.maximum(M.diagonal(), 0.0))
+    nonzero = np.flatnonzero(scale)
+    scale = scale[nonzero]
+    if not len(nonzero):
+        return np.zeros((len(M), 0))
+    L, pivots, rank, _ = dpstrf(M[np.ix_(nonzero, nonzero)] / np.outer(scale, scale), lower=1)
+    C = np.zeros((len(M), rank))
+    C[nonzero[pivots - 1]] = np.tril(L)[:, :rank] * scale[pivots - 1][:, None]
+    return C

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg.blas import dgemm, dgemv
 
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
 from backends.ekf.config import EkfConfig
@@ -21,7 +21,7 @@ from slam import se3
 from slam.blas import one_blas_thread
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.euler import angles, body_rate_matrix
+from slam.euler import angles, body_rate_matrix, rotation
 from slam.known_landmarks import require_known
 from slam.models import EstimatorModels
 from slam.objects.data import ObjectEstimate, ObjectObservations
@@ -32,6 +32,8 @@ from slam.trajectory import Trajectory
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
+_PIECES = 64  # at most, of one step through the angles' singularity
+_SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
 _ENOUGH = 6  # observations that can be judged to agree with each other
 
 
@@ -63,6 +65,7 @@ class EkfBackend:
         self._camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self._covariance = Covariance(self._initial_covariance())
         self._objects = ObjectFilter(rig, models, self.config.iterations)
+        self._has_objects = False
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -85,13 +88,15 @@ class EkfBackend:
         slots = self._landmarks.slots(observations.ids)
         if not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        G = self._covariance.gather(slots)
+        joined = self._covariance.make_local(slots)
+        if self._consistent:
+            self._refer_landmarks(joined)
         try:
-            problem = self._problem(observations, slots, G, guess)
+            problem = self._problem(observations, slots, guess)
             problem, gated, surprise = self._gated(problem)
             solution = solve(problem, gated)
             if solution is not None:
-                self._correct(slots, G, solution, surprise)
+                self._correct(slots, solution, surprise)
         except UnsolvableError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
         if solution is None:
@@ -129,7 +134,7 @@ class EkfBackend:
         D = marks.jacobian(slots)
         return Estimate(
             self._stamps[-1], self._poses[-1].copy(), self._pose_covariance(),
-            marks.ids[slots], marks.points[slots], D @ self._covariance.blocks(slots) @ D.transpose(0, 2, 1),
+            marks.ids[slots], marks.points[slots], D @ self._covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1),
         )  # fmt: skip
 
     def positions(self, ids: IdArray) -> Array:
@@ -166,8 +171,8 @@ class EkfBackend:
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
-        T, covariance = self._poses[-1], self._covariance
-        columns = covariance.gather(np.zeros(0, np.intp))[: covariance.size]
+        self._has_objects = self._has_objects or bool(observations)
+        T, columns = self._poses[-1], self._covariance.columns(np.zeros(0, np.intp))
         camera = CameraBelief(T, pose_jacobian(T[:3, :3], self._camera[3:6]), columns)
         return self._objects.update(observations, self._stamps[-1], camera)
 
@@ -204,16 +209,21 @@ class EkfBackend:
 
     def _advance(self, dt: float) -> None:
         """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity."""
-        if abs(self._camera[4] + self._camera[10] * dt) > LIMIT:
+        turn = float(self._camera[10]) * dt
+        if abs(float(self._camera[4]) + turn) > LIMIT:
             self._reanchor()
-        pieces = int(np.clip(np.ceil(abs(self._camera[10]) * dt / LIMIT), 1, 64))
+            turn = float(self._camera[10]) * dt
+        pieces = max(1, math.ceil(min(abs(turn) / LIMIT, _PIECES)))
         for _ in range(pieces):
             self._transition(dt / pieces)
             self._reanchor_if_needed()
 
     def _transition(self, dt: float) -> None:
         """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W."""
+        before = self._camera.copy()
         self._camera[:POSE] += dt * self._camera[POSE:]
+        if self._consistent and np.abs(self._camera[3:6] - before[3:6]).max() < _SMALL_TURN:
+            self._turn_with(before)
         self._covariance.move_camera(dt, self._motion_noise(dt))
         self._objects.camera_moved(dt)
 
@@ -226,7 +236,7 @@ class EkfBackend:
 
     def _reanchor_if_needed(self) -> None:
         """Choose a new angles' world where φy comes near its singularity."""
-        if abs(np.sin(self._camera[4])) > np.sin(LIMIT) or np.cos(self._camera[4]) < 0:
+        if abs(math.sin(self._camera[4])) > math.sin(LIMIT) or math.cos(self._camera[4]) < 0:
             self._reanchor()
 
     def _reanchor(self) -> None:
@@ -251,27 +261,23 @@ class EkfBackend:
         h = (marks.points - T[:3, 3]) @ R
         slots = np.flatnonzero(self.rig.left.in_view(h))
         h = h[slots]
-        line = chained(*self.rig.project_stereo(h), h, R, self._camera[3:6])
-        left = line.z[:, :2]
-        right = line.z[:, [2, 1]] if self.rig.is_rectified else self.rig.project(h)[1]
-        D = marks.jacobian(slots)
-        S = innovation_covariances(
-            line.by_relative[:, :2], covariance.pose, D @ covariance.cross(slots),
-            D @ covariance.blocks(slots) @ D.transpose(0, 2, 1), self.models.pixel_sigma,
-        )  # fmt: skip
-        return Prediction(self._stamps[-1], T, self._pose_covariance(), marks.ids[slots], left, right, S)
+        z, J = self.rig.project_stereo(h)
+        right = z[:, [2, 1]] if self.rig.is_rectified else self.rig.project(h)[1]
+        line = chained(z[:, :2], J[:, :2], h, R, self._camera[3:6], marks.jacobian(slots))
+        blocks, cross = covariance.of_landmarks(slots)
+        S = innovation_covariances(line, covariance.pose, cross, blocks, self.models.pixel_sigma)
+        return Prediction(self._stamps[-1], T, self._pose_covariance(), marks.ids[slots], line.z, right, S)
 
-    def _problem(self, observations: Observations, slots: SlotArray, G: Array, guess: Array | None) -> Problem:
-        """The update in the coordinates [r, φ, measured landmarks]; G are their columns of the covariance."""
+    def _problem(self, observations: Observations, slots: SlotArray, guess: Array | None) -> Problem:
+        """The update in the coordinates [r, φ, measured landmarks]."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
-        rows = np.concatenate([np.arange(POSE), (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)])
         marks = self._landmarks
         prior = np.concatenate([self._camera[:POSE], marks.state[slots].reshape(-1)])
         model = StereoMeasurement(self.rig, self._R_world_angles, marks.coordinates, marks.charts[slots])
         return Problem(
-            prior, G[rows], z, self.models.pixel_sigma, model,
+            prior, self._covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
             None if guess is None else self._change_to(guess),
         )  # fmt: skip
@@ -313,25 +319,82 @@ class EkfBackend:
                     return wider, gated, noise
         return problem, first, None
 
-    def _correct(self, slots: SlotArray, G: Array, solution: Solution, surprise: Array | None) -> None:
+    def _correct(self, slots: SlotArray, solution: Solution, surprise: Array | None) -> None:
         """Change the whole state and covariance, or nothing; `surprise` (12, 12) adds to the camera's covariance.
 
         Raises:
             UnsolvableError: the new state is not finite.
         """
+        covariance = self._covariance
         if surprise is not None:
-            G[:CAMERA, :POSE] += surprise[:, :POSE]
-        change, W = dgemv(1.0, G, solution.s), dgemm(1.0, G, solution.B)
+            covariance.move_camera(0.0, surprise)
+        change = covariance.times(slots, solution.s)
         if not np.isfinite(change).all():
+            if surprise is not None:
+                covariance.move_camera(0.0, -surprise)
             raise UnsolvableError("the corrected state is not finite")
-        if surprise is not None:
-            self._covariance.move_camera(0.0, surprise)
+        if self._has_objects:
+            self._objects.camera_corrected(slots, solution, covariance.columns(slots) @ solution.B)
+        covariance.subtract(slots, solution.B)
+        before = self._camera
         self._camera = self._camera + change[:CAMERA]
-        self._landmarks.move(change[CAMERA : self._covariance.size].reshape(-1, 3))
-        self._covariance.subtract(W)
-        self._objects.camera_corrected(slots, solution, W)
+        self._landmarks.move(change[CAMERA:].reshape(-1, 3))
+        if self._consistent and solution.at_prior:
+            self._refer(before)
+        elif self._consistent:  # it refers to about the corrected state already
+            self._landmarks.refer(covariance.local)
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
+
+    # --- what nothing measures ---
+
+    @property
+    def _consistent(self) -> bool:
+        """Whether the covariance is referred to the corrected state. The bodies' correlation with it cannot follow."""
+        return self.config.consistent and self.config.measurement == "stereo" and not self._has_objects
+
+    def _refer(self, before: Array) -> None:
+        """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
+
+        Nothing measures a displacement of camera and landmarks together. What it changes in each coordinate depends on
+        the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
+        that goes on with the same covariance believes to have measured such displacements, in time very well (Huang,
+        Mourikis and Roumeliotis, 2010). So the error is taken to be the displacement, in old coordinates and in new,
+        and what it leaves, which stays as it is: the error of an invariant filter (Barrau and Bonnabel, 2015).
+        """
+        A, A_before = self._turning(self._camera), self._turning(before)
+        change, J = self._camera - before, np.eye(CAMERA)
+        J[:3, 3:6] = -se3.hat(change[:3]) @ A_before
+        J[3:6, 3:6] = np.linalg.solve(A, A_before)
+        J[6:9, 3:6] = -se3.hat(change[6:9]) @ A_before
+        self._covariance.transform_camera(J)
+        self._objects.camera_transformed(J)
+        self._refer_landmarks(self._covariance.local)
+
+    def _turn_with(self, before: Array) -> None:
+        """Carry the attitude's error through a step as a turn about the world's axes, not as one of the angles φ.
+
+        The printed transition has constant rates of the angles, which is not the same in another world. The difference
+        is of second order; in long steps, where it would not be, the transition is left as printed.
+        """
+        J = np.eye(CAMERA)
+        J[3:6, 3:6] = np.linalg.solve(self._turning(self._camera), self._turning(before))
+        self._covariance.transform_camera(J)
+        self._objects.camera_transformed(J)
+
+    def _refer_landmarks(self, slots: SlotArray) -> None:
+        """The same for landmarks, those that became local last, by the displacement that the camera's [r, φ] has."""
+        if not len(slots):
+            return
+        world, A = np.eye(6), self._turning(self._camera)
+        world[:3, 3:], world[3:, 3:] = se3.hat(self._camera[:3]) @ A, A
+        K = self._landmarks.refer(slots) @ world
+        if K.any():
+            self._covariance.transform_landmarks(K)
+
+    def _turning(self, camera: Array) -> Array:
+        """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ."""
+        return self._R_world_angles @ rotation(camera[3:6]) @ body_rate_matrix(camera[3:6])
 
     def _require_started(self, what: str) -> None:
         if not self._stamps:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.data import IdArray
 from slam.errors import MeasurementError
-from slam.se3 import Array
+from slam.se3 import Array, hat
 
 SlotArray = NDArray[np.intp]
 
@@ -62,9 +62,9 @@ class InverseDepth:
 
     def points(self, charts: Array, c: Array) -> Array:
         """See `Coordinates.points`."""
-        depth = 1 / c[:, 2:]
-        local = np.concatenate([c[:, :2] * depth, depth], axis=1)
-        return (charts[:, :, :3] @ local[:, :, None])[:, :, 0] + charts[:, :, 3]
+        homogeneous = np.ones((len(c), 4))  # [x/z, y/z, 1, 1/z]
+        homogeneous[:, :2], homogeneous[:, 3] = c[:, :2], c[:, 2]
+        return np.asarray(np.einsum("nij,nj->ni", charts, homogeneous) / c[:, 2:])
 
     def of(self, charts: Array, points: Array) -> Array:
         """See `Coordinates.of`."""
@@ -94,6 +94,8 @@ class Landmarks:
         charts: (N, 3, 4), constants.
         state: coordinates (N, 3).
         points: positions (N, 3) [m] in the world, which follow from the two.
+        by_world: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by
+            δ about the origin) where the covariance was last referred to.
     """
 
     def __init__(self, coordinates: Coordinates) -> None:
@@ -102,6 +104,7 @@ class Landmarks:
         self.charts: Array = np.zeros((0, 3, 4))
         self.state: Array = np.zeros((0, 3))
         self.points: Array = np.zeros((0, 3))
+        self.by_world: Array = np.zeros((0, 3, 6))
         self._slots: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -123,28 +126,43 @@ class Landmarks:
     def append(self, ids: IdArray, charts: Array, points: Array) -> Array:
         """Add landmarks at positions (M, 3); returns the derivatives (M, 3, 3) of their coordinates by these."""
         first, state = len(self), self.coordinates.of(charts, points)
+        inverse, by_world = self._derivatives(charts, state, points)
         self._slots.update(zip(ids.tolist(), range(first, first + len(ids))))
         self.ids = np.concatenate([self.ids, ids])
         self.charts = np.concatenate([self.charts, charts])
         self.state = np.concatenate([self.state, state])
         self.points = np.concatenate([self.points, points])
-        return np.linalg.inv(self.coordinates.jacobian(charts, state))
+        self.by_world = np.concatenate([self.by_world, by_world])
+        return inverse
 
     def remove(self, ids: IdArray, holes: SlotArray, movers: SlotArray) -> None:
         """Forget landmarks; `holes` are filled from `movers`, as the covariance has done (`Covariance.drop`)."""
         for i in ids.tolist():
             del self._slots[i]
         left = len(self) - len(ids)
-        for array in (self.ids, self.charts, self.state, self.points):
+        for array in (self.ids, self.charts, self.state, self.points, self.by_world):
             array[holes] = array[movers]
         self._slots.update(zip(self.ids[holes].tolist(), holes.tolist()))
         self.ids, self.charts = self.ids[:left], self.charts[:left]
         self.state, self.points = self.state[:left], self.points[:left]
+        self.by_world = self.by_world[:left]
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""
         self.state = self.state + change
         self.points = self.coordinates.points(self.charts, self.state)
+
+    def refer(self, slots: SlotArray) -> Array:
+        """Let `by_world` be that of the present coordinates; returns the change (M, 3, 6)."""
+        now = self._derivatives(self.charts[slots], self.state[slots], self.points[slots])[1]
+        change = now - self.by_world[slots]
+        self.by_world[slots] = now
+        return np.asarray(change)
+
+    def _derivatives(self, charts: Array, c: Array, points: Array) -> tuple[Array, Array]:
+        """Derivatives of coordinates c by the positions (M, 3, 3), and by a displacement of the world (M, 3, 6)."""
+        inverse = np.linalg.inv(self.coordinates.jacobian(charts, c))
+        return inverse, np.concatenate([inverse, -inverse @ hat(points)], axis=2)
 
     def jacobian(self, slots: SlotArray) -> Array:
         """Derivatives (M, 3, 3) of positions by coordinates."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -12,10 +12,12 @@ from backends.ekf.landmarks import Coordinates
 from slam.data import BoolArray
 from slam.euler import body_rate_matrix
 from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.se3 import Array, hat
 
-#: ``(a × b)_k = Σ a_i b_j CROSS[3 i + j, k]``
-_CROSS = np.array([[np.cross(a, b) for b in np.eye(3)] for a in np.eye(3)]).reshape(9, 3)
+#: ``hat(h) = Σ h_k _HAT[k]``
+_HAT = hat(np.eye(3))
+
+_BY_POSE = np.array([-1.0, -1, -1, 1, 1, 1])  # the camera's position counts with opposite sign
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,14 @@ class Linearisation:
         return self.by_relative[..., :3]
 
     @property
-    def by_angles(self) -> Array:
-        """Derivatives (M, K, 3) by the angles φ."""
-        return self.by_relative[..., 3:]
+    def by_pose(self) -> Array:
+        """Derivatives (M, K, 6) by the camera's [r, φ]."""
+        return np.asarray(self.by_relative * _BY_POSE)
+
+    @property
+    def own(self) -> Array:
+        """Derivatives (M, K, 3) by the landmark's own coordinates."""
+        return self.by_point if self.by_landmark is None else self.by_landmark
 
 
 class Measurement(Protocol):
@@ -78,9 +85,8 @@ class StereoMeasurement:
     def linearise(self, x: Array) -> Linearisation:
         """The same with derivatives."""
         h, R = self._local(x)
-        line = chained(*self.rig.project_stereo(h), h, R, x[3:6])
         D = self.coordinates.jacobian(self.charts, x[6:].reshape(-1, 3))
-        return replace(line, by_landmark=line.by_point @ D)
+        return chained(*self.rig.project_stereo(h), h, R, x[3:6], D)
 
     def _local(self, x: Array) -> tuple[Array, Array]:
         """Landmarks ``h = Rᵀ (Y − r)`` (M, 3) in camera coordinates (paper B, Eqs. 3-5), and R (3, 3)."""
@@ -88,44 +94,44 @@ class StereoMeasurement:
         return (self.coordinates.points(self.charts, x[6:].reshape(-1, 3)) - x[:3]) @ R, R
 
 
-def chained(z: Array, J: Array, h: Array, R: Array, phi: Array) -> Linearisation:
-    """Predicted components z (M, K) with derivatives J (M, K, 3) by the points h (M, 3) in camera coordinates."""
-    out = np.empty((J.size // 3, 6))
-    out[:, :3] = J.reshape(-1, 3) @ R.T
-    # Turning the camera by δθ = E(φ) δφ about its own axes moves h by h × δθ, so z by (J × h) E δφ.
-    products = J[..., :, None] * h[:, None, None, :]
-    out[:, 3:] = products.reshape(-1, 9) @ (_CROSS @ body_rate_matrix(phi))
-    return Linearisation(z, out.reshape(*J.shape[:2], 6))
+def chained(z: Array, J: Array, h: Array, R: Array, phi: Array, D: Array) -> Linearisation:
+    """Predicted components z (M, K) with derivatives J (M, K, 3) by the points h (M, 3) in camera coordinates.
+
+    D (M, 3, 3) are derivatives of the landmarks' positions by their own coordinates.
+    """
+    out = np.empty((*J.shape[:2], 6))
+    out[..., :3] = J @ R.T
+    # Turning the camera by δθ = E(φ) δφ about its own axes moves h by h × δθ.
+    turned = h @ (_HAT @ body_rate_matrix(phi)).reshape(3, 9)
+    out[..., 3:] = J @ turned.reshape(-1, 3, 3)
+    return Linearisation(z, out, out[..., :3] @ D)
 
 
-def innovation_covariances(J: Array, pose: Array, cross: Array, blocks: Array, sigma: float) -> Array:
+def innovation_covariances(line: Linearisation, pose: Array, cross: Array, blocks: Array, sigma: float) -> Array:
     """Covariances (M, K, K) [px²] of each landmark's innovation by itself, measurement noise included.
 
     Args:
-        J: derivatives (M, K, 6) of the measurements by [Y − r, φ].
+        line: derivatives of the measurements.
         pose: covariance (6, 6) of [r, φ].
-        cross: covariances (M, 3, 6) of the landmarks with it.
-        blocks: covariances (M, 3, 3) of the landmarks.
+        cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
+        blocks: covariances (M, 3, 3) of these coordinates.
         sigma: pixel noise [px].
     """
-    relative = np.empty((len(blocks), 6, 6))  # covariance of [Y − r, φ]: all that a measurement depends on
-    by_r = cross[:, :, :3]
-    relative[:, :3, :3] = blocks - by_r - by_r.transpose(0, 2, 1) + pose[:3, :3]
-    relative[:, :3, 3:] = cross[:, :, 3:] - pose[:3, 3:]
-    relative[:, 3:, :3] = relative[:, :3, 3:].transpose(0, 2, 1)
-    relative[:, 3:, 3:] = pose[3:, 3:]
-    return J @ relative @ J.transpose(0, 2, 1) + sigma**2 * np.eye(J.shape[1])
+    A, B = line.by_pose, line.own
+    At = A.transpose(0, 2, 1)
+    S = (A @ pose + 2 * (B @ cross)) @ At
+    S = 0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1)
+    return np.asarray(S + sigma**2 * np.eye(S.shape[1]))
 
 
 def stacked(line: Linearisation, rows: BoolArray) -> Array:
     """The dense Jacobian (3M, 6 + 3M) by [r, φ, landmarks]; zero where a row is not measured (mask (M, 3))."""
     m = len(line.z)
-    J = line.by_relative
-    own = line.by_point if line.by_landmark is None else line.by_landmark
+    J, own = line.by_pose, line.own
     if not rows.all():
         J, own = np.where(rows[:, :, None], J, 0.0), np.where(rows[:, :, None], own, 0.0)
     H = np.zeros((m, 3, 2 + m, 3))
-    H[:, :, 0], H[:, :, 1] = -J[..., :3], J[..., 3:]
+    H[:, :, :2] = J.reshape(m, 3, 2, 3)
     landmark = np.arange(m)
     H[landmark, :, 2 + landmark] = own
     return H.reshape(3 * m, 6 + 3 * m)

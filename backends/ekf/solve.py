@@ -9,8 +9,9 @@ A component that is not measured (or gated) keeps its row with a zero Jacobian a
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
@@ -18,7 +19,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.ekf.measurement import Linearisation, Measurement, stacked
 from slam.data import BoolArray
-from slam.gating import chi_square_gate, chi_square_limits, squared_distances
+from slam.gating import chi_square_limits
 from slam.se3 import Array
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -28,6 +29,9 @@ from slam.se3 import Array
 #: the NEES of 1.0). But a long step, or the first frames of a fast camera, cannot do without.
 _LINEAR = 1.0
 _HALVINGS = 6  # of a step that does not lower the cost
+
+_LATER = np.maximum(np.arange(3)[:, None], np.arange(3))  # row of an entry in the lower triangle of a symmetric block
+_EARLIER = np.minimum(np.arange(3)[:, None], np.arange(3))
 
 
 class UnsolvableError(ArithmeticError):
@@ -69,7 +73,7 @@ class Solution:
         B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K) in Fortran order: the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
         nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
-        iterations: linearisations made.
+        at_prior: whether it is linearised at the prior.
     """
 
     used: BoolArray
@@ -77,7 +81,7 @@ class Solution:
     B: Array
     nis: float
     distances: Array
-    iterations: int
+    at_prior: bool
 
 
 @dataclass(frozen=True)
@@ -106,9 +110,13 @@ class _System:
 
 @dataclass(frozen=True)
 class Gated:
-    """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`."""
+    """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`.
+
+    The limits (M,) are the gate's, of a squared distance.
+    """
 
     used: BoolArray
+    limits: Array
     start: _Iterate
     system: _System
 
@@ -121,15 +129,19 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     """
     if not (np.isfinite(problem.prior).all() and np.isfinite(problem.covariance).all()):
         raise UnsolvableError("the predicted state is not finite")
-    s = _towards_guess(problem) if at_guess else np.zeros(len(problem.prior))
-    change = problem.covariance @ s
+    s: Array = np.zeros(len(problem.prior))
+    change = s
+    if at_guess:
+        s = _towards_guess(problem)
+        change = problem.covariance @ s
     line = problem.model.linearise(problem.prior + change)
     start = _Iterate(s, change, line.z, np.inf)
-    rows = np.isfinite(problem.z) & np.isfinite(line.z).all(axis=1, keepdims=True)
-    system = _system(problem, rows, start, line)
-    nu = np.where(rows, system.nu.reshape(-1, 3), np.nan)
-    used = chi_square_gate(nu, _diagonal_blocks(system.S), problem.gate_probability)
-    return Gated(used, start, system)
+    measured = np.isfinite(problem.z)
+    visible = np.asarray(np.isfinite(line.z).all(axis=1))
+    system = _system(problem, measured & visible[:, None], start, line)
+    limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
+    used = visible & (_squared_distances(system.nu, _diagonal_blocks(system.S)) <= limits)
+    return Gated(used, limits, start, system)
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
@@ -145,10 +157,9 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
         UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
     """
     used = gated.used
-    limits = chi_square_limits(np.isfinite(problem.z).sum(axis=1), problem.gate_probability)
     while used.any():
         solution = _iterate(problem, used, gated.start, gated.system if used.all() else None)
-        excess = solution.distances / limits
+        excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
             return solution
@@ -163,8 +174,8 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
     """
-    rows = np.isfinite(problem.z) & used[:, None]
-    now = replace(start, cost=_cost(problem, rows, start.z, float(start.s @ start.change)))
+    rows = first.rows if first else np.isfinite(problem.z) & used[:, None]
+    now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
     system = first or _system(problem, rows, now)
     for iteration in range(1, problem.iterations + 1):
         y = _solved(system)
@@ -184,11 +195,13 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
             break
         now, system = following, _system(problem, rows, following)
     B = dtrsm(1.0, system.L, system.H.T, side=1, lower=1, trans_a=1)
-    if not (problem.covariance.diagonal()[:6] > np.square(problem.covariance[:6] @ B).sum(axis=1)).all():
+    reduction = problem.covariance[:6] @ B
+    if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
-    flat = rows.reshape(-1)
-    B = B if flat.all() else np.asfortranarray(B[:, flat])
-    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y), iteration)
+    measured = rows.reshape(-1)
+    B = B if measured.all() else np.asfortranarray(B[:, measured])
+    at_prior = iteration == 1 and not start.s.any()
+    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y), at_prior)
 
 
 def _solved(system: _System) -> Array:
@@ -203,9 +216,9 @@ def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterat
 
 
 def _cost(problem: Problem, rows: BoolArray, z: Array, prior_cost: float) -> float:
-    residual = (problem.z - z)[rows]
-    cost = prior_cost + float(residual @ residual) / problem.sigma**2
-    return cost if np.isfinite(cost) else np.inf
+    residual = np.where(rows, problem.z - z, 0.0)
+    cost = prior_cost + float(np.vdot(residual, residual)) / problem.sigma**2
+    return cost if math.isfinite(cost) else math.inf
 
 
 def _towards_guess(problem: Problem) -> Array:
@@ -238,7 +251,9 @@ def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) ->
 def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
     line = line or problem.model.linearise(problem.prior + now.change)
     H = stacked(line, rows)
-    nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1) + H @ now.change
+    nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
+    if now.change.any():
+        nu += H @ now.change
     S = H @ problem.covariance @ H.T
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
     L, info = dpotrf(S.T, lower=1, clean=0)  # S is symmetric: its transpose is in the order that LAPACK wants
@@ -254,10 +269,20 @@ def _conditional_distances(system: _System, y: Array) -> Array:
     ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0.
     """
     inverse, _ = dpotri(system.L, lower=1)
-    return squared_distances(y.reshape(-1, 3), _diagonal_blocks(inverse))
+    return _squared_distances(y, _diagonal_blocks(inverse))
 
 
-def _diagonal_blocks(matrix: Array) -> Array:
-    """The (M, 3, 3) blocks on the diagonal of a (3M, 3M) matrix."""
-    own = np.arange(len(matrix)).reshape(-1, 3)
-    return matrix[own[:, :, None], own[:, None, :]]
+def _squared_distances(nu: Array, covariances: Array) -> Array:
+    """``ν_jᵀ S_j⁻¹ ν_j`` (M,) for the parts ν_j of ν (3M,) and positive definite S_j (M, 3, 3)."""
+    nu = nu.reshape(-1, 3)
+    try:
+        whitened = np.linalg.solve(covariances, nu[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        raise UnsolvableError("the innovation covariance is not positive definite") from None
+    return np.asarray((whitened * nu).sum(axis=1))
+
+
+def _diagonal_blocks(lower: Array) -> Array:
+    """The (M, 3, 3) blocks on the diagonal of a symmetric (3M, 3M) matrix, by its lower triangle."""
+    first = np.arange(0, len(lower), 3)[:, None, None]
+    return lower[first + _LATER, first + _EARLIER]

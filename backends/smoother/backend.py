@@ -24,7 +24,6 @@ from backends.smoother.prediction import (
 )
 from backends.smoother.records import IndexArray, Records
 from backends.smoother.stereo import RectifiedStereo
-from backends.smoother.uncertainty import quadratic
 from slam.blas import one_blas_thread
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
@@ -74,7 +73,7 @@ class SmootherBackend:
 
     @property
     def solver_seconds(self) -> float:
-        """CPU time spent in gtsam so far [s]: the least that this back end could cost; all else is overhead."""
+        """CPU time spent in gtsam's solvers so far [s]: the least this back end could cost; the rest is overhead."""
         return self._graph.solver_seconds
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -145,9 +144,11 @@ class SmootherBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
+        if landmarks and self._predicted is None:
+            self._graph.settle()
         window, marks = self._graph.window(), self.records.landmarks
         slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
-        covariances = quadratic(self._graph.landmarks_by_window(slots), window.covariance) + marks.covariance[slots]
+        covariances = self._graph.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
         if self._predicted is not None:
             stamp, T, P = self._predicted.stamp, self._predicted.T.copy(), self._predicted.covariance
         else:
@@ -164,7 +165,8 @@ class SmootherBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
         self._commit()
-        return Trajectory(self.records.path.stamps.copy(), self._graph.settled_poses())
+        self._graph.settle()
+        return Trajectory(self.records.path.stamps.copy(), self.records.path.poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -183,6 +185,17 @@ class SmootherBackend:
         self._require_new(ids)
         self._commit()
         self._graph.add_known(ids, local, covariances, self.records.path.count - 1)
+
+    # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
+
+    @one_blas_thread
+    def shift_right(self, shift: float) -> None:
+        """See `slam.interfaces.RevisingBackend.shift_right`: all is solved anew, as long as a run of so many frames."""
+        if not np.isfinite(shift):
+            raise MeasurementError(f"smoother: shift must be finite, got {shift}")
+        self._commit()
+        if self.records.measurements.count:
+            self._graph.shift_right(float(shift))
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
@@ -228,12 +241,17 @@ class SmootherBackend:
         _, J = self._stereo.project(points.local)
         noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
         known = self.records.landmarks.prior[slots].any()  # what is known in the world does not move with the poses
-        information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to_last)
+        information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to(self._last_measured()))
         problem = pose_only.PoseProblem(
             self._stereo, self.records.landmarks.position[slots], z, noise, predicted.T, information,
             self.models.gate_probability,
         )  # fmt: skip
         return pose_only.solve(problem, predicted.T if guess is None else guess)
+
+    def _last_measured(self) -> int:
+        """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""
+        frames, measured = self._graph.window().frames, self.records.path.measured
+        return int(np.searchsorted(frames, measured[-1])) if measured else len(frames) - 1
 
     def _require_started(self, what: str) -> None:
         if not self.records.path.count and self._predicted is None:

@@ -18,7 +18,8 @@ class SmootherConfig:
             `track` and twice that, so that no frame finishes them all.
         explicit: how many landmarks in view at most become variables of their own when their smart factor is finished;
             they tie the trajectory together over any time. The others go on in a new smart factor.
-        relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately.
+        relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately: in
+            every tenth frame; ten times as much in the others, next to nothing when the whole path or map is asked for.
         window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
         lag: poses that stay variables; None for all.
 
@@ -28,7 +29,7 @@ class SmootherConfig:
 
     track: int = 10
     explicit: int = 300
-    relinearise: float = 0.1
+    relinearise: float = 0.01
     window: int = 12
     lag: int | None = None
 

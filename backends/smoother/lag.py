@@ -6,9 +6,14 @@ afterwards, and the smart factors that hold a leaving pose are finished first.
 
 from __future__ import annotations
 
+import numpy as np
+
 from backends.smoother.records import Records
 from backends.smoother.solver import Change
 from backends.smoother.variables import pose_key
+
+#: For poses to leave, all that stays is eliminated anew. So many leave together: the lag over this.
+_SHARE = 4
 
 
 class FixedLag:
@@ -17,15 +22,17 @@ class FixedLag:
     Args:
         records: what is on record.
         lag: so many of the newest poses stay.
+        landmarks: so many landmark variables stay, as long as they are in the map; those last measured go last.
 
     Attributes:
         first: frame of the oldest pose that is a variable.
     """
 
-    def __init__(self, records: Records, lag: int) -> None:
+    def __init__(self, records: Records, lag: int, landmarks: int) -> None:
         self.first = 0
         self._records = records
         self._lag = lag
+        self._most = landmarks
         self._landmarks: set[int] = set()
 
     def restart(self) -> None:
@@ -39,8 +46,8 @@ class FixedLag:
 
     def advance(self, change: Change) -> None:
         """Put what leaves with the newest pose, and what stays, into the change; that pose is on record already."""
-        first = max(0, self._records.path.count - self._lag)
-        if first <= self.first:
+        first = self._records.path.count - self._lag
+        if first < self.first + max(1, self._lag // _SHARE):
             return
         self._finish_tracks(first)
         gone = self._landmarks_before(first)
@@ -58,10 +65,13 @@ class FixedLag:
                 self._records.finish(track)
 
     def _landmarks_before(self, first: int) -> list[int]:
-        """Landmark variables that were last measured before frame `first`; their landmarks have none any more."""
+        """Variables to leave, last measured before frame `first`: of landmarks not in the map any more, and surplus."""
         frame, marks = self._records.measurements.frame, self._records.landmarks
         explicit = self._records.history.explicit
-        gone = sorted(key for key in self._landmarks.intersection(explicit) if frame[explicit[key][-1]] < first)
-        for key in gone:
-            marks.variable[marks.variable == key] = -1
+        last = {key: int(frame[explicit[key][-1]]) for key in self._landmarks.intersection(explicit)}
+        mapped = set(marks.variable[marks.variable >= 0].tolist())
+        old = sorted((key for key, k in last.items() if k < first), key=lambda key: (key in mapped, last[key], key))
+        erased = sum(key not in mapped for key in old)
+        gone = old[: max(erased, len(self._landmarks) - self._most)]
+        marks.variable[np.isin(marks.variable, gone)] = -1
         return gone

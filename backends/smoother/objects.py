@@ -254,8 +254,8 @@ def _cameras(frames: IndexArray, path: Path, known: PoseSet) -> CameraWindow:
     poses = path.poses[frames]
     J = np.zeros((len(frames), 6, len(known), 6))
     for i, (frame, X) in enumerate(zip(frames.tolist(), poses)):
-        at = max(0, frame - int(known.frames[0]))
-        J[i, :, at] = np.eye(6) if frame >= known.frames[0] else adjoint(inverse(X) @ known.poses[0])
+        at = max(0, int(np.searchsorted(known.frames, frame, side="right")) - 1)
+        J[i, :, at] = np.eye(6) if frame == known.frames[at] else adjoint(inverse(X) @ known.poses[at])
     flat = J.reshape(6 * len(frames), -1)
     return CameraWindow(poses, flat @ known.covariance @ flat.T + _JITTER * np.eye(len(flat)))
 

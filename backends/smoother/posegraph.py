@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import suppress
 
 import numpy as np
@@ -9,21 +10,17 @@ import numpy as np
 from backends.smoother import uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import FactorMaker, to_pose3
+from backends.smoother.growth import Growth
 from backends.smoother.lag import FixedLag
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
-from backends.smoother.records import IndexArray, Known, Records, Track
+from backends.smoother.records import IndexArray, Known, Records
 from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.uncertainty import PoseSet, WindowJacobians
-from backends.smoother.variables import landmark_key, landmark_threshold, pose_key, thresholds
+from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray
+from slam.gating import chi_square_gate
 from slam.se3 import Array, transform
-
-#: A landmark unseen for so many frames is seen again: a smart factor over the gap would touch all poses between.
-_GAP = 20
-
-#: Landmarks seen within so many frames are likely to be seen again.
-_LATE = 60
 
 #: What lies before the window is read back when the window's oldest pose has been revised by so much [m, or sine].
 _STALE = 0.005
@@ -32,13 +29,20 @@ _STALE = 0.005
 #: so many times as large.
 _SELDOM, _AT_ONCE = 0.01, 20
 
+#: Each time a variable is linearised anew, all that was seen since it was first seen is eliminated again, so it is done
+#: for many together: every so many frames. What is off by so many times as much is not left to wait.
+_EVERY, _OFF = 10, 10.0
+
+#: Steps that take landmarks to where their mended measurements put them.
+_REFINED = 3
+
+#: The last word on all poses and landmarks is linearised to within so much [px].
+_LAST = 1e-4
+_ROUNDS = 6
+
 
 class PoseGraph:
-    """Poses, landmarks and their factors in ISAM2.
-
-    A landmark is a smart factor that grows with each measurement. When its track is long enough the factor is
-    finished: the landmark becomes a variable with a factor for each measurement, as long as few of those in view are,
-    or else goes on in a new smart factor. No measurement is ever used twice.
+    """Poses, landmarks and their factors in ISAM2. Which factors: see `backends.smoother.growth`.
 
     Args:
         make: makes the factors.
@@ -52,9 +56,15 @@ class PoseGraph:
         self.records = Records()
         self._make = make
         self._config = config
-        self._thresholds = thresholds(make.stereo, config.relinearise)
-        self._solver = Solver(self._thresholds)
-        self._lag = None if config.lag is None else FixedLag(self.records, config.lag)
+        self._lag = None if config.lag is None else FixedLag(self.records, config.lag, config.explicit)
+        self._growth = Growth(make, config, self.records, self._lag)
+        self._often, self._seldom, self._last = (
+            thresholds(make.stereo, config.relinearise, share) for share in (_OFF, 1.0, _LAST / config.relinearise)
+        )
+        self._solver = Solver(self._seldom)
+        self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
+        self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
+        self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
         self._settled = 0  # number of frames then
         self._window: PoseSet | None = None  # of the present state; None while it has not been asked for
@@ -63,8 +73,8 @@ class PoseGraph:
 
     @property
     def solver_seconds(self) -> float:
-        """CPU time spent in the incremental solver since it was last made anew."""
-        return self._solver.seconds
+        """CPU time spent in gtsam's solvers [s]."""
+        return self._seconds + self._solver.seconds
 
     def append_pose(self, stamp: float, T_world_left: Array) -> None:
         """Add a frame without measurements."""
@@ -93,7 +103,7 @@ class PoseGraph:
         self.records.path.append(stamp, T_world_left)
         rows = self.records.measurements.append(z, frame, marks.serial[slots])
         change = self._change()
-        grown = self._grow(change, slots, rows, z)
+        grown = self._growth.grow(change, slots, rows, z)
         try:
             try:
                 new = self._enter_pose(change, impulse)
@@ -106,11 +116,14 @@ class PoseGraph:
             self._recover()
             return str(error)
         marks.measured(slots, rows, frame)
+        self.records.path.note_measured()
         try:
             self._read_back(slots)
+            if self._diverged(slots, z):
+                self._rebuild()
         except SolverError:
             self._recover()
-        self._finish_tracks(slots)
+        self._growth.finish_tracks(slots)
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
@@ -120,6 +133,7 @@ class PoseGraph:
         slots = marks.add(ids, transform(path.poses[-1], local), frame, limits)
         rows = self.records.measurements.append(z, frame, marks.serial[slots])
         marks.measured(slots, rows, frame)
+        path.note_measured()
         key = pose_key(frame)
         for slot, row, zi in zip(slots.tolist(), rows.tolist(), z.tolist()):
             marks.tracks[slot].append(row, self._make.point(zi), key, stereo=True)
@@ -139,6 +153,7 @@ class PoseGraph:
             marks.mean[slots], marks.prior[slots] = positions, information
         else:
             marks.older[slots] = information
+            path.note_measured()
         for serial, position, covariance in zip(marks.serial[slots].tolist(), positions, covariances):
             self.records.history.known[serial] = Known(position.copy(), covariance.copy(), frame)
         self._carried = None
@@ -150,11 +165,19 @@ class PoseGraph:
             self.records.finish(marks.tracks[slot])
         marks.remove(slots)
 
+    def shift_right(self, shift: float) -> None:
+        """Move all right pixels by `shift` [px] and solve anew."""
+        marks = self.records.landmarks
+        self.records.shift_right(shift, self._make.point)
+        self._recover()
+        for _ in range(_REFINED):
+            self._place(marks.used())
+
     def window(self) -> PoseSet:
         """The newest poses with their joint covariance; computed once per state."""
         if self._window is None:
             count = self.records.path.count
-            frames = np.arange(max(0, count - self._config.window), count)
+            frames = np.array(self._growth.newest(), np.intp)
             P = self._joint_covariance(frames) if count else np.zeros((0, 0))
             self._window = PoseSet(frames, self.records.path.poses[frames], P)
             self._last_window = self._window if count else None
@@ -179,15 +202,39 @@ class PoseGraph:
             self._carried = WindowJacobians(window, len(marks.ids))
         return self._carried.of(self.records.measurements, marks, slots)
 
-    def settled_poses(self) -> Array:
-        """All poses (F, 4, 4) as the solver has them now; those on record may lag a little behind."""
+    def landmark_covariances(self, slots: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmark positions.
+
+        From the solver where it has them at hand: of variables that were measured lately. Those of others take what is
+        older than the window to move with its oldest pose, which makes them a little too large.
+        """
+        marks = self.records.landmarks
+        P = uncertainty.quadratic(self.landmarks_by_window(slots), self.window().covariance) + marks.covariance[slots]
+        variables = marks.variable[slots].tolist()
         try:
-            return self._solved_poses()
+            exact = self._solver.point_covariances(variables, pose_key(self.records.path.count - 1))
         except SolverError:
             self._recover()
-            return self.records.path.poses.copy()
+            return P
+        for row, key in enumerate(variables):
+            if key in exact:
+                P[row] = exact[key]
+        return P
 
     def settle(self) -> None:
+        """Solve to the last: every variable is linearised anew where it stands until nothing moves any more."""
+        if self._solved:
+            return
+        try:
+            change = Change()
+            self._growth.eliminate_late(change)
+            self._solver.settle(change, self._last, _ROUNDS)
+            self._read_all()
+        except SolverError:
+            self._recover()
+        self._solved, self._window = True, None
+
+    def _read_all(self) -> None:
         """Bring all poses and landmarks on record up to what the solver has."""
         path = self.records.path
         if path.count:
@@ -219,109 +266,12 @@ class PoseGraph:
         path = self.records.path
         i = path.count - 1
         if i >= 3:
-            self._eliminate_late(change)
+            self._growth.eliminate_late(change)
         self.records.history.impulses.append(impulse)
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
         change.factors.add(pose_factor(self._make, path, i, impulse))
-        self._window = None
-        return self._solver.update(change)
-
-    def _eliminate_late(self, change: Change) -> None:
-        """Have the landmarks of late eliminated late, and the newest poses last."""
-        marks, frame = self.records.landmarks, self.records.path.count - 1
-        landmarks, poses = change.late
-        poses.update(pose_key(i) for i in range(max(0, frame + 1 - self._config.window), frame + 1))
-        recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
-        landmarks.update(marks.variable[recent].tolist())
-
-    def _grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> list[tuple[Track, int]]:
-        """Put measurements into factors; returns tracks with the places of their new smart factors in the change."""
-        make, marks, frame = self._make, self.records.landmarks, self.records.path.count - 1
-        key, explicit = pose_key(frame), self.records.history.explicit
-        self._enter_known(change, slots)
-        variables, again = marks.variable[slots], (frame - marks.last[slots] > _GAP).tolist()
-        room = self._config.explicit - int((variables >= 0).sum())
-        grown = []
-        columns = (slots.tolist(), variables.tolist(), rows.tolist(), z.tolist(), np.isfinite(z[:, 2]).tolist(), again)
-        for slot, variable, row, zi, stereo, long_unseen in zip(*columns):
-            point = make.point(zi)
-            if variable >= 0:
-                explicit[variable].append(row)
-                change.factors.add(make.explicit(point, key, variable))
-                continue
-            track = marks.tracks[slot]
-            if long_unseen and room <= 0:
-                self.records.finish(track)
-            track.append(row, point, key, stereo)
-            if not track.informative:
-                continue
-            if track.factor >= 0:
-                change.removed.append(track.factor)
-            change.late[1].update(track.keys)
-            if (long_unseen or len(track) >= track.limit) and room > 0 and self._well_known(slot):
-                room -= 1
-                self._make_variable(change, slot, track)
-                continue
-            grown.append((track, change.factors.size()))
-            change.factors.add(make.smart(track.points, track.keys))
-        return grown
-
-    def _well_known(self, slot: int) -> bool:
-        """Whether a landmark's position is known to a tenth of its distance: else it is no good as a variable."""
-        marks = self.records.landmarks
-        offset = marks.position[slot] - self.records.path.poses[-1][:3, 3]
-        return bool(np.trace(marks.covariance[slot]) < 0.01 * (offset @ offset))
-
-    def _make_variable(self, change: Change, slot: int, track: Track) -> None:
-        """Give a landmark a variable of its own, with all that its track holds."""
-        key = self._new_variable(change, slot)
-        self.records.history.explicit[key] = track.rows
-        for point, pose in zip(track.points, track.keys):
-            change.factors.add(self._make.explicit(point, pose, key))
-        track.restart()
-
-    def _known(self, slot: int) -> Known | None:
-        """What was known of a landmark beforehand, as long as what it hangs on is in the solver."""
-        known = self.records.history.known.get(int(self.records.landmarks.serial[slot]))
-        gone = known is not None and known.frame is not None and self._lag is not None and known.frame < self._lag.first
-        return None if gone else known
-
-    def _enter_known(self, change: Change, slots: IndexArray) -> None:
-        """Give landmarks that were known beforehand variables of their own, where they have none yet."""
-        if not self.records.history.known:
-            return
-        marks = self.records.landmarks
-        for slot in slots[marks.variable[slots] < 0].tolist():
-            known = self._known(slot)
-            if known is None or len(marks.tracks[slot]):
-                continue
-            key = self._new_variable(change, slot)
-            change.factors.add(self._make.known(key, known))
-            if known.frame is not None:
-                change.late[1].add(pose_key(known.frame))
-            self.records.history.explicit[key] = []
-
-    def _new_variable(self, change: Change, slot: int) -> int:
-        """A variable for a landmark, placed where the landmark is believed to be."""
-        history, marks = self.records.history, self.records.landmarks
-        place = marks.position[slot].copy()
-        distance = float(np.linalg.norm(place - self.records.path.poses[-1][:3, 3]))
-        threshold = landmark_threshold(self._make.stereo, distance, self._config.relinearise)
-        key = landmark_key(history.variables, threshold)
-        history.variables += 1
-        marks.variable[slot], history.places[key] = key, place
-        change.values.insert(key, place)
-        if self._lag is not None:
-            self._lag.enter(key)
-        return key
-
-    def _finish_tracks(self, slots: IndexArray) -> None:
-        """Finish the smart factors that are long enough."""
-        marks = self.records.landmarks
-        for slot in slots[marks.variable[slots] < 0].tolist():
-            track = marks.tracks[slot]
-            if len(track.rows) >= track.limit:
-                self.records.finish(track)
+        self._window, self._solved = None, False
+        return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
 
     # --- the way back from the solver ---
 
@@ -338,7 +288,7 @@ class PoseGraph:
         self._moved += float(np.abs(path.poses[first] - before).max())
         waited = path.count - self._settled >= _SELDOM * path.count
         if self._moved > (_STALE if waited else _AT_ONCE * _STALE):
-            self.settle()
+            self._read_all()
         else:
             self._place(slots)
 
@@ -371,6 +321,21 @@ class PoseGraph:
 
     # --- failures ---
 
+    def _diverged(self, slots: IndexArray, z: Array) -> bool:
+        """Whether most of the newest measurements would not pass the gate any more: ISAM2 steps without looking.
+
+        Solving all anew takes long, so it is not said twice in a few frames.
+        """
+        T, marks = self.records.path.poses[-1], self.records.landmarks
+        if self.records.path.count < self._rebuilt + _EVERY:
+            return False
+        h, _ = self._make.stereo.project((marks.position[slots] - T[:3, 3]) @ T[:3, :3])
+        passed = chi_square_gate(z - h, self._noise(len(z)), self._make.models.gate_probability)
+        return 2 * int(passed.sum()) < len(z)
+
+    def _noise(self, count: int) -> Array:
+        return np.broadcast_to(self._make.sigma**2 * np.eye(3), (count, 3, 3))
+
     def _recover(self) -> None:
         """Rebuild; where the problem has no solution, as it stands; where not even that, without what was measured.
 
@@ -390,15 +355,20 @@ class PoseGraph:
             SolverError: that cannot be solved either.
         """
         change, places = whole_problem(self._make, self.records)
-        if solved:
-            change.values = optimise(change)
-        solver = Solver(self._thresholds)
+        start = time.process_time()
+        try:
+            if solved:
+                change.values = optimise(change)
+        finally:
+            self._seconds += time.process_time() - start
+        solver = Solver(self._seldom)
         new = solver.update(change)
         for track in self.records.landmarks.tracks.values():
             track.factor = -1
         for track, place in places:
             track.factor = new[place]
-        self._solver, self._window = solver, None
+        self._seconds += self._solver.seconds
+        self._solver, self._window, self._rebuilt = solver, None, self.records.path.count
         if self._lag is not None:
             self._lag.restart()
-        self.settle()
+        self._read_all()

@@ -38,13 +38,12 @@ class PredictedPose:
         """Covariance (6, 6)."""
         return self.by_window @ self.window.covariance @ self.by_window.T + self.noise
 
-    @property
-    def covariance_to_last(self) -> Array:
-        """Covariance (6, 6) where the last pose is known: what all poses have in common moves the landmarks too."""
+    def covariance_to(self, place: int) -> Array:
+        """Covariance (6, 6) where one pose of the window is known: what all have in common moves the landmarks too."""
         if not len(self.window):
             return self.noise
         J = self.by_window.copy()
-        J[:, -6:] -= adjoint(inverse(self.T) @ self.window.poses[-1])
+        J[:, 6 * place : 6 * place + 6] -= adjoint(inverse(self.T) @ self.window.poses[place])
         return J @ self.window.covariance @ J.T + self.noise
 
 
@@ -86,7 +85,7 @@ def carried_covariance(models: EstimatorModels, path: Path, known: PoseSet | Non
         carry = np.concatenate([np.eye(6 * len(known)), one.by_window])
         P = carry @ known.covariance @ carry.T
         P[-6:, -6:] += one.noise
-        known = PoseSet(np.append(known.frames, i), path.poses[: i + 1][-len(known) - 1 :], P)
+        known = PoseSet(np.append(known.frames, i), np.concatenate([known.poses, path.poses[i : i + 1]]), P)
     rows = np.concatenate([np.arange(6) + 6 * k for k in np.searchsorted(known.frames, frames)])
     return known.covariance[np.ix_(rows, rows)]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,10 +34,12 @@ class Path:
 
     Attributes:
         count: number of frames.
+        measured: those in which landmarks were measured, ascending.
     """
 
     def __init__(self) -> None:
         self.count = 0
+        self.measured: list[int] = []
         self._stamps = np.zeros(64)
         self._poses = np.zeros((64, 4, 4))
 
@@ -50,6 +52,20 @@ class Path:
     def poses(self) -> Array:
         """Poses (F, 4, 4); a view that may be written to."""
         return self._poses[: self.count]
+
+    def newest(self, most: int, first: int = 0) -> IndexArray:
+        """The two newest frames and before them those with measurements, from `first` on, at most so many together.
+
+        Landmarks hang on poses that measured them; over those in between they do not move.
+        """
+        older = [i for i in self.measured[-most:] if first <= i < self.count - 2]
+        recent = range(max(first, self.count - 2), self.count)
+        return np.array([*older[max(0, len(older) + len(recent) - most) :], *recent], np.intp)
+
+    def note_measured(self) -> None:
+        """Note that landmarks were measured in the newest frame."""
+        if not self.measured or self.measured[-1] < self.count - 1:
+            self.measured.append(self.count - 1)
 
     def upto(self, count: int) -> Path:
         """The first `count` frames; they share their memory with this."""
@@ -325,6 +341,14 @@ class Records:
         if not known and not np.isfinite(self.measurements.z[rows, 2]).any():
             del self.history.explicit[variable], self.history.places[variable]
             self.landmarks.variable[slot] = -1
+
+    def shift_right(self, shift: float, point: Callable[[list[float]], Any]) -> None:
+        """Move all right pixels by `shift`; `point` makes the solver's measurements of rows (uL, vL, uR)."""
+        self.measurements.z[:, 2] += shift
+        for track in self.landmarks.tracks.values():
+            track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
+        for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
+            self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
     def forget_measurements(self) -> None:
         """Let all poses hang on each other as they are; landmarks stay where they are and are measured anew."""

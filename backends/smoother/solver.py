@@ -77,12 +77,18 @@ class Solver:
         self._isam = gtsam.ISAM2(parameters)
         self._guarded(lambda: self._isam.update(*_ballast()))
 
-    def update(self, change: Change) -> list[int]:
+    def update(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap | None = None) -> list[int]:
         """One step; returns the slots of the new factors, in their order.
+
+        Args:
+            change: what is new.
+            thresholds: how far each kind of variable may move from now on; None for the same as before.
 
         Raises:
             SolverError: gtsam failed. The solver is then broken and has to be made anew.
         """
+        if thresholds is not None:
+            self._isam.params().setRelinearizeThreshold(thresholds)  # gtsam hands out its own, not a copy
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = change.removed
         if change.leaving:
@@ -94,6 +100,20 @@ class Solver:
         if change.leaving:  # eliminated first of all, so they are leaves of the tree
             self._guarded(lambda: self._isam.marginalizeLeaves(_key_list(change.leaving)))
         return result.getNewFactorsIndices()
+
+    def settle(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
+        """Steps without anything new, at most so many, until no variable moves farther than by the thresholds.
+
+        Raises:
+            SolverError: gtsam failed.
+        """
+        self._isam.params().setRelinearizeThreshold(thresholds)
+        parameters = gtsam.ISAM2UpdateParams()
+        parameters.constrainedKeys = _groups(*change.late)
+        for _ in range(rounds):
+            result = self._guarded(lambda: self._isam.update(change.factors, change.values, parameters))
+            if not result.getVariablesRelinearized():
+                break
 
     def poses(self, keys: Iterable[int]) -> Array:
         """Pose variables (K, 4, 4)."""
@@ -116,6 +136,24 @@ class Solver:
         if not np.isfinite(P).all() or (np.diag(P) <= 0).any():
             raise SolverError("gtsam: a covariance is not finite and positive")
         return P
+
+    def point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+        """Covariances (3, 3) of those point variables that were eliminated together with the newest pose, or after it.
+
+        Raises:
+            SolverError: gtsam failed.
+        """
+        return self._guarded(lambda: self._point_covariances(keys, newest))
+
+    def _point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+        root = _root_of(self._isam, newest)
+        if root is None:
+            return {}
+        variables, R = root
+        starts = dict(zip(variables, np.cumsum([0, *map(size_of, variables)]).tolist()))
+        half = np.asarray(solve_triangular(R, np.eye(len(R))))
+        rows = {key: half[starts[key] : starts[key] + 3] for key in keys if key in starts}
+        return {key: part @ part.T for key, part in rows.items()}
 
     def _joint_covariance(self, keys: list[int]) -> Array:
         root = _root_of(self._isam, keys[-1])

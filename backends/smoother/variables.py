@@ -49,16 +49,18 @@ def landmark_threshold(stereo: RectifiedStereo, distance: float, error: float) -
     return distance * float(np.sqrt(error * distance / (stereo.f * stereo.baseline)))
 
 
-def thresholds(stereo: RectifiedStereo, error: float) -> gtsam.ISAM2ThresholdMap:
-    """How far each kind of variable may move before linearised pixels are off by about `error` [px].
+def thresholds(stereo: RectifiedStereo, error: float, share: float = 1.0) -> gtsam.ISAM2ThresholdMap:
+    """How far each kind of variable may move before linearised pixels are off by about `share` of `error` [px].
+
+    `error` is that of the landmarks' names (`landmark_threshold`).
 
     A turn by δ moves pixels near the centre by f δ, to within f δ² / 2; a step by δ those at depth z to within f δ²/z².
     """
-    turn = np.sqrt(2 * error / stereo.f)
-    step = _NEAR * stereo.baseline * np.sqrt(error / stereo.f)
+    turn = np.sqrt(2 * share * error / stereo.f)
+    step = _NEAR * stereo.baseline * np.sqrt(share * error / stereo.f)
     table = gtsam.ISAM2ThresholdMap()
     table.insert((_POSE, np.repeat([turn, step], 3)))
     table.insert((_BALLAST, np.ones(1)))
     for i, letter in enumerate(_LETTERS):
-        table.insert((letter, np.full(3, _FINEST * 2**i)))
+        table.insert((letter, np.full(3, np.sqrt(share) * _FINEST * 2**i)))
     return table

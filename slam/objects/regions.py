@@ -39,7 +39,7 @@ _SIZES = ((0.1, 0.2), (0.2, 0.4), (0.4, 0.8))  # of windows: directions (x/z, y/
 _OFFSETS = 0.5 * np.array(list(np.ndindex(2, 2, 2)))  # windows begin every half a width, along every axis
 _CELLS = 2**16  # more than there are windows along an axis
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
-_MOST = 6  # windows looked into in a frame
+_MOST = 20  # windows looked into for the next group
 
 
 @dataclass(frozen=True)
@@ -90,27 +90,37 @@ def judge_scene(moved: Displacements, place: Array, test: float, support: int) -
     problem = _Problem.of(moved)
     windows = _Windows.over(place, support)
     rest: BoolArray = np.ones(n, bool)
-    alone: Array = np.zeros(n)
     groups: list[Group] = []
-    for _ in range(_MOST):
-        common = problem.common_motion(rest)
-        alone = problem.squares(common)
+    while True:
+        alone = problem.squares(problem.common_motion(rest))
         scale = max(1.0, float(np.median(alone[rest])) / _MEDIAN)
         alone = alone / scale
-        found = _clearest(windows, problem, alone, scale, rest, test, support)
-        if found is None:
-            break
-        seeds, near = rest & windows.inside(found[0]), rest & windows.around(found[0], place)
-        common = problem.common_motion(rest & ~seeds)
-        members = _members(problem, seeds, near, problem.squares(common) / scale, scale, support)
-        if len(members) < support:
-            rest &= ~seeds  # nothing holds together there: judged no more
-            continue
-        groups.append(Group(members, found[1], problem.mean_gap(members, common)))
-        rest[members] = False
+        group = _next_group(problem, windows, place, alone, scale, rest, test, support)
+        if group is None:
+            return Scene(groups, alone)
+        groups.append(group)
+        rest[group.members] = False
         if rest.sum() < n / 3:
-            break
-    return Scene(groups, alone)
+            return Scene(groups, alone)
+
+
+def _next_group(
+    problem: _Problem, windows: _Windows, place: Array, alone: Array, scale: float, rest: BoolArray, test: float,
+    support: int,
+) -> Group | None:  # fmt: skip
+    """The group in the clearest window whose tracks hold together; None where there is none."""
+    doubted = ~rest
+    for window, value in _clearest(windows, problem, alone, scale, rest, test, support):
+        seeds = windows.inside(window) & ~doubted
+        if seeds.sum() < support:
+            continue
+        common = problem.common_motion(rest & ~seeds)
+        near = rest & windows.around(window, place)
+        members = _members(problem, seeds, near, problem.squares(common) / scale, scale, support)
+        if len(members) >= support:
+            return Group(members, value, problem.mean_gap(members, common))
+        doubted |= seeds
+    return None
 
 
 @dataclass(frozen=True)
@@ -202,15 +212,15 @@ class _Windows:
 
 def _clearest(
     windows: _Windows, problem: _Problem, alone: Array, scale: float, rest: BoolArray, test: float, support: int
-) -> tuple[int, float] | None:
-    """The window that differs most from the rest of the scene, and its χ²(6), if that is enough."""
+) -> list[tuple[int, float]]:
+    """Windows that differ enough from the rest of the scene, and their χ²(6), the clearest first."""
     weight = rest * np.minimum(1.0, _PULL / np.maximum(alone, 1e-9))
     size = windows.members @ rest.astype(float)
     asked = limit(test, size)
     most = windows.members @ (weight * alone)
     able = np.flatnonzero((size >= support) & (size <= _LARGEST * rest.sum()) & (most > asked))
     if not len(able):
-        return None
+        return []
     inside, share = windows.members[able], (weight / scale)[:, None]
     L, eta = share * problem.L, share * problem.eta
     total, total_eta = L.sum(axis=0).reshape(6, 6), eta.sum(axis=0)
@@ -220,8 +230,9 @@ def _clearest(
     gap = np.linalg.solve(Lw, eta_w[..., None]) - np.linalg.solve(Lr, (total_eta - eta_w)[..., None])
     both = Lw @ np.linalg.inv(total + 2 * _PRIOR) @ Lr
     values = (np.swapaxes(gap, 1, 2) @ both @ gap)[:, 0, 0]
-    best = int(np.argmax(values - asked[able]))
-    return (int(able[best]), float(values[best])) if values[best] > asked[able][best] else None
+    clear = values - asked[able]
+    order = np.argsort(-clear, kind="stable")[:_MOST]
+    return [(int(able[i]), float(values[i])) for i in order if clear[i] > 0]
 
 
 def _members(

@@ -6,20 +6,33 @@ import numpy as np
 import pytest
 
 import backends
-from benchmarks.backends import RIG, Corridor, measured, walk
+from experiments.long_run import RIG, Corridor, Loop, has_cholesky, measured, run, table
 from slam.data import Observations
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
     assert name in backends.names()
-    checkpoints = list(walk(name, 60, checkpoints=3, corridor=Corridor(density=4, speed=4.0)))
+    checkpoints = list(run(name, 60, 20, Corridor(density=4, speed=4.0)))
     assert [c.frame for c in checkpoints] == [20, 40, 60]
     for c in checkpoints:
-        assert c.failed == 0 and c.least > 0
+        assert c.failed == 0 and c.indefinite == 0 and c.least > 0
         assert c.landmarks <= 4 * 8 + 4  # those of 24 m were in the map in all
-        assert c.drift < 0.3  # of 24 m
-        assert c.step_nees < 20
+        assert c.error < 0.3  # of 24 m
+        assert c.nees < 20
+    assert "0 times; failed updates: 0" in table(checkpoints)
+
+
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
+def test_rounds_past_the_same_landmarks(name):
+    """Two rounds: the second adds next to no landmark, and comes back to where the first began."""
+    last = list(run(name, 220, 110, Loop(count=150, speed=3.0)))
+    assert last[1].landmarks <= 150 and last[1].landmarks - last[0].landmarks < 10
+    assert last[1].failed == 0 and last[1].error < 0.2  # of 66 m
+
+
+def test_what_has_no_cholesky_factor():
+    assert has_cholesky(np.eye(3)) and not has_cholesky(np.diag([1.0, -1e-9, 1.0]))
 
 
 def test_the_filters_memory_follows_the_map():

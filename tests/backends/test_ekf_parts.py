@@ -146,7 +146,7 @@ def test_innovation_covariances_are_blocks_of_the_dense_ones():
     S = H @ P @ H.T + 0.25 * np.eye(12)
     cross = P[6:, :6].reshape(4, 3, 6)
     blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
-    found = innovation_covariances(line.by_relative, P[:6, :6], cross, blocks, 0.5)
+    found = innovation_covariances(line, P[:6, :6], cross, blocks, 0.5)
     for i in range(4):
         np.testing.assert_allclose(found[i], S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-9)
 
@@ -228,13 +228,14 @@ def test_parts_of_the_matrix():
     slots = np.array([4, 0, 22, 11])
     np.testing.assert_allclose(covariance.camera, dense[:CAMERA, :CAMERA], rtol=1e-12)
     np.testing.assert_allclose(covariance.pose, dense[:6, :6], rtol=1e-12)
-    for block, cross, s in zip(covariance.blocks(slots), covariance.cross(slots), slots):
+    for block, cross, s in zip(*covariance.of_landmarks(slots), slots):
         rows = slice(CAMERA + 3 * s, CAMERA + 3 * s + 3)
         np.testing.assert_allclose(block, dense[rows, rows], rtol=1e-12)
         np.testing.assert_allclose(cross, dense[rows, :6], rtol=1e-12)
-    G = covariance.gather(slots)
-    assert G.flags.f_contiguous and (G[covariance.size :] == 0).all()
-    np.testing.assert_allclose(G[: covariance.size], dense[:, columns_of(slots)], rtol=1e-12)
+    g = columns_of(slots)
+    covariance.make_local(slots)
+    np.testing.assert_allclose(covariance.marginal(slots), dense[np.ix_(g, g)], rtol=1e-12)
+    np.testing.assert_allclose(covariance.columns(slots), dense[:, g], rtol=1e-12)
 
 
 def test_moving_the_camera_is_the_printed_prediction():
@@ -258,11 +259,107 @@ def test_a_change_of_the_cameras_state():
 
 def test_subtraction():
     covariance, dense = grown(20, np.random.default_rng(10))
-    W = np.zeros((covariance.capacity, 5), order="F")
-    W[: covariance.size] = 0.1 * np.random.default_rng(11).standard_normal((covariance.size, 5))
-    covariance.subtract(W)
-    n = covariance.size
-    np.testing.assert_allclose(covariance.full(), dense - W[:n] @ W[:n].T, rtol=1e-12, atol=1e-12)
+    slots, B = np.array([3, 17]), 0.1 * np.random.default_rng(11).standard_normal((12, 5))
+    g = columns_of(slots)
+    covariance.make_local(slots)
+    np.testing.assert_allclose(covariance.times(slots, B[:, 0]), dense[:, g] @ B[:, 0], rtol=1e-12)
+    covariance.subtract(slots, B)
+    W = dense[:, g] @ B
+    np.testing.assert_allclose(covariance.full(), dense - W @ W.T, rtol=1e-12, atol=1e-12)
+
+
+def test_a_change_of_landmarks_coordinates():
+    rng = np.random.default_rng(15)
+    covariance, dense = grown(20, rng)
+    covariance.full()  # so that all landmarks but the next are brought up to date later
+    slots, K = np.array([7, 2, 11]), rng.standard_normal((3, 3, 6))
+    covariance.make_local(np.array([4, 9]))
+    np.testing.assert_array_equal(covariance.make_local(slots), slots)
+    covariance.transform_landmarks(K)
+    M = np.eye(len(dense))
+    M[columns_of(slots)[6:], :6] = K.reshape(-1, 6)
+    np.testing.assert_allclose(covariance.full(), M @ dense @ M.T, rtol=1e-11, atol=1e-11)
+
+
+class Dense:
+    """The same operations on the whole matrix, as they are written; landmarks have names."""
+
+    def __init__(self, P: np.ndarray) -> None:
+        self.P, self.names = P, list(range((len(P) - CAMERA) // 3))
+
+    def columns(self, names: list[int]) -> np.ndarray:
+        return columns_of([self.names.index(name) for name in names])
+
+    def measure(self, names: list[int], rng: np.random.Generator) -> np.ndarray:
+        """Measure landmarks; returns B of the update."""
+        g = self.columns(names)
+        H = rng.standard_normal((3 * len(names), len(g)))
+        S = H @ self.P[np.ix_(g, g)] @ H.T + np.eye(len(H))
+        B = np.linalg.solve(np.linalg.cholesky(S), H).T
+        W = self.P[:, g] @ B
+        self.P = self.P - W @ W.T
+        return B
+
+
+def test_what_is_brought_up_to_date_later_is_exact(monkeypatch):
+    """Three hundred random steps: landmarks measured here and there, moves, changes of state, landmarks come and go."""
+    monkeypatch.setattr("backends.ekf.covariance._LOCAL", 60)  # so that it is stored again and again
+    stored = []
+    store = Covariance._store
+    monkeypatch.setattr(Covariance, "_store", lambda self: (stored.append(self.count), store(self))[1])
+    rng = np.random.default_rng(14)
+    covariance, P = grown(60, rng)
+    dense, slots, fresh = Dense(P), list(range(60)), 60  # slots: the name that each slot holds
+    for step in range(300):
+        near = [name for name in dense.names if abs(name % 60 - step // 5) < 12] or dense.names
+        names = [int(i) for i in rng.choice(near, min(4, len(near)), replace=False)]
+        where = np.array([slots.index(name) for name in names])
+        g = dense.columns(names)
+        covariance.make_local(where)
+        np.testing.assert_allclose(covariance.marginal(where), dense.P[np.ix_(g, g)], rtol=1e-7, atol=1e-9)
+        before, B = dense.P, dense.measure(names, rng)
+        order = np.concatenate([np.arange(CAMERA), *[dense.columns([name])[6:] for name in slots]])
+        np.testing.assert_allclose(
+            covariance.times(where, B[:, 0]), before[order][:, g] @ B[:, 0], rtol=1e-7, atol=1e-9
+        )
+        covariance.subtract(where, B)
+        F = np.eye(len(dense.P))
+        F[:6, 6:12] = 0.1 * np.eye(6)
+        dense.P = F @ dense.P @ F.T
+        dense.P[:CAMERA, :CAMERA] += 0.1 * np.eye(CAMERA)
+        covariance.move_camera(0.1, 0.1 * np.eye(CAMERA))
+        if step % 40 == 17:
+            J = np.eye(CAMERA) + 0.1 * rng.standard_normal((CAMERA, CAMERA))
+            F = np.eye(len(dense.P))
+            F[:CAMERA, :CAMERA] = J
+            dense.P = F @ dense.P @ F.T
+            covariance.transform_camera(J)
+        if step % 7 == 3:
+            gone = [int(i) for i in rng.choice(dense.names, 3, replace=False)]
+            keep = np.setdiff1d(np.arange(len(dense.P)), dense.columns(gone)[6:])
+            dense.P = dense.P[np.ix_(keep, keep)]
+            dense.names = [name for name in dense.names if name not in gone]
+            holes, movers = covariance.drop(np.array([slots.index(name) for name in gone]))
+            for hole, mover in zip(holes, movers):
+                slots[hole] = slots[mover]
+            del slots[len(dense.names) :]
+        if step % 7 == 5:
+            J, noise = rng.standard_normal((3, 3, 6)), np.tile(np.eye(3), (3, 1, 1))
+            dense.P = augmented(dense.P, J, noise)
+            covariance.append(J, noise)
+            dense.names += range(fresh, fresh + 3)
+            slots += range(fresh, fresh + 3)
+            fresh += 3
+        if step % 25 == 0:
+            rows = np.concatenate([dense.columns([name])[6:] for name in slots])
+            blocks, cross = covariance.of_landmarks(np.arange(len(slots)))
+            expected = dense.P[rows.reshape(-1, 3)[:, :, None], rows.reshape(-1, 3)[:, None, :]]
+            np.testing.assert_allclose(blocks, expected, rtol=1e-7, atol=1e-9)
+            np.testing.assert_allclose(cross.reshape(-1, 6), dense.P[rows, :6], rtol=1e-7, atol=1e-9)
+    assert len(stored) > 10
+    rows = np.concatenate([np.arange(CAMERA), *[dense.columns([name])[6:] for name in slots]])
+    np.testing.assert_allclose(covariance.full(), dense.P[np.ix_(rows, rows)], rtol=1e-7, atol=1e-9)
+    assert np.linalg.eigvalsh(covariance.full())[0] > 0
 
 
 def test_landmarks_come_and_go():

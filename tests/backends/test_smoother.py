@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
-from backends.smoother import SmootherBackend
+from backends.smoother import SmootherBackend, growth
 from slam import se3
 from slam.data import Observations, UpdateStatus
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, MeasurementError
 from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import RIG, observe, path, run, scene, step
 
@@ -171,7 +172,7 @@ def test_landmarks_seen_again_tie_the_trajectory_together():
 
 def test_a_fixed_lag_keeps_the_path_and_bounds_the_problem():
     data = drive(80, points=400)
-    full, lagged = SmootherBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=15, window=10)
+    full, lagged = SmootherBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=15, window=10, explicit=30)
     run(full, data)
     known: set[int] = set()
     sizes = []
@@ -187,6 +188,28 @@ def test_a_fixed_lag_keeps_the_path_and_bounds_the_problem():
     P, Q = (b.estimate(landmarks=False).covariance for b in (lagged, full))
     # What was marginalised keeps its information: the end is known about as well.
     assert 0.7 < np.trace(P[3:, 3:]) / np.trace(Q[3:, 3:]) < 1.5
+
+
+def test_landmarks_in_the_map_outlast_the_lag():
+    poses, points = loop(1.15, 90)
+    models, known = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=1.0), set()
+    backend, rng = SmootherBackend(RIG, models, lag=20), np.random.default_rng(1)
+    for k, T in enumerate(poses):
+        step(backend, DT * k, observe(T, points, 1.0, rng, limit=12), known)
+        if k == 60:
+            marks = backend.records.landmarks
+            first = [
+                i for i in known if marks.last[marks.slots([i])[0]] < 15 and marks.variable[marks.slots([i])[0]] >= 0
+            ]
+    assert first, "landmarks that were last seen long before the lag are still variables"
+    # As with all poses: see the test on landmarks that are seen again.
+    assert errors(backend.estimate().T_world_left, poses[-1])[0] < 0.1
+    backend.remove(first)
+    known.difference_update(first)
+    for k in range(10):
+        step(backend, DT * (len(poses) + k), observe(poses[-1], points, 1.0, rng, limit=12), known)
+    keys = set(backend._graph._solver.values().keys())
+    assert all(key in keys for key in backend.records.landmarks.variable.tolist() if key >= 0)
 
 
 def test_a_landmark_that_left_the_lag_may_be_seen_again():
@@ -208,6 +231,75 @@ def test_a_landmark_that_left_the_lag_may_be_seen_again():
 def test_the_lag_is_not_shorter_than_the_window():
     with pytest.raises(ConfigurationError, match="lag"):
         SmootherBackend(RIG, MODELS, lag=5, window=10)
+
+
+def off_by(seen: Observations, offset: float) -> Observations:
+    """Observations with right pixels moved along the row."""
+    return Observations(seen.ids, seen.uv_left, seen.uv_right + np.array([offset, 0.0]))
+
+
+@pytest.mark.parametrize("options", [{}, {"explicit": 0}, {"lag": 15}], ids=str)
+def test_right_pixels_are_mended_afterwards(options):
+    data = drive(24, points=200)
+    right, mended, spoilt = (SmootherBackend(RIG, MODELS, **options) for _ in range(3))
+    known: list[set[int]] = [set(), set(), set()]
+    for k, (stamp, _, seen) in enumerate(data):
+        if k == 14:
+            mended.shift_right(0.8)
+        early = off_by(seen, -0.8) if k < 14 else seen
+        for backend, ids, given in zip((right, mended, spoilt), known, (seen, early, early)):
+            step(backend, stamp, given, ids)
+    truth = right.trajectory().poses
+    distances = [errors(b.trajectory().poses, truth)[0].max() for b in (mended, spoilt)]
+    # The same measurements; where the lag has left a pose behind, it is linearised where it stood then, and the gate
+    # had let other measurements pass.
+    assert distances[0] < (0.003 if options else 1e-4) < distances[1], distances
+    ours, theirs = mended.estimate(), right.estimate()
+    np.testing.assert_array_equal(ours.ids, theirs.ids)
+    off = np.linalg.norm(ours.positions - theirs.positions, axis=1)
+    deviations = np.sqrt(np.trace(theirs.covariances, axis1=1, axis2=2))
+    assert np.median(off / deviations) < 0.05
+
+
+def test_mending_needs_nothing_to_mend():
+    backend = SmootherBackend(RIG, MODELS)
+    backend.shift_right(0.1)
+    backend.predict(0.0)
+    backend.shift_right(0.1)
+    with pytest.raises(MeasurementError, match="finite"):
+        backend.shift_right(np.nan)
+
+
+def test_no_two_landmarks_share_a_variable(monkeypatch):
+    # A measurement that is taken back may take the landmark's variable with it; its name is not given out again.
+    data, given = drive(30), []
+    original = growth.landmark_key
+    monkeypatch.setattr(growth, "landmark_key", lambda *a: given.append(original(*a)) or given[-1])
+    backend = SmootherBackend(RIG, MODELS, track=3, explicit=20)
+    known: set[int] = set()
+    for k, (stamp, _, seen) in enumerate(data):
+        step(backend, stamp, seen, known)
+        if k % 5 == 4:
+            slots = np.flatnonzero(backend.records.landmarks.variable >= 0)[:3]
+            for slot, key in zip(slots, backend.records.landmarks.variable[slots].tolist()):
+                rows = np.array(backend.records.history.explicit[key])
+                for row in rows[::-1]:
+                    backend.records.take_back(np.array([slot]), np.array([row]))
+            backend._graph._recover()
+    numbers = [gtsam.symbolIndex(key) for key in given]
+    assert len(numbers) > 20 and len(set(numbers)) == len(numbers)
+
+
+def test_the_path_that_is_asked_for_is_solved_to_the_last():
+    data = drive(40, points=300)
+    loose, tight = (SmootherBackend(RIG, MODELS, relinearise=px) for px in (0.3, 0.001))
+    run(loose, data)
+    run(tight, data)
+    before = errors(loose.records.path.poses, tight.records.path.poses)[0].max()
+    after = errors(loose.trajectory().poses, tight.trajectory().poses)[0].max()
+    assert after < 0.1 * before and after < 2e-4, (before, after)
+    assert loose.estimate().covariance.shape == (6, 6)
+    np.testing.assert_array_equal(loose.trajectory().poses, loose.trajectory().poses)
 
 
 def test_time_in_the_solver_is_told():

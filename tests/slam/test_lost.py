@@ -13,6 +13,7 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.map_management import MapConfig
 from slam.models import EstimatorModels
+from slam.relocation import Sightings
 from slam.system import StereoSlam
 from slam.tracking import Tracking
 from tests.slam.scene import RIG, Cloud, path
@@ -97,6 +98,30 @@ def test_carried_off_to_a_known_place(backend):
     assert right_share(results, points) == 1
     assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.02
     assert not any(len(r.added) for r in results[25 : tracked[0]])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
+    """The way it was carried is no motion: the back end begins anew in the map, and the path keeps every frame."""
+    jump = se3.exp(np.array([0, 0.3, 0, 0.4, 0, 0.2]))
+    poses = [*path(25), *(T @ jump for T in path(60)[25:])]
+    system, results, points = run(backend, poses)
+    needed = CONFIG.association.carried_after - 1
+    assert states(results) == [("started", 1), ("tracked", 24), ("predicted", needed), ("tracked", 35 - needed)]
+    errors = np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1)
+    assert len(errors) == 60
+    assert errors[25 + needed :].max() < 0.02  # as before
+    steps = np.diff([r.estimate.T_world_left[:3, 3] for r in results[25 + needed :]], axis=0)
+    assert np.linalg.norm(steps, axis=1).max() < 0.03  # the jump has left no velocity behind
+    assert right_share(results, points) == 1
+
+
+def test_poses_that_do_not_agree_with_each_other_prove_nothing():
+    models = EstimatorModels()
+    here, there = se3.exp(np.array([0, 0, 0, 1.0, 0, 0])), se3.exp(np.array([0, 0, 0, 1.5, 0, 0]))
+    once = Sightings().after(here, 1.0, models)
+    assert [once.count, once.after(here, 1.1, models).count, once.after(there, 1.1, models).count] == [1, 2, 1]
+    assert once.after(there, 1.2, models).count == 2  # it may have moved by 0.65 m
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

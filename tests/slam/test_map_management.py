@@ -9,12 +9,13 @@ from slam.landmarks import LandmarkRows
 from slam.map_management import (
     MapConfig,
     bad_landmarks,
+    crowded_landmarks,
     doubled_landmarks,
     known_features,
     new_landmarks,
     surplus_landmarks,
 )
-from slam.visibility import MapView, expected_landmarks
+from slam.visibility import MapView, expected_landmarks, seen_alike
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)
@@ -127,6 +128,38 @@ def test_the_never_confirmed_give_way_first():
     config = MapConfig(target_in_view=3, max_landmarks=3)
     rows = rows_with(last_seen=[5, 1, 9, 3, 9], seen=[1, 4, 1, 4, 2])
     assert surplus_landmarks(rows, config).tolist() == [True, True, False, False, False]
+
+
+def test_out_of_view_the_map_is_thinned_to_the_best_seen():
+    """Landmarks two metres off, 10 cm apart, the last one 1 m from the others; the first three are out of view."""
+    config = MapConfig(spacing=0.1, erase_missed=2)
+    positions = np.array([[0, 0, 2], [0.1, 0, 2], [0.2, 0, 2], [0.3, 0, 2], [0.4, 0, 2], [1.4, 0, 2.0]])
+    rows = rows_with(seen=[3, 9, 4, 1, 1, 1], last_seen=[4, 5, 6, 7, 8, 9], seen_from=np.zeros((6, 3)))
+    assert crowded_landmarks(rows, positions, config).tolist() == [True, False, True, False, False, False]
+    assert not crowded_landmarks(rows, positions, MapConfig(spacing=0.0, erase_missed=2)).any()
+    apart = positions * [3, 1, 1]  # further apart than a tenth of the distance
+    assert not crowded_landmarks(rows, apart, config).any()
+    unknown = rows_with(seen=rows.seen, last_seen=rows.last_seen)
+    assert not crowded_landmarks(unknown, positions, config).any()
+
+
+def test_of_equally_well_seen_ones_the_older_stays():
+    rows = rows_with(seen=[5, 5, 5, 5], last_seen=[1, 1, 2, 3], seen_from=np.zeros((4, 3)))
+    positions = np.array([[0, 0, 2], [0.05, 0, 2], [1, 0, 2], [2, 0, 2.0]])
+    assert crowded_landmarks(rows, positions, MapConfig(erase_missed=1)).tolist() == [False, True, False, False]
+
+
+def test_what_looks_as_it_did():
+    """One landmark 2 m ahead of where it was first seen from."""
+    from_here = lambda *camera: bool(  # noqa: E731
+        seen_alike(np.array([[0, 0, 2.0]]), np.zeros((1, 3)), np.array(camera), 20.0, 1.4)[0]
+    )
+    assert from_here(0, 0, 0) and from_here(0, 0, 0.5) and from_here(0, 0, -0.7) and from_here(0.7, 0, 0)
+    assert not from_here(0, 0, 0.6)  # 1.4 m
+    assert not from_here(0, 0, -0.9)  # 2.9 m
+    assert not from_here(0.75, 0, 0)  # 20.6 degrees
+    unknown = seen_alike(np.array([[0, 0, 2.0]]), np.full((1, 3), np.nan), np.array([5.0, 0, 0]), 20.0, 1.4)
+    assert unknown.tolist() == [True]
 
 
 def seen_from_the_origin(positions, features):

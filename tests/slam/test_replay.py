@@ -54,6 +54,26 @@ def test_a_run_replayed_into_the_same_back_end_is_the_same_run(desk):
     np.testing.assert_array_equal(twice.removed, recorded.removed)
 
 
+def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkeypatch):
+    offsets = {8: 0.3, 11: 0.2}  # what the self-calibration believes from a frame on
+    system = StereoSlam(desk.rig, None, "smoother")
+    results = []
+    for k in range(FRAMES):
+        system.calibration._mean = offsets.get(k, system.calibration._mean)
+        system.calibration._information = 1e4
+        results.append(system.process_features(desk.observations(k)))
+    shifts = [r.shift for r in results]
+    assert np.flatnonzero(shifts).tolist() == [8, 11]
+    assert sum(shifts) == pytest.approx(system.calibration.applied)
+    save_recording(record(results, desk.rig, system.config.models), tmp_path / "run.npz")
+    recorded = load_recording(tmp_path / "run.npz")
+    backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
+    monkeypatch.setattr(backend, "shift_right", lambda shift: given.append((len(backend.records.path.stamps), shift)))
+    assert [r.shift for r in replay(recorded, backend)] == shifts
+    assert given == [(8, shifts[8]), (11, shifts[11])]
+    assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
+
+
 def test_a_third_party_back_end_can_be_given_a_recording(recording, desk):
     results = list(replay(recording, FixedMapBackend(recording.rig, recording.models)))
     assert len(results) == FRAMES

@@ -135,11 +135,20 @@ def test_correction_takes_the_offset_away(rig):
     left, right = rig.project(points)
     features = feature_rows(left, shifted(rig, right, calibration.offset))
     features.uv_right[3] = np.nan
+    assert calibration.correct(features) is features, "not before it is applied"
+    assert calibration.apply() == calibration.offset
     corrected = calibration.correct(features)
     good = np.arange(20) != 3
     np.testing.assert_allclose(corrected.uv_right[good], right[good], atol=1e-6)
     assert np.isnan(corrected.uv_right[3]).all()
     np.testing.assert_array_equal(corrected.uv_left, features.uv_left)
+
+
+def test_a_change_that_does_not_count_is_not_applied():
+    calibration = drive(seed=2)
+    assert calibration.apply(least=100.0) == 0.0 == calibration.applied
+    assert calibration.apply() == calibration.applied == calibration.offset != 0
+    assert calibration.apply() == 0.0
 
 
 def feature_rows(left, right):
@@ -151,7 +160,7 @@ def feature_rows(left, right):
 def test_disabled_means_untouched():
     calibration = drive(enabled=False)
     features = feature_rows(np.ones((5, 2)), np.ones((5, 2)))
-    assert calibration.offset == 0.0
+    assert calibration.offset == calibration.apply() == 0.0
     assert calibration.correct(features) is features
 
 
