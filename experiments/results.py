@@ -1,10 +1,12 @@
 """The results page: every experiment in one command, its tables and figures with what the papers had.
 
     SLAM_DATA=/path/to/data python experiments/results.py [--quick] [--only NAME …] [--out DIR] [--page FILE]
+        [--processes N] [--resume]
 
-Runs the scripts beside this one, one after the other, each with a folder of its own; what a script prints as Markdown
-is its section of the page, and the pictures that it leaves are copied beside the page. A script that fails is said
-on the page, and the exit status is 1; the others run all the same.
+Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of the
+page, and the pictures that it leaves are copied beside the page. A script that fails is said on the page, and the exit
+status is 1; the others run all the same. ``--processes 2`` runs two at once, which spoils their times; ``--resume``
+takes what ran to its end in an earlier call, of the same code, from its folder.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,6 +95,22 @@ def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
     return done.stdout, ""
 
 
+def printed_by(experiment: Experiment, folder: Path, quick: bool, resume: bool) -> tuple[str, str]:
+    """What a script prints, now or in an earlier call, and why it failed; it is kept in ``printed.md``."""
+    out = (folder / experiment.name).absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    kept = out / "printed.md"
+    if resume and kept.exists():
+        return kept.read_text(encoding="utf-8"), ""
+    print(f"{experiment.name} …", file=sys.stderr, flush=True)
+    printed, failure = run(experiment, out, quick)
+    if failure:
+        print(f"{experiment.name}: {failure}", file=sys.stderr, flush=True)
+    else:
+        kept.write_text(printed, encoding="utf-8")
+    return printed, failure
+
+
 def section(experiment: Experiment, printed: str, failure: str, out: Path, page: Path) -> str:
     """A script's section of the page; its pictures go to ``images/results`` beside the page."""
     lines = [f"## {experiment.title}", ""]
@@ -130,19 +149,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="*", choices=[e.name for e in EXPERIMENTS], help="these scripts alone")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for what the scripts leave")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md", help="the page")
+    parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
+    parser.add_argument("--resume", action="store_true", help="do not run again what ran to its end in --out")
     given = parser.parse_args(arguments)
-    sections, failed = [], []
-    for experiment in EXPERIMENTS:
-        if given.only and experiment.name not in given.only:
-            continue
-        out = (given.out / experiment.name).absolute()
-        out.mkdir(parents=True, exist_ok=True)
-        print(f"{experiment.name} …", file=sys.stderr, flush=True)
-        printed, failure = run(experiment, out, given.quick)
-        if failure:
-            failed.append(experiment.name)
-            print(f"{experiment.name}: {failure}", file=sys.stderr, flush=True)
-        sections.append(section(experiment, printed, failure, out, given.page))
+    chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
+    with ThreadPoolExecutor(given.processes) as pool:
+        outcomes = list(pool.map(lambda e: printed_by(e, given.out, given.quick, given.resume), chosen))
+    sections = [section(e, *outcome, given.out / e.name, given.page) for e, outcome in zip(chosen, outcomes)]
+    failed = [e.name for e, (_, failure) in zip(chosen, outcomes) if failure]
     given.page.parent.mkdir(parents=True, exist_ok=True)
     given.page.write_text("\n".join([head(given.quick), *sections]), encoding="utf-8")
     print(f"{len(sections)} experiments, {len(failed)} failed. Page: {given.page}", file=sys.stderr)
