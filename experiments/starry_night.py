@@ -1,6 +1,6 @@
 """Both back ends on the Starry Night data: real stereo measurements of twenty landmarks, without images.
 
-    SLAM_DATA=/path/to/data python experiments/starry_night.py [--quick] [--sigma PX] [--starts K ...] [--out DIR]
+    SLAM_DATA=/path/to/data python experiments/starry_night.py [--quick] [--sigma PX] [--parts A:B ...] [--out DIR]
 
 A sensor head is carried by hand through a motion-capture room; of its twenty landmarks five are seen on average, and
 none in a tenth of the steps. The association is given. Every run starts at the true pose of its first step and prints
@@ -33,6 +33,7 @@ from slam.se3 import Array
 from slam.trajectory import Trajectory
 
 FILE = "starry_night/steps_0_950.npz"
+PARTS = [(0, 300), (130, 950), (300, 950), (500, 950)]
 BACKENDS = ("ekf", "smoother")
 HEADER = (
     "steps", "back end", "updates ok / empty / failed", "rejected", "RMSE online [m]", "[deg]", "RMSE final [m]",
@@ -114,8 +115,8 @@ def rms(errors: Array) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
-def rows(data: Data, starts: list[int], stop: int, sigma: float) -> Iterator[tuple[str, str, dict[str, float | int]]]:
-    for start in starts:
+def rows(data: Data, parts: list[tuple[int, int]], sigma: float) -> Iterator[tuple[str, str, dict[str, float | int]]]:
+    for start, stop in parts:
         for name in BACKENDS:
             models = EstimatorModels(
                 MotionModel(1.0, 1.0), pixel_sigma=sigma, T_world_left=data.poses[start],
@@ -131,12 +132,17 @@ def cells(span: str, name: str, r: dict[str, float | int]) -> list[str]:
     ]  # fmt: skip
 
 
+def part(text: str) -> tuple[int, int]:
+    """``A:B`` as a range of steps."""
+    start, stop = text.split(":")
+    return int(start), int(stop)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a hundred steps from one start")
     parser.add_argument("--sigma", type=float, default=6.0, help="assumed pixel noise [px]")
-    parser.add_argument("--starts", type=int, nargs="*", default=[0, 130, 300, 500])
-    parser.add_argument("--stop", type=int, default=950)
+    parser.add_argument("--parts", type=part, nargs="*", default=PARTS, metavar="A:B", help="steps from A to before B")
     parser.add_argument("--out", type=Path, default=Path("results/starry_night"))
     arguments = parser.parse_args()
     folder = os.environ.get("SLAM_DATA")
@@ -144,10 +150,9 @@ def main() -> int:
         print(f"starry night: set SLAM_DATA to the folder that holds {FILE}; nothing was run")
         return 0
     data = load(Path(folder) / FILE)
-    starts, stop = ([130], 230) if arguments.quick else (arguments.starts, arguments.stop)
     found, lines = [], ["| " + " | ".join(HEADER) + " |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
     print("\n".join(lines))
-    for row in rows(data, starts, stop, arguments.sigma):
+    for row in rows(data, [(130, 230)] if arguments.quick else arguments.parts, arguments.sigma):
         found.append(row)
         lines.append("| " + " | ".join(cells(*row)) + " |")
         print(lines[-1], flush=True)
