@@ -10,12 +10,10 @@ import numpy as np
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import (
-    BoolArray,
     Estimate,
     FrameResult,
     FrameStatus,
     IdArray,
-    Observations,
     Prediction,
     StereoFeatures,
     StereoFrame,
@@ -26,16 +24,7 @@ from slam.errors import ConfigurationError
 from slam.interfaces import Backend, Frontend, MapBackend, RevisingBackend
 from slam.known_map import MapSearch, models_at
 from slam.landmarks import LandmarkRows
-from slam.map_management import (
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    new_landmarks,
-    surplus_landmarks,
-)
-from slam.monocular import MonocularDepth, unclaimed
-from slam.objects.data import Judgement
+from slam.map_keeping import MapKeeper, Step, observations_of
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.recognition import Recogniser, Recognition, jump, median_deviation
 from slam.relocation import Sightings, hand_over
@@ -45,7 +34,6 @@ from slam.se3 import Array
 from slam.selfcalibration import SelfCalibration
 from slam.tracking import Tracking
 from slam.trajectory import Trajectory
-from slam.visibility import MapView, expected_landmarks
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
 _COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
@@ -104,15 +92,10 @@ class StereoSlam:
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self._recogniser = Recogniser(rig, c.association, c.models.pixel_sigma)
         self._index = -1
-        self._next_id = 0
         self._tracking = Tracking()
         self.frontend_name = frontend if isinstance(frontend, str) else ""
         self.world_frame = FIRST_FRAME
-        self._monocular: MonocularDepth | None = None
-        if c.map.monocular:
-            if not isinstance(self.backend, MapBackend):
-                raise ConfigurationError("map.monocular: this back end cannot place landmarks")
-            self._monocular = MonocularDepth(rig, c.models.pixel_sigma, c.map.max_depth_error)
+        self._keeper = MapKeeper(rig, c, self._recogniser, self.backend)
         self._backend_name = backend if isinstance(backend, str) else None
         self._may_begin_anew = isinstance(backend, str) and isinstance(self.backend, MapBackend)
         self._carried = Sightings()
@@ -153,7 +136,7 @@ class StereoSlam:
         found = found.without(self.objects.suspects)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
-        report = self.backend.update(_observations(features, found), found.T_world_left)
+        report = self.backend.update(observations_of(features, found), found.T_world_left)
         clock.lap("update")
         self._tracking = self._tracked(prediction, features, found, report)
         estimate = self.backend.estimate(landmarks=False)
@@ -161,7 +144,8 @@ class StereoSlam:
         judged = self.objects.judge(features, estimate, _landmark_ids(features, found))
         objects = self.objects.update(self.backend, features)
         clock.lap("objects")
-        landmarks, added, erased = self._keep(landmarks, estimate, features, found, report, judged)
+        step = Step(self._index, features, estimate, found, report, judged, self._tracking)
+        landmarks, added, erased = self._keeper.keep(self.backend, landmarks, step)
         self.landmarks = landmarks
         status, reason = self._status(report, len(added))
         clock.lap("manage")
@@ -228,7 +212,7 @@ class StereoSlam:
             return False
         self.backend = self._new_backend(T)
         search.fill(self.backend)
-        self._next_id = int(search.known.ids.max(initial=-1)) + 1
+        self._keeper.next_id = int(search.known.ids.max(initial=-1)) + 1
         self._search = None
         return True
 
@@ -276,126 +260,12 @@ class StereoSlam:
         recognised = len(report.used) >= least and 2 * len(report.used) >= len(found)
         return self._tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
 
-    def _view(self, T_world_left: Array, landmarks: LandmarkRows, features: StereoFeatures) -> MapView:
-        """The map as a camera at this pose sees it."""
-        positions = self.backend.positions(landmarks.ids)
-        return MapView.of(self.rig, T_world_left, positions, features, self.config.models.pixel_sigma)
-
-    def _keep(
-        self,
-        landmarks: LandmarkRows,
-        estimate: Estimate,
-        features: StereoFeatures,
-        found: Recognition,
-        report: UpdateReport,
-        judged: Judgement,
-    ) -> tuple[LandmarkRows, Recognition, IdArray]:
-        """The map after this frame: count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        view = self._view(estimate.T_world_left, landmarks, features)
-        landmarks = self._count(landmarks, view, features, found, report)
-        bad = bad_landmarks(landmarks, self.config.map) | np.isin(landmarks.ids, judged.landmarks)
-        bad |= doubled_landmarks(view, landmarks, self.config.map)
-        bad |= crowded_landmarks(landmarks, view.positions, self.config.map)
-        known = known_features(view, landmarks, features, self.config.map)
-        landmarks, erased = self._erase(landmarks, bad)
-        landmarks, added = self._add(landmarks, features, found, known, judged)
-        landmarks, surplus = self._erase(landmarks, surplus_landmarks(landmarks, self.config.map))
-        return landmarks, added, np.concatenate([erased, surplus])
-
-    def _count(
-        self,
-        landmarks: LandmarkRows,
-        view: MapView,
-        features: StereoFeatures,
-        found: Recognition,
-        report: UpdateReport,
-    ) -> LandmarkRows:
-        """Count what was seen and missed; a frame in which nothing is recognised says nothing of single landmarks."""
-        m = self.config.map
-        measured = np.isin(found.ids, report.used)
-        expected = landmarks.ids[:0]
-        if not self._tracking.unrecognised:
-            size = (self.rig.width, self.rig.height)
-            shown = expected_landmarks(view, features, size, m.view_margin, m.occlusion_radius)
-            shown &= self._recogniser.looks_alike(view.T_world_left, landmarks, view.positions)
-            expected = landmarks.ids[shown]
-        ids, rows = found.ids[measured], found.rows[measured]
-        place = view.T_world_left[:3, 3], view.in_image, self.config.association.again_after
-        return landmarks.after_frame(self._index, expected, ids, features, rows, m.renewal, *place)
-
-    def _erase(self, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
-        """Drop landmarks from the map and from the back end."""
-        erased = landmarks.ids[rows]
-        if len(erased):
-            self.backend.remove(erased)
-            landmarks = landmarks.select(~rows)
-        return landmarks, erased
-
-    def _add(
-        self,
-        landmarks: LandmarkRows,
-        features: StereoFeatures,
-        found: Recognition,
-        known: BoolArray,
-        judged: Judgement,
-    ) -> tuple[LandmarkRows, Recognition]:
-        """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew.
-
-        What moves, or lies on a body that moves, becomes none, nor what is in doubt.
-        """
-        if len(landmarks) and not self._tracking.may_add(self.config.map):
-            return landmarks, Recognition.nothing()
-        free = ~known
-        free[found.rows] = free[judged.moving] = False
-        free[judged.undecided] = False
-        occupied = features.uv_left[found.rows]
-        rows = new_landmarks(features, free, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
-        ids = np.arange(self._next_id, self._next_id + len(rows), dtype=np.int64)
-        added = Recognition(ids, rows)
-        if len(added):
-            self.backend.add(_observations(features, added))
-            camera = self.backend.estimate(landmarks=False).T_world_left[:3, 3]
-            landmarks = landmarks.with_new(self._index, ids, features, rows, camera)
-            self._next_id += len(added)
-        if self._monocular is not None:
-            return self._add_monocular(self._monocular, landmarks, features, found, added, free)
-        return landmarks, added
-
-    def _add_monocular(
-        self,
-        monocular: MonocularDepth,
-        landmarks: LandmarkRows,
-        features: StereoFeatures,
-        found: Recognition,
-        added: Recognition,
-        free: BoolArray,
-    ) -> tuple[LandmarkRows, Recognition]:
-        """Make landmarks of features without a stereo match that two views give a depth (paper B, 2.2)."""
-        if len(found) < _MINIMUM_TRACKED:
-            return landmarks, added
-        estimate = self.backend.estimate(landmarks=False)
-        view = self._view(estimate.T_world_left, landmarks, features)
-        rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
-        covariance = monocular.pose_covariance(estimate, view, landmarks, features, found)
-        new = monocular.step(features, rows, estimate.T_world_left, covariance, self._index)
-        wanted = max(self.config.map.target_in_view - len(found) - len(added), 0)
-        best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
-        if not len(best):
-            return landmarks, added
-        ids = np.arange(self._next_id, self._next_id + len(best), dtype=np.int64)
-        self.backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
-        camera = estimate.T_world_left[:3, 3]
-        landmarks = landmarks.with_new(self._index, ids, features, new.rows[best], camera)
-        self._next_id += len(ids)
-        both = Recognition(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
-        return landmarks, both
-
     def _status(self, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
         if report.status is UpdateStatus.FAILED:
             return FrameStatus.FAILED, report.reason
         if not self._tracking.unrecognised:
             return FrameStatus.TRACKED, ""
-        if self._next_id == added:
+        if self._keeper.next_id == added:
             return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
         reason = report.reason or f"only {len(report.used)} landmarks recognised"
         return (FrameStatus.LOST if self._tracking.lost else FrameStatus.PREDICTED), reason
@@ -406,10 +276,6 @@ def _landmark_ids(features: StereoFeatures, found: Recognition) -> IdArray:
     ids = np.full(len(features), -1, np.int64)
     ids[found.rows] = found.ids
     return ids
-
-
-def _observations(features: StereoFeatures, found: Recognition) -> Observations:
-    return Observations(found.ids, features.uv_left[found.rows], features.uv_right[found.rows])
 
 
 @dataclass

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.data import FrameResult, StereoFeatures
 from slam.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
 
-_SINGULAR = 1e-14  # smallest eigenvalue of a covariance that counts
+_SINGULAR = 1e-9  # smallest eigenvalue of a matrix of correlations that counts
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
 _SUPPORT = 4  # stereo features from which a body counts as in view
 
@@ -74,14 +74,29 @@ def absolute_pose_errors(estimated: Array, true: Array) -> PoseErrors:
 
 
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
-    """NEES of object poses with covariances (N, 6, 6), after one change of body frame for all.
+    """NEES of a body's motion since the first row, which must be that of its first sight.
 
-    Rows whose covariance is singular, as where a body defines its own axes, are left out.
+    A body's frame is put there at its first sight: its pose has no error then, and from then on its covariance is that
+    of the motion since (docs/objects_estimation.md). With the true motion ``H = T_k T_0⁻¹`` the error is
+    ``log(T_est,k⁻¹ H T_est,0)``.
+
+    Args:
+        estimated: poses T_world_object (N, 4, 4).
+        covariances: theirs (N, 6, 6), right perturbations.
+        true: the true ones in the same world frame; the body frames may differ.
+
+    Returns:
+        a value for each row but the first; rows whose covariance is numerically singular are left out.
     """
-    D = body_alignment(estimated, true)
-    e = log(inverse(estimated) @ true @ inverse(D))
-    known = np.linalg.eigvalsh(covariances)[:, 0] > _SINGULAR  # in its first frame a body defines its own axes
-    return np.asarray(np.einsum("ni,nij,nj->n", e[known], np.linalg.inv(covariances[known]), e[known]), np.float64)
+    e = log(inverse(estimated[1:]) @ true[1:] @ inverse(true[0]) @ estimated[0])
+    P = covariances[1:]
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    known = (sigma > 0).all(axis=1)
+    e, P, sigma = e[known], P[known], sigma[known]
+    correlations = P / (sigma[:, :, None] * sigma[:, None, :])
+    regular = np.linalg.eigvalsh(correlations)[:, 0] > _SINGULAR
+    w = (e / sigma)[regular]
+    return np.asarray((w * np.linalg.solve(correlations[regular], w[:, :, None])[:, :, 0]).sum(axis=1), np.float64)
 
 
 @dataclass

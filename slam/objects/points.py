@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.se3 import Array, transform
@@ -93,3 +94,29 @@ def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Sha
         gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
         h = h + (covariance @ gradient[:, :, None])[:, :, 0]
     return h, covariance
+
+
+def room_makers(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
+    """Which points of a full body leave to make room for new ones.
+
+    Those that have not been seen for more frames than they ever were; a point that is only missed now and then is worth
+    more than a new one. Where hardly any are in view, as when a body has turned round, others leave, too.
+
+    Args:
+        unseen: number of frames since each was seen (p,), 0 for those in view.
+        sights: in how many frames each was seen (p,), at least 1.
+        wanted: so many new points would like to join.
+        most: so many points a body may have.
+
+    Returns:
+        mask (p,).
+    """
+    age = unseen / sights
+    order = np.argsort(-age, kind="stable")
+    in_view = int((unseen == 0).sum())
+    lacking = min(wanted, most // 2 - in_view) - (most - len(age))
+    surplus = len(age) + wanted - most
+    leaving = order[: max(0, min(surplus, max(int((age > 1).sum()), lacking), len(age) - in_view))]
+    gone = np.zeros(len(age), bool)
+    gone[leaving] = True
+    return gone
