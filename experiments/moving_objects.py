@@ -3,8 +3,9 @@
     [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--only PART,…] [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
-paired (both back ends on identical measurements), boxes, still (no false movers), street, kitti (two overtaking cars). Prints Markdown tables, leaves them in DIR as JSON.
-Worlds are rendered and SURF runs on them; with `--observations` they give noisy observations without images.
+paired (both back ends on identical measurements), boxes, still (no false movers), street, kitti (two overtaking cars).
+Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
+they give noisy observations without images.
 """
 
 from __future__ import annotations

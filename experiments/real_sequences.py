@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from slam.compare.measure import Lifetimes
 from slam.config import SystemConfig
 from slam.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -25,15 +26,17 @@ SEQUENCES = {
     "EuRoC V1_01, 20 keyframes": "euroc/V1_01_keyframes_a",
 }
 BACKENDS = ("ekf", "smoother")
-HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "GPS RMSE online [m]", "ms per frame")
+HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "GPS RMSE online [m]",
+          "landmark lifetime, median [frames]", "ms per frame")  # fmt: skip
 
 
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
     target = out / name.replace(" ", "_").replace(",", "") / backend
-    return run(
-        sequence, RunOptions(backend, "surf", SystemConfig.for_kind(sequence.kind, "surf", backend), target, 0, frames)
-    )
+    lifetimes = Lifetimes()
+    config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+    summary = run(sequence, RunOptions(backend, "surf", config, target, 0, frames), lifetimes.add)
+    return {**summary, "lifetime": lifetimes.median}
 
 
 def row(name: str, summary: dict[str, Any]) -> list[str]:
@@ -41,7 +44,8 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
     tracked = f"{summary['status'].get('tracked', 0) + summary['status'].get('started', 0)} of {summary['frames']}"
     figures = (online.get("ATE RMSE [m]"), final.get("ATE RMSE [m]"), online.get("GPS distance RMSE [m]"))
     texts = [f"{x:.3f}" if x is not None else "–" for x in figures]
-    return [name, summary["backend"], tracked, *texts, f"{summary['milliseconds']['median_total']:.0f}"]
+    times = (f"{summary['lifetime']:.0f}", f"{summary['milliseconds']['median_total']:.0f}")
+    return [name, summary["backend"], tracked, *texts, *times]
 
 
 def main() -> int:

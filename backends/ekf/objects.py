@@ -29,7 +29,7 @@ from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
 from slam.models import EstimatorModels
 from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
-from slam.objects.points import Shape, first_frame, shape_of, with_shape
+from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse
 
@@ -154,10 +154,11 @@ class ObjectFilter:
         body, used = self._correct(body, o, known, rows, camera)
         if len(rows) and not used.any():
             return body, Sight(rejected=np.sort(o.points[known]))
-        failures, seen = body.failures.copy(), body.seen.copy()
+        failures, seen, sights = body.failures.copy(), body.seen.copy(), body.sights.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         seen[rows] = self._now
-        body = without(replace(body, failures=failures, seen=seen), failures >= _FAILURES)
+        sights[rows] += used
+        body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= _FAILURES)
         old = body.ids
         body = self._join(body, o, ~np.isin(o.points, old), camera)
         good = np.union1d(o.points[known][used], np.setdiff1d(body.ids, old))
@@ -217,17 +218,12 @@ class ObjectFilter:
         )  # fmt: skip
 
     def _join(self, body: Body, o: ObjectObservations, wanted: BoolArray, camera: CameraBelief) -> Body:
-        """With those of the wanted points that have a depth; points unseen for longest make room."""
+        """With those of the wanted points that have a depth, as far as there is room."""
+        most = self._models.objects.points
         h = self._rig.triangulate(o.uv_left, o.uv_right)
-        rows = np.flatnonzero(wanted & np.isfinite(h).all(axis=1))[: self._models.objects.points]
-        surplus = len(body.ids) + len(rows) - self._models.objects.points
-        if surplus > 0:
-            unseen = np.flatnonzero(body.seen < self._now)
-            oldest = unseen[np.argsort(body.seen[unseen], kind="stable")][:surplus]
-            gone = np.zeros(len(body.ids), bool)
-            gone[oldest] = True
-            body = without(body, gone)
-            rows = rows[: self._models.objects.points - len(body.ids)]
+        rows = np.flatnonzero(wanted & np.isfinite(h).all(axis=1))
+        body = without(body, room_makers(self._now - body.seen, body.sights, len(rows), most))
+        rows = rows[: most - len(body.ids)]
         if not len(rows):
             return body
         shape = self._shape(body, h[rows], inverse(camera.T_world_left) @ body.T)

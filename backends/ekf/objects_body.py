@@ -62,6 +62,7 @@ class Body:
         noise: what the last step of time has added to the covariance of [θ, τ, δω, δv] (12, 12).
         failures: of each point (p,), how often running its observation was rejected.
         seen: of each point (p,), when it was last observed (number of the update).
+        sights: of each point (p,), in how many updates it was used.
     """
 
     id: int
@@ -74,6 +75,7 @@ class Body:
     noise: Array
     failures: IdArray
     seen: IdArray
+    sights: IdArray
 
 
 def found(number: int, T: Array, models: ObjectModels, size: int) -> Body:
@@ -84,7 +86,7 @@ def found(number: int, T: Array, models: ObjectModels, size: int) -> Body:
     none = np.zeros(0, np.int64)
     return Body(
         number, T, np.zeros(6), none, BodyPoints.at(T, np.zeros((0, 3))),
-        P, np.zeros((RIGID, size)), np.zeros_like(P), none, none,
+        P, np.zeros((RIGID, size)), np.zeros_like(P), none, none, none,
     )  # fmt: skip
 
 
@@ -94,7 +96,7 @@ def advanced(body: Body, dt: float, models: ObjectModels) -> Body:
     R = step @ body.T[:3, :3]
     T = pose(R, body.T[:3, 3] + dt * body.velocity[3:])
     F = np.eye(RIGID)
-    F[:3, :3] = F[3:6, 3:6] = R.T @ body.T[:3, :3]
+    F[3:6, 3:6] = R.T @ body.T[:3, :3]  # a turn on the right stays what it is: exp(ω dt) R exp(θ)
     F[:3, 6:9] = dt * R.T @ so3_left_jacobian(dt * body.velocity[:3])
     F[3:6, 9:] = dt * R.T
     linear, angular = models.velocity_variance(dt)
@@ -141,6 +143,7 @@ def joined(body: Body, camera: CameraBelief, ids: IdArray, h: Array, noise: Arra
         cross=np.concatenate([body.cross, with_filter]),
         failures=np.concatenate([body.failures, np.zeros(len(ids), np.int64)]),
         seen=np.concatenate([body.seen, np.full(len(ids), now)]),
+        sights=np.concatenate([body.sights, np.ones(len(ids), np.int64)]),
     )
 
 
@@ -157,6 +160,7 @@ def without(body: Body, gone: BoolArray) -> Body:
         cross=body.cross[rows],
         failures=body.failures[~gone],
         seen=body.seen[~gone],
+        sights=body.sights[~gone],
     )
 
 

@@ -26,7 +26,7 @@ from slam.data import BoolArray, IdArray, Observations
 from slam.errors import MeasurementError
 from slam.models import EstimatorModels
 from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
-from slam.objects.points import Shape, first_frame, shape_of, with_shape
+from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
 from slam.se3 import Array, adjoint, inverse, transform
 
 _LAG = 4  # frames of a window at least
@@ -101,8 +101,9 @@ class ObjectSmoother:
     def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         frame, X = path.count - 1, path.poses[-1].copy()
         T, near = first_frame(X, seen.local)
-        window = self._join(opened(frame, float(path.stamps[-1]), T, X), seen, near)
-        window = self._solver.solved(window, _cameras(window.frames, path, camera))
+        window = opened(frame, float(path.stamps[-1]), T, X)
+        cameras = _cameras(window.frames, path, camera)
+        window = self._solver.solved(self._join(window, cameras, seen, near), cameras)
         return window, Sight(True, np.sort(window.ids))
 
     def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
@@ -131,7 +132,7 @@ class ObjectSmoother:
             found, known, rows = self._agreement(window, expected, seen)
             window = with_frame(window, frame, stamp, found.T, expected.X, found.scale)
             window.z[-1, rows[found.used]] = seen.z[known][found.used]
-            window, sight = self._exchange(window, seen, known, rows, found.used)
+            window, sight = self._exchange(window, cameras, seen, known, rows, found.used)
         window = self._solver.solved(window, cameras)
         if len(window) >= _LAG + _BATCH:
             window = self._solver.without_oldest(window, cameras, _BATCH)
@@ -156,7 +157,7 @@ class ObjectSmoother:
         return (found if enough else nothing), known, rows
 
     def _exchange(
-        self, window: Window, seen: _Measured, known: BoolArray, rows: IndexArray, used: BoolArray
+        self, window: Window, camera: CameraWindow, seen: _Measured, known: BoolArray, rows: IndexArray, used: BoolArray
     ) -> tuple[Window, Sight]:
         """Points that failed too often leave, new ones join.
 
@@ -165,30 +166,31 @@ class ObjectSmoother:
         mine = seen.ids[known]
         if len(rows) and not used.any():
             return window, Sight(rejected=np.sort(mine))
-        failures = window.failures.copy()
+        failures, unseen, sights = window.failures.copy(), window.unseen.copy(), window.sights.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
-        window = without_points(replace(window, failures=failures), failures >= _FAILURES)
+        unseen[rows] = 0
+        sights[rows] += used
+        window = replace(window, failures=failures, unseen=unseen, sights=sights)
+        window = without_points(window, failures >= _FAILURES)
         old = window.ids
-        window = self._join(window, seen, ~np.isin(seen.ids, old))
+        window = self._join(window, camera, seen, ~np.isin(seen.ids, old))
         good = np.union1d(mine[used], np.setdiff1d(window.ids, old))
         return window, Sight(bool(used.any()), good, np.setdiff1d(mine[~used], good))
 
-    def _join(self, window: Window, seen: _Measured, wanted: BoolArray) -> Window:
-        """With those of the wanted points that have a depth; points unseen for longest make room."""
+    def _join(self, window: Window, camera: CameraWindow, seen: _Measured, wanted: BoolArray) -> Window:
+        """With those of the wanted points that have a depth, as far as there is room."""
         most = self._models.objects.points
-        rows = np.flatnonzero(wanted & seen.deep)[:most]
-        surplus = len(window.ids) + len(rows) - most
-        if surplus > 0:
-            window = without_points(window, _stalest(window, surplus))
-            rows = rows[: most - len(window.ids)]
+        rows = np.flatnonzero(wanted & seen.deep)
+        gone = room_makers(window.unseen, window.sights, len(rows), most)
+        if gone.any():
+            window = without_points(self._solver.with_measured(window, camera, gone), gone)
+        rows = rows[: most - len(window.ids)]
         if not len(rows):
             return window
         Y = inverse(window.prior.X[-1]) @ window.T[-1]
-        shape = self._shape(window, seen.local[rows], inverse(Y))
-        in_camera = shape.seen_from(Y)
-        h, _ = with_shape(self._stereo.project, seen.z[rows], seen.local[rows], self._sigma, in_camera)
-        information = np.linalg.inv(shape.covariance)
-        return with_points(window, seen.ids[rows], transform(inverse(Y), h), information, shape.mean, seen.z[rows])
+        shape = self._shape(window, seen.local[rows], inverse(Y)).seen_from(Y)
+        h, _ = with_shape(self._stereo.project, seen.z[rows], seen.local[rows], self._sigma, shape)
+        return with_points(window, seen.ids[rows], transform(inverse(Y), h), shape, seen.z[rows])
 
     def _shape(self, window: Window, h: Array, T_body_left: Array) -> Shape:
         """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
@@ -258,13 +260,3 @@ def _cameras(frames: IndexArray, path: Path, known: PoseSet) -> CameraWindow:
         J[i, :, at] = np.eye(6) if frame == known.frames[at] else adjoint(inverse(X) @ known.poses[at])
     flat = J.reshape(6 * len(frames), -1)
     return CameraWindow(poses, flat @ known.covariance @ flat.T + _JITTER * np.eye(len(flat)))
-
-
-def _stalest(window: Window, count: int) -> BoolArray:
-    """Which points (p,) leave: `count` at most, not seen in the newest frame, those unseen for longest first."""
-    seen = np.isfinite(window.z[..., 0])
-    age = np.where(seen.any(axis=0), np.argmax(seen[::-1], axis=0), len(window))
-    order = np.argsort(-age, kind="stable")[:count]
-    gone = np.zeros(len(age), bool)
-    gone[order[age[order] > 0]] = True
-    return gone

@@ -14,7 +14,7 @@ from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
 from slam.gating import chi_square_limits
 from slam.objects.models import ObjectModels
-from slam.se3 import Array, adjoint, inverse, log, pose, so3_exp, so3_left_jacobian
+from slam.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (0.0, 3.0, 10.0)
@@ -64,12 +64,14 @@ def predicted(window: Window, camera: CameraWindow, stamp: float, models: Object
     A = -adjoint(inverse(X) @ T)
     W = camera.covariance[-12:, -12:]
     F = W[6:, :6] @ np.linalg.inv(W[:6, :6])
-    L = np.zeros((6 + size - window.first_point, size))
-    L[:6] = A @ by_unknowns
-    L[:6, last + 6 : last + FRAME] += F
-    L[np.arange(6, len(L)), np.arange(window.first_point, size)] = 1
-    own = L @ window.covariance @ L.T
-    own[:6, :6] += W[6:, 6:] - F @ W[:6, 6:]
+    L = A @ by_unknowns
+    L[:, last + 6 : last + FRAME] += F
+    with_all, first = L @ window.covariance, window.first_point
+    own = np.zeros((6 + size - first, 6 + size - first))
+    own[:6, :6] = with_all @ L.T + W[6:, 6:] - F @ W[:6, 6:]
+    own[:6, 6:] = with_all[:, first:]
+    own[6:, :6] = own[:6, 6:].T
+    own[6:, 6:] = window.covariance[first:, first:]
     by_velocity = A @ by_velocity
     return PredictedBody(T, X, own, (by_velocity * sigmas**2) @ by_velocity.T)
 
@@ -116,16 +118,61 @@ def agreement(
     starts = [expected.T_body_left] + ([] if guess is None else [inverse(guess) @ expected.X])
     first = None
     for factor in _SURPRISES:
-        problem = _problem(expected, stereo, sigma, probability, points, rows, z, factor)
+        belief = _belief(expected, rows, factor)
+        problem = _problem(expected, stereo, sigma, probability, points, rows, z, belief)
         for start in starts:
             Y, used = pose_only.solve(problem, start)
             off = log(inverse(problem.predicted) @ Y)
+            Y, used = _without_contradicted(problem, belief, sigma, Y, used)
             tried = Agreement(expected.X @ inverse(Y), used, float(np.hypot(1.0, factor)))
             first = first or tried
             if len(rows) < most or (used.sum() >= most and off @ problem.information @ off < limit):
                 return tried
     assert first is not None
     return first
+
+
+def _belief(expected: PredictedBody, rows: IndexArray, factor: float) -> Array:
+    """Covariance (6 + 3M, 6 + 3M) of the camera's pose in the body and of the points `rows`."""
+    mine = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
+    P: Array = expected.own[np.ix_(mine, mine)]
+    P[:6, :6] += (1 + factor**2) * expected.impulse
+    return P
+
+
+def _without_contradicted(
+    problem: pose_only.PoseProblem, belief: Array, sigma: float, Y: Array, used: BoolArray
+) -> tuple[Array, BoolArray]:
+    """Without the observations that what all others say contradicts, the worst first; with the pose that remains.
+
+    An observation with leverage draws the pose to itself, and agrees with it then: so each is judged by the others.
+    For its rows j, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``; given the others its innovation is off by ``Q_j⁻¹ y_j``,
+    with covariance ``Q_j⁻¹``.
+    """
+    count, used = len(problem.points), used.copy()
+    own = np.arange(3 * count).reshape(-1, 3)
+    limits = chi_square_limits(np.isfinite(problem.z).sum(axis=1), problem.probability)
+    while used.any():
+        r, by_pose = pose_only.residuals(problem, Y)
+        _, J = problem.stereo.project((problem.points - Y[:3, 3]) @ Y[:3, :3])
+        H = np.zeros((count, 3, 6 + 3 * count))
+        H[:, :, :6] = by_pose
+        H[np.arange(count)[:, None], :, 6 + own] = np.swapaxes(J @ Y[:3, :3].T, 1, 2)
+        missing = ~(np.isfinite(r) & used[:, None])
+        r[missing], H[missing] = 0, 0
+        H = H.reshape(3 * count, -1)
+        nu = r.reshape(-1) + H[:, :6] @ log(inverse(problem.predicted) @ Y)
+        Q = np.linalg.inv(H @ belief @ H.T + sigma**2 * np.eye(len(H)))
+        y = Q @ nu
+        Y = problem.predicted @ exp(belief[:6] @ (H.T @ y))
+        off = y.reshape(-1, 3, 1)
+        blocks = Q[own[:, :, None], own[:, None, :]]
+        excess = (off * np.linalg.solve(blocks, off)).sum(axis=(1, 2)) / limits
+        worst = excess.max()
+        if worst <= 1:
+            break
+        used &= excess <= max(1.0, 0.5 * worst)
+    return Y, used
 
 
 def _problem(
@@ -136,17 +183,14 @@ def _problem(
     points: Array,
     rows: IndexArray,
     z: Array,
-    factor: float,
+    belief: Array,
 ) -> pose_only.PoseProblem:
     """The camera's pose in the body, with the points held where they are.
 
     What pose and points have in common (where the body's frame lies in the world) matters to neither; so the pose is
     taken as known given the points, and each point given the pose.
     """
-    mine = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
-    P = expected.own[np.ix_(mine, mine)]
-    P[:6, :6] += (1 + factor**2) * expected.impulse
-    cross = P[6:, :6]
+    P, cross = belief, belief[6:, :6]
     given_points = P[:6, :6] - cross.T @ np.linalg.solve(P[6:, 6:], cross)
     given_pose = P[6:, 6:] - cross @ np.linalg.solve(P[:6, :6], cross.T)
     own = np.arange(3 * len(rows)).reshape(-1, 3)

@@ -19,7 +19,8 @@ from backends.smoother.records import IndexArray
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray
 from slam.objects.models import ObjectModels
-from slam.se3 import Array, exp, inverse, log
+from slam.objects.points import Shape
+from slam.se3 import Array, exp, hat, inverse, log, transform
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
@@ -66,6 +67,8 @@ class Window:
         ids: of the points (p,).
         points: in body coordinates (p, 3).
         failures: how often running each point's observation was rejected (p,).
+        unseen: number of frames since each point was last observed (p,).
+        sights: in how many frames each point was used (p,).
         fresh: whether the first frame is that of the first sight.
         prior: of what has left.
         covariance: of all unknowns (12 n + 3 p, 12 n + 3 p) after the last solution, zero for those new since.
@@ -79,6 +82,8 @@ class Window:
     ids: IdArray
     points: Array
     failures: IdArray
+    unseen: IdArray
+    sights: IdArray
     fresh: bool
     prior: Prior
     covariance: Array
@@ -107,17 +112,15 @@ def opened(frame: int, stamp: float, T: Array, X: Array, covariance: Array = _EX
     none = np.zeros(0, np.int64)
     points = np.zeros((0, 3))
     return Window(
-        np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points, none, True,
-        Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
+        np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points,
+        none, none, none, True, Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
     )  # fmt: skip
 
 
 def with_frame(window: Window, frame: int, stamp: float, T: Array, X: Array, scale: float) -> Window:
     """With one more frame, in which nothing has been measured yet."""
-    first, size = window.first_point, FRAME * len(window) + 3 * len(window.ids)
-    old = np.concatenate([np.arange(first), np.arange(first, size) + FRAME])
-    p = window.prior
-    prior = Prior(_spread(p.system, old, size + FRAME), _append(p.T, T), _append(p.X, X), p.points)
+    first, p = window.first_point, window.prior
+    prior = Prior(_widened(p.system, first, FRAME), _append(p.T, T), _append(p.X, X), p.points)
     return replace(
         window,
         frames=np.append(window.frames, frame),
@@ -125,34 +128,46 @@ def with_frame(window: Window, frame: int, stamp: float, T: Array, X: Array, sca
         T=_append(window.T, T),
         scales=np.append(window.scales, scale),
         z=_append(window.z, np.full(window.z.shape[1:], np.nan)),
+        unseen=window.unseen + 1,
         prior=prior,
-        covariance=_spread_matrix(window.covariance, old, size + FRAME),
+        covariance=_with_zeros(window.covariance, first, FRAME),
     )
 
 
-def with_points(window: Window, ids: IdArray, points: Array, information: Array, mean: Array, z: Array) -> Window:
-    """With new points (M, 3), measured z (M, 3) in the newest frame; of each it is known that it belongs to the body.
+def with_points(window: Window, ids: IdArray, points: Array, shape: Shape, z: Array) -> Window:
+    """With new points (M, 3), measured z (M, 3) in the newest frame.
 
-    That is the Gaussian with mean (3,) and information (3, 3) in body coordinates.
+    Of each it is known that it belongs to the body: a Gaussian in the coordinates of the newest camera. Were it one in
+    body coordinates, every new point would say where the body is, though the shape is but what the body's own points
+    have shown.
     """
     if not len(ids):
         return window
-    size, count = len(window.prior.system.vector), len(ids)
-    system = _spread(window.prior.system, np.arange(size), size + 3 * count)
-    rows = size + np.arange(3 * count).reshape(-1, 3)
-    system.information[rows[:, :, None], rows[:, None, :]] = information
-    system.vector[rows] = (mean - points) @ information
+    p, count, last = window.prior, len(ids), FRAME * (len(window) - 1)
+    size = len(p.system.vector)
+    system = _widened(p.system, size, 3 * count)
+    Y = inverse(p.X[-1]) @ p.T[-1]
+    R, h = Y[:3, :3], transform(Y, points)
+    J = np.zeros((count, 3, FRAME + 3))
+    J[:, :, :3], J[:, :, 3:6], J[:, :, 6:9] = -R @ hat(points), R, hat(h)
+    J[:, :, 9:12], J[:, :, 12:] = -np.eye(3), R
+    weighted = np.swapaxes(J, 1, 2) @ np.linalg.inv(shape.covariance)
+    for i, (H, g) in enumerate(zip(weighted @ J, (weighted @ (shape.mean - h)[:, :, None])[:, :, 0])):
+        unknowns = np.concatenate([last + np.arange(FRAME), size + 3 * i + np.arange(3)])
+        system.information[np.ix_(unknowns, unknowns)] += H
+        system.vector[unknowns] += g
     measured = np.full((len(window), count, 3), np.nan)
     measured[-1] = z
-    prior = replace(window.prior, system=system, points=np.concatenate([window.prior.points, points]))
     return replace(
         window,
         z=np.concatenate([window.z, measured], axis=1),
         ids=np.concatenate([window.ids, ids]),
         points=np.concatenate([window.points, points]),
         failures=np.concatenate([window.failures, np.zeros(count, np.int64)]),
-        prior=prior,
-        covariance=_spread_matrix(window.covariance, np.arange(size), size + 3 * count),
+        unseen=np.concatenate([window.unseen, np.zeros(count, np.int64)]),
+        sights=np.concatenate([window.sights, np.ones(count, np.int64)]),
+        prior=replace(p, system=system, points=np.concatenate([p.points, points])),
+        covariance=_with_zeros(window.covariance, size, 3 * count),
     )
 
 
@@ -169,6 +184,8 @@ def without_points(window: Window, gone: BoolArray) -> Window:
         ids=window.ids[~gone],
         points=window.points[~gone],
         failures=window.failures[~gone],
+        unseen=window.unseen[~gone],
+        sights=window.sights[~gone],
         prior=prior,
         covariance=window.covariance[np.ix_(kept, kept)],
     )
@@ -218,6 +235,21 @@ class Solver:
             raise np.linalg.LinAlgError("the window has no usable solution")
         return replace(now, covariance=covariance)
 
+    def with_measured(self, window: Window, camera: CameraWindow, points: BoolArray) -> Window:
+        """All that the window has measured of some points (mask (p,)) taken into the prior.
+
+        So they may go without loss.
+        """
+        if not np.isfinite(window.z[:, points]).any():
+            return window
+        taken = replace(window, z=np.where(points[:, None], window.z, np.nan))
+        system = self._system(taken, camera.poses, len(window), range(0))
+        return replace(
+            window,
+            z=np.where(points[:, None], np.nan, window.z),
+            prior=Prior(system, window.T, camera.poses, window.points),
+        )
+
     def without_oldest(self, window: Window, camera: CameraWindow, count: int) -> Window:
         """Without the `count` oldest frames, which are marginalised; the window must be solved."""
         n = len(window)
@@ -261,16 +293,19 @@ def _cameras(n: int) -> IndexArray:
     return (FRAME * np.arange(n)[:, None] + 6 + np.arange(6)).reshape(-1)
 
 
-def _spread(system: System, places: IndexArray, size: int) -> System:
-    """The same system over more unknowns, with the old ones at `places`."""
-    out = System(_spread_matrix(system.information, places, size), np.zeros(size))
-    out.vector[places] = system.vector
-    return out
+def _widened(system: System, at: int, count: int) -> System:
+    """The same system with `count` more unknowns at the place `at`, of which nothing is known."""
+    old = system.vector
+    vector = np.concatenate([old[:at], np.zeros(count), old[at:]])
+    return System(_with_zeros(system.information, at, count), vector)
 
 
-def _spread_matrix(matrix: Array, places: IndexArray, size: int) -> Array:
+def _with_zeros(matrix: Array, at: int, count: int) -> Array:
+    """The matrix with `count` more rows and columns at the place `at`."""
+    size = len(matrix) + count
     out = np.zeros((size, size))
-    out[np.ix_(places, places)] = matrix
+    out[:at, :at], out[:at, at + count :] = matrix[:at, :at], matrix[:at, at:]
+    out[at + count :, :at], out[at + count :, at + count :] = matrix[at:, :at], matrix[at:, at:]
     return out
 
 

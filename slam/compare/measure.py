@@ -124,8 +124,7 @@ class Collector:
         world = self.sequence if self.sequence.format == "synthetic" else None
         self._truth = None if world is None else SurfacePoints(cast(TrueWorld, world))
         self._frames: list[_Frame] = []
-        self._first_seen: dict[int, int] = {}
-        self._lifetimes: list[int] = []
+        self._lifetimes = Lifetimes()
         self._right = self._wrong = 0
 
     def add(self, result: FrameResult) -> None:
@@ -137,10 +136,7 @@ class Collector:
                 self._right += int((errors < _RIGHT).sum())
                 self._wrong += int((errors >= _RIGHT).sum())
             self._truth.add(number, result.added, features.uv_left[result.added_features])
-        for i in result.added.tolist():
-            self._first_seen[i] = result.index
-        for i in result.erased.tolist():
-            self._lifetimes.append(result.index - self._first_seen.pop(i))
+        self._lifetimes.add(result)
         e = result.estimate
         self._frames.append(
             _Frame(
@@ -196,19 +192,40 @@ class Collector:
         }
 
     def _map_figures(self) -> dict[str, float]:
-        """Size of the map and lifetimes; those still in the map have lived until the last frame."""
+        """Size of the map and lifetimes."""
         frames = self._frames
-        last = len(frames) - 1
-        lived = [*self._lifetimes, *(last - first for first in self._first_seen.values())]
         scored = self._right + self._wrong
         tracked = sum(f.status in (FrameStatus.TRACKED, FrameStatus.STARTED) for f in frames)
         return {
             "association_precision": self._right / scored if scored else float("nan"),
             "tracked": tracked / len(frames),
             "map_size": float(np.mean([f.map_size for f in frames])),
-            "lifetime_frames": float(np.median(lived)) if lived else float("nan"),
+            "lifetime_frames": self._lifetimes.median,
             "used_per_frame": float(np.mean([f.used for f in frames])),
         }
+
+
+class Lifetimes:
+    """How long landmarks stay in the map; those still in it have lived until the last frame."""
+
+    def __init__(self) -> None:
+        self._first: dict[int, int] = {}
+        self._ended: list[int] = []
+        self._last = 0
+
+    def add(self, result: FrameResult) -> None:
+        """One more frame."""
+        self._last = result.index
+        for i in result.added.tolist():
+            self._first[i] = result.index
+        for i in result.erased.tolist():
+            self._ended.append(result.index - self._first.pop(i))
+
+    @property
+    def median(self) -> float:
+        """In frames; NaN where there was no landmark."""
+        lived = [*self._ended, *(self._last - first for first in self._first.values())]
+        return float(np.median(lived)) if lived else float("nan")
 
 
 @dataclass(frozen=True)

@@ -32,9 +32,23 @@ def test_motion_error_is_that_of_the_bodys_place():
 
 
 def test_nees_of_gaussian_errors_is_its_dimension():
+    """The first row defines the body's frame, whichever frame the truth has, and does not count."""
     P = np.diag([1e-4] * 3 + [1e-5] * 3)
     true = np.repeat(TRUE, 50, axis=0)
-    errors = RNG.multivariate_normal(np.zeros(6), P, len(true))
-    values = object_nees(true @ exp(errors), np.repeat(P[None], len(true), axis=0), true)
+    estimated = true @ exp(RNG.multivariate_normal(np.zeros(6), P, len(true)))
+    estimated[0] = true[0]
+    covariances = np.repeat(P[None], len(true), axis=0)
+    covariances[0] = 0
+    values = object_nees(estimated, covariances, true @ CHANGE)
+    assert len(values) == len(true) - 1
     # 1000 values of mean 6 and variance 12: a deviation of 0.11 on the mean.
     assert abs(values.mean() - 6) < 0.4
+
+
+def test_nees_leaves_out_what_is_numerically_singular():
+    """Whether a covariance is singular does not depend on how large it is."""
+    small, certain = 1e-14 * np.eye(6), np.diag([1e-4] * 5 + [0.0])
+    one = np.ones((6, 6)) * 1e-4
+    covariances = np.array([np.zeros((6, 6)), small, certain, one, np.eye(6)])
+    values = object_nees(np.repeat(TRUE[:1], 5, axis=0), covariances, np.repeat(TRUE[:1], 5, axis=0))
+    np.testing.assert_allclose(values, np.zeros(2), atol=1e-3)
