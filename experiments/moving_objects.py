@@ -107,7 +107,7 @@ def scored_run(name: str, backend: str, images: bool, frames: int, *settings: st
 def table1(images: bool, quick: bool) -> list[dict[str, Any]]:
     """Paper B, Table 1: where the box is said to be at its four places, and the errors."""
     sequence = slam.open_sequence("synthetic:box?density=300&camera=still")
-    frames = 170 if quick else len(sequence)
+    frames = 40 if quick else len(sequence)
     true = np.array([sequence.objects(k).T_world_object[0] for k in range(frames)])
     rows = []
     for backend in BACKENDS:
@@ -159,7 +159,7 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
 
 def moving(images: bool, quick: bool) -> list[dict[str, Any]]:
     """The box under a moving camera, and the same run without the box's features."""
-    name, frames = "box?density=300&camera=moving", 120 if quick else 10**6
+    name, frames = "box?density=300&camera=moving", 40 if quick else 10**6
     rows = []
     for backend in BACKENDS:
         row = scored_run(name, backend, images, frames)
@@ -173,7 +173,7 @@ def moving(images: bool, quick: bool) -> list[dict[str, Any]]:
 
 def paired(images: bool, quick: bool) -> list[dict[str, Any]]:
     """Both back ends on identical measurements, bodies included: the filter drives, the smoother is given the same."""
-    seeds, frames = (1, 110) if quick else (6, 200)
+    seeds, frames = (1, 40) if quick else (6, 200)
     values: dict[str, list[list[float]]] = {}
     for seed in range(seeds):
         sequence = slam.open_sequence(f"synthetic:box?density=300&camera=moving&seed={seed}")
@@ -204,20 +204,20 @@ def paired(images: bool, quick: bool) -> list[dict[str, Any]]:
 
 def boxes(images: bool, quick: bool) -> list[dict[str, Any]]:
     """Three boxes and an articulated one."""
-    frames = 60 if quick else 300
+    frames = 20 if quick else 300
     return [scored_run("boxes?density=300", backend, images, frames) for backend in BACKENDS]
 
 
 def still(images: bool, quick: bool) -> list[dict[str, Any]]:
     """Nothing moves."""
-    seeds, frames = (1, 30) if quick else (10, 100)
+    seeds, frames = (1, 15) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
     return [scored_run(f"{w}seed={seed}", "ekf", images, frames) for w in worlds for seed in range(seeds)]
 
 
 def street(images: bool, quick: bool) -> list[dict[str, Any]]:
     """Cars that drive ahead and come towards the camera."""
-    return [scored_run("street?density=3", backend, images, 60 if quick else 10**6) for backend in BACKENDS]
+    return [scored_run("street?density=3", backend, images, 20 if quick else 10**6) for backend in BACKENDS]
 
 
 def kitti(images: bool, quick: bool) -> list[dict[str, Any]]:
@@ -233,7 +233,7 @@ def kitti(images: bool, quick: bool) -> list[dict[str, Any]]:
         system = system_for(sequence, backend, True, [])
         seen: dict[int, list[tuple[int, int, float, float]]] = {}
         milliseconds = []
-        for k, frame in enumerate(sequence.frames(0, 30 if quick else None)):
+        for k, frame in enumerate(sequence.frames(0, 12 if quick else None)):
             result = system.process(frame)
             milliseconds.append(result.milliseconds["objects"])
             for thing in result.objects:

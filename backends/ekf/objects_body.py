@@ -223,11 +223,12 @@ def corrected(body: Body, covariances: Gathered, s: Array, B: Array) -> Body:
     change = covariances.body @ (s + np.linalg.solve(covariances.own, off))
     change[:6] = np.concatenate([turn, shift])
     W = covariances.body @ B
-    return replace(
+    after = replace(
         _changed(body, change),
         covariance=body.covariance - W @ W.T,
         cross=body.cross - W @ (covariances.filter @ B).T,
     )
+    return _with_free_frame(body, after)
 
 
 def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, W: Array) -> Body:
@@ -236,11 +237,12 @@ def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, 
     """
     mine = body.cross[:, columns]
     V = mine @ B
-    return replace(
+    after = replace(
         _changed(body, mine @ s),
         covariance=body.covariance - V @ V.T,
         cross=body.cross - V @ W[: body.cross.shape[1]].T,
     )
+    return _with_free_frame(body, after)
 
 
 def _changed(body: Body, change: Array) -> Body:
@@ -251,3 +253,27 @@ def _changed(body: Body, change: Array) -> Body:
         velocity=body.velocity + change[6:RIGID],
         points=body.points.plus(change[RIGID:].reshape(-1, 3)),
     )
+
+
+def _with_free_frame(before: Body, after: Body) -> Body:
+    """With covariances that know where the body's frame lies no better than before the points were changed.
+
+    No measurement says where in the body its frame lies: a change [θ, τ] of it changes the points by ``N [θ, τ]`` and
+    no prediction. N depends on the points; were the covariance kept in the coordinates of their old places, each
+    update would seem to say something of it.
+    """
+    if not len(after.ids):
+        return after
+    moved_on = _by_frame(after.points) - _by_frame(before.points)
+    P, cross = after.covariance.copy(), after.cross.copy()
+    P[RIGID:] += moved_on @ P[:6]
+    P[:, RIGID:] += P[:, :6] @ moved_on.T
+    cross[RIGID:] += moved_on @ cross[:6]
+    return replace(after, covariance=P, cross=cross)
+
+
+def _by_frame(points: BodyPoints) -> Array:
+    """Change (3p, 6) of the points' coordinates with a change [θ, τ] of the body's frame that leaves them in place."""
+    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    by_frame = np.concatenate([hat(points.cartesian()), -eye], axis=2)
+    return np.asarray(np.linalg.solve(points.derivatives(), by_frame).reshape(-1, 6))

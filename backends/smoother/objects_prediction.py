@@ -155,12 +155,12 @@ def _without_contradicted(
     while used.any():
         r, by_pose = pose_only.residuals(problem, Y)
         _, J = problem.stereo.project((problem.points - Y[:3, 3]) @ Y[:3, :3])
-        H = np.zeros((count, 3, 6 + 3 * count))
-        H[:, :, :6] = by_pose
-        H[np.arange(count)[:, None], :, 6 + own] = np.swapaxes(J @ Y[:3, :3].T, 1, 2)
+        by_all = np.zeros((count, 3, 6 + 3 * count))
+        by_all[:, :, :6] = by_pose
+        by_all[np.arange(count)[:, None], :, 6 + own] = np.swapaxes(J @ Y[:3, :3].T, 1, 2)
         missing = ~(np.isfinite(r) & used[:, None])
-        r[missing], H[missing] = 0, 0
-        H = H.reshape(3 * count, -1)
+        r[missing], by_all[missing] = 0, 0
+        H = by_all.reshape(3 * count, -1)
         nu = r.reshape(-1) + H[:, :6] @ log(inverse(problem.predicted) @ Y)
         Q = np.linalg.inv(H @ belief @ H.T + sigma**2 * np.eye(len(H)))
         y = Q @ nu

@@ -278,14 +278,37 @@ class Solver:
         Of the measurements only those of the first frames are taken, `measured` in number, and of the steps of motion
         only `steps`.
         """
-        p, n = window.prior, len(window)
-        moved = log(inverse(np.concatenate([p.T, p.X])) @ np.concatenate([window.T, X]))
-        delta = np.concatenate([moved.reshape(2, n, 6).swapaxes(0, 1).reshape(-1), (window.points - p.points).ravel()])
-        system = System(p.system.information.copy(), p.system.vector - p.system.information @ delta)
+        system = _prior_at(window, X)
         Y = inverse(X[:measured]) @ window.T[:measured]
         add_measurements(system, self._stereo, self._sigma, window.z[:measured], Y, window.points, window.first_point)
         add_motion(system, self._models, window.T, window.stamps, window.scales, window.fresh, steps)
         return system
+
+
+def _prior_at(window: Window, X: Array) -> System:
+    """The prior for changes of the window's poses and points and of cameras X, instead of where it was linearised.
+
+    No measurement says where in the body its frame lies: a change [θ, τ] of it, which moves all body poses alike,
+    changes the points by ``N [θ, τ]`` and no prediction. N depends on the points. So that the prior does not hold on
+    to the N of their old places, and with every marginalisation seem to say something of the frame, it is taken to be
+    one on the body's poses and on where the points are beside the oldest of them.
+    """
+    p, n = window.prior, len(window)
+    moved = log(inverse(np.concatenate([p.T, p.X])) @ np.concatenate([window.T, X]))
+    before, now = _by_frame(p.points), _by_frame(window.points)
+    beside = transform(inverse(p.T[0]) @ window.T[0], window.points) - p.points + before @ moved[0]
+    delta = np.concatenate([moved.reshape(2, n, 6).swapaxes(0, 1).reshape(-1), beside.ravel()])
+    H, vector = p.system.information.copy(), p.system.vector - p.system.information @ delta
+    moved_on, points = (now - before).reshape(-1, 6), slice(window.first_point, None)
+    H[:, :6] -= H[:, points] @ moved_on
+    H[:6] -= moved_on.T @ H[points]
+    vector[:6] -= moved_on.T @ vector[points]
+    return System(H, vector)
+
+
+def _by_frame(points: Array) -> Array:
+    """Change (p, 3, 6) of points with a change [θ, τ] of the body's frame that leaves them in place."""
+    return np.concatenate([hat(points), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
 
 
 def _cameras(n: int) -> IndexArray:

@@ -90,7 +90,7 @@ def test_back_ends_agree(make):
     for x, y in zip(a.estimates[1:], b.estimates[1:]):
         off = se3.log(se3.inverse(x.T_world_object) @ y.T_world_object)
         shares.append(np.abs(off) / np.sqrt(np.diag(y.covariance)))
-        np.testing.assert_allclose(np.diag(x.covariance), np.diag(y.covariance), rtol=0.5)
+        np.testing.assert_allclose(np.diag(x.covariance), np.diag(y.covariance), rtol=0.8)
     assert np.median(shares) < 0.25
 
 

@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 
 import backends
+from backends.ekf.objects_body import RIGID, _by_frame, _with_free_frame, advanced, found
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
 from backends.smoother.objects_factors import System, add_measurements, add_motion, velocities
+from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
 from backends.smoother.stereo import RectifiedStereo
 from slam import se3
 from slam.metrics import chi_square_band
 from slam.objects.models import ObjectModels
-from slam.objects.points import Shape, first_frame, shape_of, with_shape
+from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
 from tests.backends.objects_scene import HANDHELD, KITTI, SIGMA, box_points, box_scene, car_scene, follow, score
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "smoother"])
-SEEDS = 16
+SEEDS = 20
 LATEST = (1, 4, 8)  #: frames judged; they are some frames apart, so nearly independent
 
 
@@ -116,7 +118,62 @@ def test_changes_of_a_pose():
     np.testing.assert_allclose(moved(T, small), T @ se3.exp(small), atol=1e-8)
 
 
+def test_a_turn_of_the_body_stays_what_it_is_while_it_turns_on():
+    """The covariance of a pose after a step is that of poses perturbed before it."""
+    xi, models = 1e-4 * np.arange(1.0, 7.0), ObjectModels()
+    body = replace(
+        found(1, se3.pose(np.eye(3), [0.1, 0.2, 1.0]), models, 0), velocity=np.array([3.0, 5, -4, 0.2, 0, 1])
+    )
+    P = np.zeros((RIGID, RIGID))
+    P[:6, :6] = np.outer(xi, xi)
+    one = advanced(replace(body, covariance=P), 0.1, models)
+    other = advanced(replace(body, T=body.T @ se3.exp(xi)), 0.1, models)
+    after = se3.log(se3.inverse(one.T) @ other.T)
+    np.testing.assert_allclose((one.covariance - one.noise)[:6, :6], np.outer(after, after), rtol=2e-3)  # of 3e-4 in size
+
+
+def test_the_filter_never_learns_where_in_a_body_its_frame_lies():
+    """What only the frame is unsure of stays so after the points were changed, whatever their coordinates."""
+    rng = np.random.default_rng(4)
+    h = box_points(5, np.full(3, 0.3), np.array([0.05, 0, 1.2]), rng)
+    body = found(1, se3.pose(np.eye(3), [0, 0, 1.2]), ObjectModels(), 2)
+    points = BodyPoints.at(se3.inverse(body.T), h)
+    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), _by_frame(points)])
+    none = np.zeros(5, np.int64)
+    before = replace(
+        body, ids=np.arange(5), points=points, covariance=1e-4 * frame @ frame.T, cross=frame @ np.ones((6, 2)),
+        failures=none, seen=none, sights=none,
+    )  # fmt: skip
+    after = _with_free_frame(before, replace(before, points=points.plus(0.02 * rng.standard_normal((5, 3)))))
+    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), _by_frame(after.points)])
+    np.testing.assert_allclose(after.covariance, 1e-4 * frame @ frame.T, atol=1e-12)
+    np.testing.assert_allclose(after.cross, frame @ np.ones((6, 2)), atol=1e-9)
+
+
 # --- parts of the smoother ---
+
+
+def test_the_smoothers_prior_never_learns_where_in_a_body_its_frame_lies():
+    """Measurements in the prior say nothing of the frame, also where the points are no longer where they were then."""
+    rng, stereo = np.random.default_rng(5), RectifiedStereo.of(HANDHELD)
+    T, points = se3.pose(np.eye(3), [0, 0, 1.2]), box_points(4, np.full(3, 0.3), np.zeros(3), rng)
+    z, _ = stereo.project(se3.transform(T, points))
+    window = with_frame(opened(0, 0.0, T, np.eye(4)), 1, 0.1, T, np.eye(4), 1.0)
+    window = with_points(window, np.arange(4), points, Shape(T[:3, 3], np.eye(3)), z)
+    X = np.tile(np.eye(4), (2, 1, 1))
+    system = System.empty(24 + 12)
+    add_measurements(system, stereo, SIGMA, np.array([z, z]), window.T, points, 24)
+    window = replace(window, prior=Prior(system, window.T, X, points))
+    shift = 0.01 * rng.standard_normal((4, 3))
+    xi = np.array([0.3, -0.2, 0.4, 0.1, 0.2, -0.1])
+    D = se3.exp(xi)
+    cases = [(window.T, points + shift), (window.T @ D, se3.transform(se3.inverse(D), points))]
+    for T, Y in cases:
+        at = _prior_at(replace(window, T=T, points=Y), X)
+        frame = np.concatenate([xi, np.zeros(6), xi, np.zeros(6), (np.cross(Y, xi[:3]) - xi[3:]).reshape(-1)])
+        assert np.abs(at.information @ frame).max() < 1e-9 * np.abs(at.information).max()
+    # another frame altogether, with the points where they were in the world, is as good
+    np.testing.assert_allclose(at.vector, 0, atol=1e-6 * np.abs(at.information).max())
 
 
 def _error(stereo, z, T, X, points, stamps, models):
@@ -200,3 +257,20 @@ def test_few_points_show_no_shape():
     shape = shape_of(np.array([[0.0, 0, 1], [0.1, 0, 1]]), covariances)
     np.testing.assert_allclose(shape.covariance, np.eye(3))
     assert isinstance(shape.seen_from(np.eye(4)), Shape)
+
+
+# --- who makes room ---
+
+
+def test_points_unseen_for_longer_than_they_were_seen_make_room():
+    unseen, sights = np.array([0, 3, 1, 9, 0]), np.array([5, 2, 20, 8, 1])
+    np.testing.assert_array_equal(room_makers(unseen, sights, 0, 5), False)
+    np.testing.assert_array_equal(room_makers(unseen, sights, 1, 5), [0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(room_makers(unseen, sights, 4, 5), [0, 1, 0, 1, 0])  # seldom missed: stays
+
+
+def test_a_body_that_has_turned_round_takes_up_new_points():
+    unseen, sights = np.full(10, 2), np.full(10, 50)
+    assert room_makers(unseen, sights, 8, 10).sum() == 5  # half of its points at least shall be in view
+    assert room_makers(unseen, sights, 3, 10).sum() == 3
+    assert not room_makers(np.zeros(10, np.int64), sights, 8, 10).any()
