@@ -80,7 +80,7 @@ class ObjectEstimate:
         stamp: time [s].
         T_world_object: pose (4, 4).
         covariance: its covariance (6, 6), [rotation, translation], of a perturbation on the right (body axes),
-            given the camera's uncertainty too.
+            given the camera's uncertainty too. It is that of the motion since the first sight, where the pose has none.
         velocity: angular [rad/s] and linear [m/s] velocity (6,) of the body's origin, in world axes.
         velocity_covariance: its covariance (6, 6).
         measured: whether the body was measured in this frame; else it was predicted.
