@@ -96,12 +96,13 @@ def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
 
 
 def printed_by(experiment: Experiment, folder: Path, quick: bool, resume: bool) -> tuple[str, str]:
-    """What a script prints, now or in an earlier call, and why it failed; it is kept in ``printed.md``."""
+    """What a script prints, now or in an earlier call, and why it failed; it is kept beside its files."""
     out = (folder / experiment.name).absolute()
     out.mkdir(parents=True, exist_ok=True)
-    kept = out / "printed.md"
+    kept = out / ("printed_quick.md" if quick else "printed.md")
     if resume and kept.exists():
         return kept.read_text(encoding="utf-8"), ""
+    kept.unlink(missing_ok=True)
     print(f"{experiment.name} …", file=sys.stderr, flush=True)
     printed, failure = run(experiment, out, quick)
     if failure:
@@ -152,6 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
     parser.add_argument("--resume", action="store_true", help="do not run again what ran to its end in --out")
     given = parser.parse_args(arguments)
+    if given.only and given.page == parser.get_default("page"):
+        parser.error("--only would leave the other sections out of the page: name another --page")
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
     with ThreadPoolExecutor(given.processes) as pool:
         outcomes = list(pool.map(lambda e: printed_by(e, given.out, given.quick, given.resume), chosen))

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -157,7 +158,8 @@ def replay_command(
     from slam.runner import RunOptions, run_recording
 
     loaded = load_recording(recording)
-    config = SystemConfig(models=loaded.models).with_settings(settings or [])
+    default = SystemConfig.for_kind(loaded.kind, None, backend)
+    config = replace(default, models=loaded.models).with_settings(settings or [])
     progress = Progress(len(loaded), f"{loaded.name} · {backend}", quiet)
     with progress, _whole_frames(progress.frame) as end_of_frame:
         summary = run_recording(loaded, RunOptions(backend, "recording", config, out), end_of_frame)

@@ -120,7 +120,7 @@ class MapKeeper:
 
         What moves, or lies on a body that moves, becomes none, nor what is in doubt.
         """
-        if len(landmarks) and not step.tracking.may_add(self.config.map):
+        if len(landmarks) >= _MINIMUM_TRACKED and not step.tracking.may_add(self.config.map):
             return landmarks, Recognition.nothing()
         features, found = step.features, step.found
         free = ~known

@@ -1,7 +1,7 @@
 """Recordings as files: an .npz of plain arrays, without pickled objects, with a version.
 
-Keys: ``format``, ``version``, ``name``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``, ``observed_…`` and
-``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where earlier frames were
+Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
+``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where earlier frames were
 mended ``shift``, and, where the true path is known, ``truth_stamps`` and ``truth_poses``. Meanings:
 `slam.replay.Recording`.
 """
@@ -42,6 +42,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         "format": _FORMAT,
         "version": _VERSION,
         "name": r.name,
+        "kind": r.kind,
         "rig": json.dumps(_rig_tree(r.rig)),
         "models": json.dumps(asdict(r.models)),
         "numbers": r.numbers,
@@ -105,6 +106,7 @@ def _recording(arrays: Mapping[str, np.ndarray]) -> Recording:
         _array(arrays, "removed", 1, np.int64),
         truth,
         shift=_array(arrays, "shift", 1, float) if "shift" in arrays else None,
+        kind=str(arrays.get("kind", "handheld")),
     )
     _check_lives(recording)
     return recording

@@ -12,6 +12,7 @@ from slam.se3 import Array, inverse, log
 from slam.trajectory import Trajectory
 
 _SIGMAS = 3.0
+_LEAST_VARIANCE = 1e-12  # of a landmark's place along any direction [m²]
 _SLACK = 0.05  # between two poses found one by one [m], [rad]
 
 
@@ -50,6 +51,8 @@ def hand_over(old: Backend, new: Backend) -> Trajectory:
     assert isinstance(new, MapBackend)
     whole = old.estimate()
     covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
+    short = np.maximum(_LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)  # by rounding
+    covariances = covariances + short[:, None, None] * np.eye(3)
     new.insert(whole.ids, whole.positions, covariances)
     path = old.trajectory()
     return Trajectory(path.stamps[:-1], path.poses[:-1])

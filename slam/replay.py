@@ -122,6 +122,7 @@ class Recording:
         removed_frame, removed: row of `stamps`, ascending, and id of each landmark that left the map (R,).
         ground_truth: the left camera's true path, where it is known.
         shift: of the right pixels of all earlier frames, before each (F,) [px]; None for none at all.
+        kind: of motion, which chooses a back end's default options.
 
     Raises:
         MeasurementError: arrays do not fit each other, stamps do not increase, or a value is not finite.
@@ -139,6 +140,7 @@ class Recording:
     ground_truth: Trajectory | None = None
     warnings: list[str] = field(default_factory=list)
     shift: Array | None = None
+    kind: str = "handheld"
 
     format: ClassVar[str] = "recording"
 

@@ -188,11 +188,27 @@ def _drive(
         finally:
             summary = _finish(sequence, options, system, record, files, ended, score)
             if options.record is not None:
-                models, truth = options.config.models, sequence.ground_truth
-                save_recording(Recording.of(tape, sequence.rig, models, sequence.name, truth), options.record)
+                save_recording(_recording(sequence, options, system, tape), options.record)
             if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
                 save_map(options.save_map, system)
     return summary
+
+
+def _recording(
+    sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed, tape: list[RecordedFrame]
+) -> Recording:
+    """What was given to the back end of a run.
+
+    Raises:
+        SlamError: it was given to more than one.
+    """
+    if isinstance(system, StereoSlam) and system.begun_anew:
+        raise SlamError(
+            f"{options.record}: not written: the camera was carried off, and another back end went on in frame "
+            f"{system.begun_anew[0]}; what is recorded is for one"
+        )
+    whole = Recording.of(tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
+    return replace(whole, kind=sequence.kind)
 
 
 def _processed(
@@ -202,9 +218,9 @@ def _processed(
     for frame, elapsed in _timed(frames):
         result = system.process(frame)
         result.milliseconds["read"] = elapsed  # type: ignore[index]
+        yield frame.index, result
         for watch in watches:
             watch(frame, result, system)
-        yield frame.index, result
 
 
 @dataclass(frozen=True)

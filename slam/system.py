@@ -100,6 +100,7 @@ class StereoSlam:
         self._may_begin_anew = isinstance(backend, str) and isinstance(self.backend, MapBackend)
         self._carried = Sightings()
         self._past: list[Trajectory] = []  # the paths of back ends before the camera was carried off
+        self.begun_anew: list[int] = []  # indices of the frames in which another back end went on
         self._search: MapSearch | None = None
         if known_map is not None:
             self._search_in(known_map, backend)
@@ -244,7 +245,8 @@ class StereoSlam:
         new = self._new_backend(T_world_left)
         self._past.append(hand_over(self.backend, new))
         self.backend, self._carried = new, Sightings()
-        self.objects = detector_for(self.rig, self.config.objects, self.config.models)
+        self.begun_anew.append(self._index)
+        self.objects.begin_anew()
         return self.backend.predict(stamp)
 
     def _tracked(

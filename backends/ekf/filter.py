@@ -179,6 +179,7 @@ class EkfBackend:
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
         self._objects.remove(ids)
+        self._has_objects = bool(self._objects.count)
 
     # --- the filter's parts ---
 

@@ -90,6 +90,11 @@ class ObjectFilter:
         for number in numbers:
             del self._bodies[number]
 
+    @property
+    def count(self) -> int:
+        """Number of bodies."""
+        return len(self._bodies)
+
     # --- what happens to the filter's state happens to the bodies' covariance with it ---
 
     def camera_moved(self, dt: float) -> None:

@@ -170,8 +170,9 @@ class PoseGraph:
         marks = self.records.landmarks
         self.records.shift_right(shift, self._make.point)
         self._recover()
-        for _ in range(_REFINED):
-            self._place(marks.used())
+        with suppress(SolverError):  # of a problem that could not be solved: the landmarks stay where they were
+            for _ in range(_REFINED):
+                self._place(marks.used())
 
     def window(self) -> PoseSet:
         """The newest poses with their joint covariance; computed once per state."""

@@ -57,6 +57,12 @@ class MovingObjectDetector:
         self._estimated: set[int] = set()  # bodies that the back end knows
         self.suspects = np.zeros(0, np.int64)
 
+    def begin_anew(self) -> None:
+        """See `slam.objects.modes.ObjectDetector`."""
+        self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
+        self._stamps[:], self._frame = np.nan, -1
+        self._forgotten, self._estimated = [], set()
+
     # ------------------------------------------------------------------------------------------- a step, first part
 
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
@@ -70,6 +76,7 @@ class MovingObjectDetector:
         self._measure(tracks, features, T_world_left)
         seen = np.flatnonzero(tracks.seen)
         known = seen[landmark[tracks.row[seen]] >= 0]
+        tracks.landmark[np.isin(tracks.landmark, landmark[tracks.row[known]])] = -1
         tracks.landmark[known] = landmark[tracks.row[known]]
         self._fit(tracks, times)
         self._change_members()
@@ -122,7 +129,7 @@ class MovingObjectDetector:
                 self.bodies[body.id] = body
             mine = tracks.body == body.id
             tracks.position[mine] = transform(body.T, tracks.local[mine])
-            make_room(tracks, self.slot)
+        make_room(tracks, self.slot)
         seen = np.flatnonzero(tracks.seen)
         z = membership.measured(features, tracks.row[seen])
         record(tracks, seen, self.slot, *measure(self.rig, T_world_left, tracks.position[seen], z, self.sigma))
@@ -240,6 +247,7 @@ class MovingObjectDetector:
             for body in list(self.bodies.values()):
                 if body.measured and body.estimate is None and dt > 0:
                     self.bodies[body.id] = from_fit(body, body.T, dt, self.slot)
+            self._forgotten.clear()
             return ()
         known = {body.id for body in self.bodies.values() if body.estimate is not None}
         gone = [id for id in self._forgotten if id in self._estimated]

@@ -116,9 +116,15 @@ class FramePictures:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._film = path.suffix.lower() == ".mp4"
         self._first: tuple[float, np.ndarray] | None = None
         self._video: Any = None
-        (path.parent if path.suffix == ".mp4" else path).mkdir(parents=True, exist_ok=True)
+        if path.suffix and not self._film:
+            raise SlamError(f"{path}: pictures go to a folder, or to a video FILE.mp4")
+        try:
+            (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SlamError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.runner.Watch`."""
@@ -128,23 +134,34 @@ class FramePictures:
         """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
         import cv2
 
-        if self.path.suffix != ".mp4":
-            cv2.imwrite(str(self.path / f"{number:06d}.png"), picture)
-        elif self._video is not None:
-            self._video.write(picture)
+        if not self._film:
+            file = self.path / f"{number:06d}.png"
+            if not cv2.imwrite(str(file), picture):
+                raise SlamError(f"{file}: cannot be written")
         elif self._first is None:
             self._first = (stamp, picture)
         else:
-            rate, size = 1.0 / (stamp - self._first[0]), (picture.shape[1], picture.shape[0])
-            video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-            if not video.isOpened():
-                raise SlamError(f"cannot write the video {self.path}")
-            video.write(self._first[1])
-            video.write(picture)
-            self._video = video
+            if self._video is None:
+                self._video = self._opened(1.0 / (stamp - self._first[0]))
+            self._video.write(picture)
+
+    def _opened(self, rate: float) -> Any:
+        """The video, with the first picture in it."""
+        import cv2
+
+        assert self._first is not None
+        picture = self._first[1]
+        size = (picture.shape[1], picture.shape[0])
+        video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        if not video.isOpened():
+            raise SlamError(f"{self.path}: cannot be written")
+        video.write(picture)
+        return video
 
     def close(self) -> None:
-        """Finish the video."""
+        """Finish the video; a single picture is shown for a second."""
+        if self._video is None and self._first is not None:
+            self._video = self._opened(1.0)
         if self._video is not None:
             self._video.release()
 

@@ -24,6 +24,10 @@ class ObjectDetector(Protocol):
         """Ids of landmarks that may move: they do not measure the camera's next pose."""
         ...
 
+    def begin_anew(self) -> None:
+        """Forget the tracks and bodies, which do not go on where the camera was carried off; ids are not used again."""
+        ...
+
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Say which features move, before any of them becomes a landmark.
 
@@ -43,6 +47,9 @@ class NoDetector:
     """Takes everything for still."""
 
     suspects: IdArray = np.zeros(0, np.int64)
+
+    def begin_anew(self) -> None:
+        """There is nothing to forget."""
 
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Nothing moves, nothing is undecided."""

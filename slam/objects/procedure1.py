@@ -230,6 +230,10 @@ class Procedure1Detector:
         self._covariance: Array = np.eye(6)
         self._last: tuple[float, Array] | None = None
 
+    def begin_anew(self) -> None:
+        """The database goes on; the last pose does not."""
+        self._last = None
+
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Recognise the object's features and find its motion; no other feature is judged."""
         c, d = self.config, self.database

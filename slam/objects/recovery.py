@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import StereoFeatures
+from slam.data import BoolArray, StereoFeatures
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
@@ -30,50 +30,50 @@ def locate(
 
     Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree.
     """
-    mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-    found = _fit(body, tracks, mine, features, T_world_left, rig, sigma, seed)
-    if found is None or 2 * len(found[1]) < len(mine):
-        again = _anew(body, tracks, features, T_world_left, rig, sigma, config, seed)
-        if again is not None and (found is None or len(again[1]) > len(found[1])):
-            found, mine = again, again[1]
+    members = np.flatnonzero(tracks.body == body.id)
+    mine = members[tracks.seen[members]]
+    rows = tracks.row[mine]
+    found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
+    if found is None or 2 * found[1].sum() < len(mine):
+        wide, wide_rows = _by_looks(body, tracks, members, features, T_world_left, rig, config)
+        again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
+        if again is not None and (found is None or again[1].sum() > found[1].sum()):
+            found, mine, rows = again, wide, wide_rows
+    tracks.row[members] = -1
     if found is None:
-        tracks.row[mine] = -1
         return None
-    T_body_left, agreeing = found
-    outside = np.setdiff1d(mine, agreeing)
-    tracks.misfit[outside] += 1
-    tracks.row[outside] = -1
-    tracks.misfit[agreeing] = 0
+    T_body_left, agrees = found
+    tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
+    good, looks = mine[agrees], rows[agrees]
+    tracks.row[good], tracks.missed[good] = looks, 0
+    tracks.descriptors[good] = features.descriptors[looks]
     return np.asarray(T_world_left @ inverse(T_body_left))
 
 
 def _fit(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, T_world_left: Array, rig: StereoRig,
-    sigma: float, seed: int, least: int = _LEAST,
-) -> tuple[Array, NDArray[np.intp]] | None:  # fmt: skip
-    """Pose T_body_left and the tracks that agree with it."""
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
+    T_world_left: Array, rig: StereoRig, sigma: float, seed: int, least: int = _LEAST,
+) -> tuple[Array, BoolArray] | None:  # fmt: skip
+    """Pose T_body_left, and which tracks agree with it as the features of these rows."""
     if len(mine) < least:
         return None
-    rows = tracks.row[mine]
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     guess = inverse(body.T) @ T_world_left
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
-    agreeing = mine[fit.inliers]
-    stereo = features.has_stereo[tracks.row[agreeing]]
-    return None if stereo.sum() < least else (fit.T_world_left, agreeing)
+    stereo = features.has_stereo[rows[fit.inliers]]
+    return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
 
 
-def _anew(
-    body: Body, tracks: Tracks, features: StereoFeatures, T_world_left: Array, rig: StereoRig, sigma: float,
-    config: ObjectsConfig, seed: int,
-) -> tuple[Array, NDArray[np.intp]] | None:  # fmt: skip
-    """Find a body by its points' looks, no farther from where it is expected than it can have gone."""
-    mine = np.flatnonzero(tracks.body == body.id)
+def _by_looks(
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, T_world_left: Array, rig: StereoRig,
+    config: ObjectsConfig,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
+    """Members whose looks are seen, and the features' rows, no farther off than the body can have gone."""
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen & (tracks.body != body.id)]] = True
     free = np.flatnonzero(~taken & features.has_stereo)
     if len(mine) < _LEAST_ANEW or len(free) < _LEAST_ANEW:
-        return None
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
     local = rig.triangulate(features.uv_left[free], features.uv_right[free])
     points = transform(T_world_left, local)
     reach = config.max_speed * max(features.stamp - body.seen_at, 0.1) + np.linalg.norm(body.upper - body.lower)
@@ -83,10 +83,4 @@ def _anew(
         tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.wide_d_match,
         config.wide_ratio,
     )  # fmt: skip
-    before = tracks.row[mine].copy()
-    tracks.row[mine] = -1
-    tracks.row[mine[rows]] = columns
-    found = _fit(body, tracks, mine[rows], features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
-    if found is None:
-        tracks.row[mine] = before
-    return found
+    return mine[rows], columns

@@ -129,7 +129,9 @@ def test_a_turn_of_the_body_stays_what_it_is_while_it_turns_on():
     one = advanced(replace(body, covariance=P), 0.1, models)
     other = advanced(replace(body, T=body.T @ se3.exp(xi)), 0.1, models)
     after = se3.log(se3.inverse(one.T) @ other.T)
-    np.testing.assert_allclose((one.covariance - one.noise)[:6, :6], np.outer(after, after), rtol=2e-3)  # of 3e-4 in size
+    np.testing.assert_allclose(
+        (one.covariance - one.noise)[:6, :6], np.outer(after, after), rtol=2e-3
+    )  # of 3e-4 in size
 
 
 def test_the_filter_never_learns_where_in_a_body_its_frame_lies():

@@ -105,3 +105,16 @@ def test_settings_are_checked():
         ObjectsConfig(mode="procedure1")
     with pytest.raises(ConfigurationError, match="min_support"):
         ObjectsConfig(min_support=2)
+
+
+def test_what_leaves_the_window_is_remembered_and_nothing_else():
+    """Longer than the window, without a body: the slot of the present frame holds only what this frame measured."""
+    sequence = slam.open_sequence("synthetic:desk?density=150")
+    system = system_for(sequence)
+    for k in range(system.config.objects.window + 3):
+        system.process_features(sequence.simulate(k).features)
+    tracks = system.objects.tracks
+    alive = tracks.ids >= 0
+    assert not tracks.dof[alive & ~tracks.seen, system.objects.slot].any()
+    long = alive & tracks.seen & (tracks.count == system.config.objects.window)
+    assert long.any() and (np.trace(tracks.older_A[long], axis1=1, axis2=2) > 0).all()

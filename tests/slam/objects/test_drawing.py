@@ -6,6 +6,7 @@ import pytest
 
 import slam
 from slam.config import SystemConfig
+from slam.errors import SlamError
 from slam.objects.drawing import FramePictures, draw_objects
 
 
@@ -43,3 +44,22 @@ def test_pictures_and_video(steps, tmp_path, name):
     video = cv2.VideoCapture(str(tmp_path / name))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(1 / (frames[1][0].stamp - frames[0][0].stamp), rel=0.01)
+
+
+def test_a_video_of_one_frame_is_written(steps, tmp_path):
+    system, ((frame, result), _) = steps
+    with FramePictures(tmp_path / "one.mp4") as pictures:
+        pictures.show(frame, result, system)
+    assert int(cv2.VideoCapture(str(tmp_path / "one.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 1
+
+
+def test_places_that_cannot_be_written_are_said(steps, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SlamError, match="file/below: cannot be written"):
+        FramePictures(tmp_path / "file" / "below")
+    with pytest.raises(SlamError, match=r"a folder, or to a video FILE\.mp4"):
+        FramePictures(tmp_path / "frames.avi")
+    (tmp_path / "folder.mp4").mkdir()
+    system, ((frame, result), _) = steps
+    with pytest.raises(SlamError, match=r"folder\.mp4: cannot be written"), FramePictures(tmp_path / "folder.mp4") as p:
+        p.show(frame, result, system)
