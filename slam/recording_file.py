@@ -1,8 +1,8 @@
 """Recordings as files: an .npz of plain arrays, without pickled objects, with a version.
 
 Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
-``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where earlier frames were
-mended ``shift``, and, where the true path is known, ``truth_stamps`` and ``truth_poses``. Meanings:
+``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where
+earlier frames were mended ``shift``, and, where the true path is known, ``truth_stamps`` and ``truth_poses``. Meanings:
 `slam.replay.Recording`.
 """
 
