@@ -11,10 +11,15 @@ import pytest
 from slam.config import SystemConfig
 from slam.map_management import MapConfig
 from slam.models import EstimatorModels
+from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=60, max_depth_error=0.3))
+CONFIG = SystemConfig(
+    models=EstimatorModels(pixel_sigma=0.5),
+    map=MapConfig(target_in_view=60, max_depth_error=0.3),
+    objects=ObjectsConfig(mode="off"),
+)
 STILL, FRAMES, MOVERS = 20, 60, 12
 
 
