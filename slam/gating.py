@@ -14,13 +14,13 @@ from slam.se3 import Array
 
 def chi_square_limits(dof: NDArray, probability: float) -> Array:
     """Quantiles of χ² at `probability` for degrees of freedom (M,), integers."""
-    table = np.array([_quantile(n, probability) for n in range(int(np.max(dof, initial=0)) + 1)])
-    return np.asarray(table[np.asarray(dof, int)])
+    return np.asarray(_quantiles(int(np.max(dof, initial=0)), probability)[np.asarray(dof, int)])
 
 
 @lru_cache(maxsize=256)
-def _quantile(dof: int, probability: float) -> float:
-    return float(2.0 * gammaincinv(dof / 2.0, probability)) if dof else 0.0
+def _quantiles(most: int, probability: float) -> Array:
+    """Those for 0 to `most` degrees of freedom."""
+    return np.append(0.0, 2.0 * gammaincinv(np.arange(1, most + 1) / 2.0, probability))
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:

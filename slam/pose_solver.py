@@ -21,7 +21,6 @@ _POLISHING_ROUNDS = 5
 _BATCH = 50  # hypotheses tried at once
 _APPROACHES = 3
 _ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
-_EYE = np.eye(6)
 _CONVERGED = 1e-4  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
 
 
@@ -148,8 +147,7 @@ def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Ar
     """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
     T = T_left_world
     for _ in range(steps):
-        residual, J = _reprojection(rig, points, measured, T[None])
-        delta = _gauss_newton_step(residual, J)[0]
+        delta = _gauss_newton_steps(rig, points, measured, T[None])[0]
         T = exp(delta) @ T
         if np.abs(delta).max() < _CONVERGED:
             break
@@ -169,8 +167,7 @@ def _minimal_poses(
         return np.zeros((0, 4, 4))
     poses = rigid_fit(points[triples], local[triples])
     for _ in range(_REFINEMENTS):
-        residual, J = _reprojection(rig, points[triples], measured[triples], poses)
-        poses = exp(_gauss_newton_step(residual, J)) @ poses
+        poses = exp(_gauss_newton_steps(rig, points[triples], measured[triples], poses)) @ poses
     return poses[np.isfinite(poses).all(axis=(1, 2))]
 
 
@@ -188,34 +185,17 @@ def rigid_fit(source: Array, target: Array) -> Array:
     return T
 
 
-def _reprojection(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> tuple[Array, Array]:
-    """Residuals (H, K, 3) and Jacobians (H, K, 3, 6) by a perturbation on the left of T_left_world.
+def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """Steps (H, 6) that reduce the errors of poses T_left_world (H, 4, 4).
 
-    `points` and `measured` are (K, 3), or (H, K, 3) with a set for each pose. Unusable entries are zero in both.
+    `points` and `measured` are (K, 3), or (H, K, 3) with a set for each pose.
     """
+    from slam.pose_kernels import gauss_newton_steps
+
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
     z, J_point = rig.project_stereo(local.reshape(-1, 3))
     residual = measured - z.reshape(local.shape)
-    J = np.empty((*local.shape, 6))
-    J[..., 3:] = J_point.reshape(*local.shape, 3)
-    x, y, w = (local[..., None, i] for i in range(3))
-    a, b, c = (J[..., 3 + i] for i in range(3))
-    J[..., 0], J[..., 1], J[..., 2] = y * c - w * b, w * a - x * c, x * b - y * a  # local × the row of J_point
-    unusable = ~np.isfinite(residual)
-    if unusable.any():
-        residual[unusable] = 0.0
-        J[unusable] = 0.0
-    return residual, J
-
-
-def _gauss_newton_step(residual: Array, J: Array) -> Array:
-    """Steps (H, 6); lightly damped so that a degenerate set yields a bad pose, not an error."""
-    J = J.reshape(len(J), -1, 6)
-    Jt = np.swapaxes(J, 1, 2)
-    normal = Jt @ J
-    trace = np.einsum("hii->h", normal)
-    normal += _EYE * (1e-9 * trace[:, None, None] + 1e-12)
-    return np.linalg.solve(normal, Jt @ residual.reshape(len(J), -1, 1))[..., 0]
+    return np.asarray(gauss_newton_steps(local, residual, J_point.reshape(*local.shape, 3)))
 
 
 def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:

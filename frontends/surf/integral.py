@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from frontends.surf.kernels import kernel
+from slam.compilation import kernel
 
 
 def integral_image(image: NDArray) -> NDArray[np.int32]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from frontends.surf.kernels import kernel, vector_helper
+from slam.compilation import kernel, vector_helper
 from slam.errors import MeasurementError
 
 

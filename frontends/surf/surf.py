@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from frontends.surf.compilation import announce_compilation
 from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
 from frontends.surf.detector import COLUMNS, detect_octave
 from frontends.surf.filters import Filters, layer_sizes, make_filters
@@ -20,6 +19,7 @@ from frontends.surf.integral import integral_image
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
 from frontends.surf.workers import SHARES, Workers
+from slam.compilation import announce_compilation
 from slam.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class Surf:
             raise ConfigurationError(f"descriptor: must be 16 or 64, not {descriptor}")
         if not isinstance(threads, int) or threads < 1:
             raise ConfigurationError(f"threads: must be a whole number of at least 1, not {threads}")
-        announce_compilation()
+        announce_compilation("frontends.surf", "the SURF kernels: some ten seconds")
         self.threshold = float(threshold)
         self.octaves = octaves
         self.layers = layers

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray
 from slam.objects.data import ObjectEstimate
-from slam.objects.tracks import Tracks, times_vectors
-from slam.se3 import Array, inverse, so3_exp, so3_log
+from slam.objects.track_kernels import windows_in_body
+from slam.objects.tracks import Tracks
+from slam.se3 import Array, so3_exp, so3_log
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
-_REACH = 1.8  # farthest point of a body from its origin, in diagonals of the extent with which it was found
+_REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
 
@@ -32,12 +33,14 @@ class Body:
         T_before: at the previous frame.
         T_found, T_reported: the back end's poses when it was found, and at the previous frame.
         lower, upper: extent of its points (3,), body coordinates.
+        size: what it measures across at least [m].
         reach: its points lie no farther from its origin [m].
         seen_at: when it was last measured [s].
         seen: number of frames in which it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
         proved: whether it has moved for certain.
+        alike: for how many frames it has gone with an older body as if it were a part of that.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -53,13 +56,20 @@ class Body:
     T_reported: Array
     lower: Array
     upper: Array
+    size: float
     reach: float
     seen_at: float
     seen: int = 1
     measured: bool = True
     moving: bool = True
     proved: bool = False
+    alike: int = 0
     estimate: ObjectEstimate | None = field(default=None, repr=False)
+
+    @property
+    def across(self) -> float:
+        """Diagonal of its extent, but no less than its least size [m]."""
+        return max(float(np.linalg.norm(self.upper - self.lower)), self.size)
 
     def placed(self, T: Array, slot: int) -> Body:
         """The body with its pose at the present frame, whose slot is `slot`."""
@@ -68,7 +78,7 @@ class Body:
         return replace(self, T=T, history=history, known=known)
 
 
-def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float) -> Body:
+def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float) -> Body:
     """A body found with a twist at its centre; its poses over the window follow from an even motion.
 
     Args:
@@ -77,6 +87,7 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float) -
         twist: [ω, v] (6,).
         times: of the window's slots less the present (W,) [s].
         stamp: the present [s].
+        size: what it measures across at least [m].
     """
     history = np.tile(np.eye(4), (len(times), 1, 1))
     history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
@@ -85,7 +96,8 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float) -
     T[:3, 3] = centre
     none = np.zeros(3)
     return Body(
-        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, T, none, none, np.inf, stamp
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, T, none, none, size,
+        np.inf, stamp,
     )  # fmt: skip
 
 
@@ -109,7 +121,8 @@ def from_estimate(body: Body, estimate: ObjectEstimate, slot: int, min_speed: fl
     settled = body.seen > _SETTLED
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     return replace(
-        body.placed(estimate.T_world_object, slot),
+        body,
+        T=estimate.T_world_object,
         velocity=v if settled else body.velocity,
         covariance=estimate.covariance,
         moving=not settled or (certain and speed > min_speed),
@@ -131,9 +144,18 @@ def with_extent(body: Body, local: Array) -> Body:
     """The body with the extent of its points (K, 3)."""
     if len(local) < 3:
         return body
-    lower, upper = np.percentile(local, [5, 95], axis=0)
-    reach = body.reach if np.isfinite(body.reach) else _REACH * float(np.linalg.norm(upper - lower))
-    return replace(body, lower=lower, upper=upper, reach=reach)
+    lower, upper = _outermost(local)
+    body = replace(body, lower=lower, upper=upper)
+    return body if np.isfinite(body.reach) else replace(body, reach=_REACH * body.across)
+
+
+def _outermost(points: Array) -> tuple[Array, Array]:
+    """The 5th and 95th percentiles (3,) of points (K, 3): as NumPy's, without their cost for a few points."""
+    ordered = np.sort(points, axis=0)
+    place = 0.05 * (len(points) - 1)
+    k = int(place)
+    share = place - k
+    return (1 - share) * ordered[k] + share * ordered[k + 1], (1 - share) * ordered[-1 - k] + share * ordered[-2 - k]
 
 
 def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
@@ -142,8 +164,6 @@ def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Ar
     Returns:
         points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).
     """
-    known = (tracks.dof[rows] > 0) & body.known
-    back = inverse(body.history)
-    points = times_vectors(back[:, :3, :3], tracks.p[rows] + tracks.anchor[rows, None]) + back[:, :3, 3]
-    A = back[:, :3, :3] @ tracks.A[rows] @ body.history[:, :3, :3]
-    return points, np.where(known[..., None, None], A, 0.0), known
+    t = tracks
+    points, A, known = windows_in_body(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
+    return points, A, known

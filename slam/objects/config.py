@@ -37,7 +37,8 @@ class ObjectsConfig:
         forget_after: a body not seen for so long is forgotten [s].
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
         least_side, least_sine: of the triangle of features in ``"procedure1"``: sides [m], and sines of its angles.
-        margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal.
+        margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal, or of
+        size: what bodies measure across at least, seen in part or whole [m].
     """
 
     mode: str = "detect"
@@ -60,6 +61,7 @@ class ObjectsConfig:
     max_points: int = 80
     forget_after: float = 8.0
     margin: float = 0.25
+    size: float = 0.0
     database: str = ""
     least_side: float = 0.08
     least_sine: float = 0.3

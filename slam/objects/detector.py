@@ -28,7 +28,9 @@ from slam.objects.twists import fit_twist
 from slam.rig import StereoRig
 from slam.se3 import Array, inverse, transform
 
-_TRUST = 1.0  # a body is remembered for as long as it was seen, at most
+_PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
+_YOUNG = 24  # frames in which a body turns out to be a part of another at once; later after so many
+_SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
 
@@ -90,7 +92,11 @@ class MovingObjectDetector:
             self.tracks = Tracks.empty(features.descriptors.shape[1], self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
-        return np.nan_to_num(self._stamps - features.stamp)
+        return self._times(features)
+
+    def _times(self, features: StereoFeatures) -> Array:
+        times = self._stamps - features.stamp
+        return np.where(np.isnan(times), 0.0, times)
 
     @property
     def slot(self) -> int:
@@ -105,7 +111,8 @@ class MovingObjectDetector:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = self._stamps[self.slot], self._dt(times)
         for body in list(self.bodies.values()):
-            if now - body.seen_at > min(self.config.forget_after, _TRUST * body.seen * dt):
+            remembered = (_PATIENCE + body.seen) * dt if body.seen < _SETTLED else np.inf
+            if now - body.seen_at > min(self.config.forget_after, remembered):
                 self._forget(body.id)
             else:
                 self.bodies[body.id] = advanced(body, dt, self.slot, self.acceleration)
@@ -168,10 +175,11 @@ class MovingObjectDetector:
             far = group.away > _LAG * self._dt(times) * c.min_speed
             alike[members] = far and group.test > limit(c.group_test, len(members))
         fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
-        tracks.streak[:] = np.where(alike, tracks.streak + 1, 0)
+        tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
         for group in scene.groups:
             members = rows[group.members]
-            self._perhaps_found(members[tracks.streak[members] >= c.confirm], times)
+            if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
+                self._perhaps_found(members[tracks.streak[members] > 0], times)
         self.suspects = np.concatenate(suspects)
 
     def _perhaps_found(self, members: NDArray[np.intp], times: Array) -> None:
@@ -181,32 +189,51 @@ class MovingObjectDetector:
         members = members[membership.compact(tracks.position[members])]
         if len(members) < c.min_support:
             return
-        whose = membership.overlapped(self.bodies, tracks, members)
-        if whose is not None:
-            membership.enter(whose, tracks, members)
-            return
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
         twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
-        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot])
-        self._next_body += 1
-        self.bodies[body.id] = membership.found(body, tracks, members, times, self.slot)
+        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
+        body = membership.fitted(body, tracks, members, times, self.slot)
+        known = membership.overlapped(self.bodies, tracks, members, body)
+        if known is None:
+            self.bodies[body.id] = body
+            self._next_body += 1
+        membership.enter(known or body, tracks, members, sure=True)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
         tracks = self.tracks
         assert tracks is not None
-        for body in list(self.bodies.values()):
-            if not body.measured:
-                continue
-            gain = membership.regroup(body, tracks, self.slot, self.config)
-            kept = membership.proved(body, gain)
+        measured = {body.id: body for body in self.bodies.values() if body.measured}
+        gains = membership.regroup(measured, tracks, self.slot, self.config)
+        for id, gain in gains.items():
+            kept = membership.proved(self.bodies[id], gain)
+            mine = np.flatnonzero(tracks.body == id)
             if kept is None:
-                membership.leave(tracks, np.flatnonzero(tracks.body == body.id), body)
-                del self.bodies[body.id]
-                self._forgotten.append(body.id)
+                membership.leave(tracks, mine, self.bodies[id])
+                del self.bodies[id]
+                self._forgotten.append(id)
             else:
-                self.bodies[body.id] = with_extent(kept, tracks.local[tracks.body == body.id])
+                self.bodies[id] = with_extent(kept, tracks.local[mine[tracks.sure[mine]]])
+        self._merge()
+
+    def _merge(self) -> None:
+        """A body whose members go with an older one is a part of that: at once while young, later only after a while.
+
+        The parts of an articulated one go together now and then.
+        """
+        tracks = self.tracks
+        assert tracks is not None
+        for body in sorted(self.bodies.values(), key=lambda body: -body.id):
+            if body.measured:
+                mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+                older = {id: other for id, other in self.bodies.items() if id < body.id}
+                whole = membership.overlapped(older, tracks, mine, body)
+                alike = body.alike + 1 if whole is not None else 0
+                self.bodies[body.id] = replace(body, alike=alike)
+                if whole is not None and (body.seen < _YOUNG or alike > _YOUNG):
+                    membership.enter(whole, tracks, mine, sure=True)
+                    self._forget(body.id)
 
     def _begin_tracks(self, features: StereoFeatures, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""
@@ -234,15 +261,16 @@ class MovingObjectDetector:
         doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
         landmarks = np.unique(tracks.landmark[tracks.body >= 0])
         tracks.landmark[tracks.body >= 0] = -1
-        moving = np.unique(tracks.row[on])
-        undecided = np.setdiff1d(tracks.row[np.concatenate([near, doubtful])], moving)
-        return Judgement(moving, undecided, landmarks[landmarks >= 0])
+        moving, undecided = np.zeros(len(features), bool), np.zeros(len(features), bool)
+        moving[tracks.row[on]] = True
+        undecided[tracks.row[near]] = undecided[tracks.row[doubtful]] = True
+        return Judgement(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
 
     # ------------------------------------------------------------------------------------------- a step, second part
 
     def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
         """Give the bodies' observations to the back end, and report what it makes of them; nothing where it cannot."""
-        dt = self._dt(np.nan_to_num(self._stamps - features.stamp))
+        dt = self._dt(self._times(features))
         if not isinstance(backend, ObjectBackend):
             for body in list(self.bodies.values()):
                 if body.measured and body.estimate is None and dt > 0:
@@ -254,7 +282,8 @@ class MovingObjectDetector:
         if gone:
             backend.remove_objects(gone)
         self._forgotten.clear()
-        observations = [self._observations(body, features) for body in self.bodies.values() if body.measured]
+        told = [body for body in self.bodies.values() if body.measured]
+        observations = [self._observations(body, features) for body in told]
         fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= 3]
         estimates = backend.update_objects(fit_to_start)
         self._estimated = {e.id for e in estimates}

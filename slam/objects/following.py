@@ -11,12 +11,15 @@ from slam.data import StereoFeatures
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far, match_near
+from slam.objects.pixel_kernels import pixel_deviations
+from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import Tracks
 from slam.rig import StereoRig
-from slam.se3 import Array, hat, transform
+from slam.se3 import Array, transform
 
 _SIGMAS = 3.0
 _RIGHT_SIGMAS = 4.0
+_LEAST = 1e-6  # information on a member's point that has none yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
 
@@ -39,11 +42,9 @@ def follow(
     alive = np.flatnonzero(tracks.ids >= 0)
     if len(alive) and len(features):
         _advance(tracks, bodies, alive, dt)
-        R = T_world_left[:3, :3]
-        local = (tracks.position[alive] - T_world_left[:3, 3]) @ R
+        local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
         z, J = rig.project_stereo(local)
-        J = J @ R.T
-        spread = np.sqrt(((J @ tracks.covariance[alive]) * J).sum(axis=2) + sigma**2)
+        spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
         _near(tracks, alive, features, z, spread, config)
         _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
         _far(tracks, T_world_left, features, dt, config, rig, sigma)
@@ -59,11 +60,9 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
     tracks.covariance[moves] += dt**2 * tracks.velocity_covariance[moves]
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
-        R, local = body.T[:3, :3], tracks.local[mine]
-        tracks.position[mine] = transform(body.T, local)
-        J = R @ np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (len(mine), 3, 3))], axis=2)
-        own = np.linalg.inv(tracks.local_information[mine] + 1e-6 * np.eye(3))
-        tracks.covariance[mine] = J @ body.covariance @ np.swapaxes(J, 1, 2) + R @ own @ R.T
+        tracks.position[mine], tracks.covariance[mine] = members_ahead(
+            tracks.local, tracks.local_information, mine, body.T, body.covariance, _LEAST
+        )
 
 
 def _near(
@@ -71,7 +70,7 @@ def _near(
 ) -> None:
     size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
-    radius = np.clip(np.nan_to_num(size), least, config.search_limit)
+    radius = np.fmin(np.fmax(size, least), config.search_limit)  # the least where the size is NaN
     rows, columns = match_near(
         z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], features, config.d_match, config.ratio
     )

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.objects.pixel_kernels import best_in_windows, best_of_products
 from slam.se3 import Array
 
 _NEIGHBOURS = 8  # features looked at in a window: the nearest ones
-_NONE = np.float32(np.inf)
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
@@ -34,28 +34,15 @@ def match_near(
         d_match: largest descriptor distance.
         ratio: largest ratio of the best to the second best in the window.
     """
-    from scipy.spatial import cKDTree
-
-    usable = np.flatnonzero(np.isfinite(uv).all(axis=1))
-    if not len(usable) or not len(features):
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    count = min(_NEIGHBOURS, len(features))
-    tree = cKDTree(features.uv_left)
-    gap, near = tree.query(uv[usable], k=count, distance_upper_bound=float(radius[usable].max()))
-    gap, near = gap.reshape(-1, count), near.reshape(-1, count)
-    inside = gap <= radius[usable, None]
-    candidate = np.where(inside, near, 0)
-    inside &= laplacian[usable, None] == features.laplacian[candidate]
-    rows, columns = np.nonzero(inside)
-    distance = np.full(gap.shape, _NONE)
-    pairs = descriptors[usable[rows]] - features.descriptors[candidate[rows, columns]]
-    distance[rows, columns] = np.sqrt(np.einsum("ij,ij->i", pairs, pairs))
-    best = distance.argmin(axis=1)
-    nearest = distance[np.arange(len(usable)), best]
-    good = nearest < d_match
-    if count > 1:
-        good &= nearest < ratio * np.partition(distance, 1, axis=1)[:, 1]
-    return _each_once(usable[good], candidate[np.arange(len(usable)), best][good], nearest[good], len(features))
+    order = np.argsort(features.uv_left[:, 1], kind="stable")
+    pixels = features.uv_left[order]
+    first = np.searchsorted(pixels[:, 1], uv[:, 1] - radius)
+    best = best_in_windows(
+        uv, radius, first, descriptors, laplacian, pixels, features.descriptors[order], features.laplacian[order],
+        _NEIGHBOURS, d_match, ratio,
+    )  # fmt: skip
+    rows = np.flatnonzero(best >= 0)
+    return rows, order[best[rows]]
 
 
 def match_far(
@@ -70,23 +57,8 @@ def match_far(
     """Rows of tracks (N) and of features that are each other's best where `allowed` (N, len(free))."""
     if not len(descriptors) or not len(free):
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance = np.sqrt(np.maximum(2 - 2 * (descriptors @ features.descriptors[free].T), 0))
-    distance[laplacian[:, None] != features.laplacian[free][None]] = _NONE
-    wanted = np.where(allowed, distance, _NONE)
-    best = wanted.argmin(axis=1)
-    nearest = wanted[np.arange(len(best)), best]
-    good = (nearest < d_match) & (wanted.argmin(axis=0)[best] == np.arange(len(best)))
-    if wanted.shape[1] > 1:
-        good &= nearest < ratio * np.partition(wanted, 1, axis=1)[:, 1]
-    return np.flatnonzero(good), free[best[good]]
-
-
-def _each_once(rows: NDArray[np.intp], columns: NDArray[np.intp], distance: Array, size: int) -> Pairs:
-    """Of all pairs with the same feature, the one with the least distance; rows ascending."""
-    least = np.full(size, np.inf)
-    np.minimum.at(least, columns, distance)
-    keep = distance <= least[columns]
-    rows, columns = rows[keep], columns[keep]
-    _, first = np.unique(columns, return_index=True)
-    first.sort()
-    return rows[first], columns[first]
+    products = descriptors @ features.descriptors[free].T
+    signs = features.laplacian[free]
+    best = best_of_products(products, np.ascontiguousarray(allowed), laplacian, signs, d_match, ratio)
+    rows = np.flatnonzero(best >= 0)
+    return rows, free[best[rows]]

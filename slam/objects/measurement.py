@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.objects.pixel_kernels import information_in_world, move_along_rays
 from slam.rig import StereoRig
-from slam.se3 import Array, transform
+from slam.se3 import Array
 
 _FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4
@@ -28,24 +29,13 @@ def measure(
         measured: (N, 3) = (uL, vL, uR).
         sigma: pixel noise [px].
     """
-    R = T_world_left[:3, :3]
-    depth = (points - T_world_left[:3, 3]) @ R[:, 2]
-    rays = np.column_stack([rig.left.normalise(measured[:, :2]), np.ones(len(points))])
-    mono = np.isnan(measured[:, 2])
+    depth = (points - T_world_left[:3, 3]) @ T_world_left[:3, 2]
+    rays = np.ones((len(points), 3))
+    rays[:, :2] = rig.left.normalise(measured[:, :2])
     for _ in range(_STEPS):
-        q = rays * depth[:, None]
-        z, J = rig.project_stereo(q)
-        usable = np.isfinite(z).all(axis=1) & np.isfinite(J).all(axis=(1, 2)) & (depth > 0)
-        J = np.where(usable[:, None, None], J, np.eye(3))
-        step = np.where(usable & ~mono, measured[:, 2] - z[:, 2], 0.0)
-        along = np.linalg.solve(J, np.broadcast_to([0.0, 0.0, 1.0], (len(J), 3))[..., None])[..., 0]  # by uR
-        q = np.where(usable[:, None], q + along * step[:, None], 0.0)
-        far = np.abs(step) > _FAR
-        if not far.any():
+        z, J = rig.project_stereo(rays * depth[:, None])
+        met, usable, any_far = move_along_rays(rays, depth, z, J, measured, _FAR)
+        if not any_far:
             break
-        depth = np.where(far, q[:, 2], depth)
-    J = (J @ R.T) / sigma
-    J[mono, 2] = 0.0
-    J[~usable] = 0.0
-    dof = np.where(usable, np.where(mono, 2, 3), 0).astype(np.int8)
-    return transform(T_world_left, q), np.swapaxes(J, 1, 2) @ J, dof
+    found, A, dof = information_in_world(met, usable, J, measured, T_world_left, sigma)
+    return found, A, dof

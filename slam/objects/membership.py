@@ -16,7 +16,14 @@ from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.gating import chi_square_limits
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
-from slam.objects.tracks import Tracks, times_vectors
+from slam.objects.track_kernels import (
+    improve_members,
+    squares,
+    squares_from_box,
+    squares_of_both,
+    weighted_means,
+)
+from slam.objects.tracks import Tracks, median, times_vectors
 from slam.se3 import Array, exp, hat, transform
 
 _MISFITS = 3  # times that a track may disagree with its body before it leaves
@@ -24,6 +31,7 @@ _FAR = 3.0  # so many times the median distance from the median point is no part
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from an even motion, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_FREEDOM = 6.0  # of a body's pose in every frame
 _PROOF = 8.0  # median of the members' χ² from which a body has moved for certain
 _PROBATION = 12  # frames after which it must have
 _NEAR = 9.0  # χ² of the distance from a body's extent up to which a track may join, and
@@ -34,6 +42,10 @@ _LOOSE = 4.0  # by how much it may exceed the 99 % limit then
 _BETTER = 6.0  # by how much χ² the body must explain a track better than the still world does, for it to join, and
 _BETTER_INSIDE = -4.0  # where it lies inside
 _WORSE = -9.0  # a member for which the still world is better by more leaves
+_MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
+_ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
+_YOUNG = 12  # frames in which a body's motion is not well enough known to tell it from another
+_APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
 
 
 def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
@@ -58,13 +70,11 @@ class Verdict:
 
 def verdict(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Verdict:
     """How tracks go with a body and with the still world, over the window."""
-    points, A, known = in_body_axes(body, tracks, rows)
-    dof = np.maximum((tracks.dof[rows] * known).sum(axis=1).astype(int) - 3, 1)
-    fixed = _squares(points, A)
-    still = _squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
-    limit = chi_square_limits(dof, 0.99)
+    t = tracks
+    fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
+    limit = chi_square_limits(np.maximum(numbers - 3, 1), 0.99)
     fits = (fixed < limit) | ((fixed < _EXPLAINED * still) & (fixed < _LOOSE * limit))
-    return Verdict(still - fixed, fits, known.sum(axis=1))
+    return Verdict(still - fixed, fits, count)
 
 
 def compact(points: Array) -> BoolArray:
@@ -73,8 +83,8 @@ def compact(points: Array) -> BoolArray:
     return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
-def found(body: Body, tracks: Tracks, rows: NDArray[np.intp], times: Array, slot: int) -> Body:
-    """Make tracks the first members of a body; its poses over the window and their points are fitted together first.
+def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], times: Array, slot: int) -> Body:
+    """A new body with its poses over the window and its extent fitted to what tracks measured.
 
     An even motion is but the first guess of a body that starts to move: poses and points are improved in turn.
     """
@@ -87,49 +97,83 @@ def found(body: Body, tracks: Tracks, rows: NDArray[np.intp], times: Array, slot
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)
         body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
     now, first = body.history[slot], body.history[int(np.argmin(times))]
-    body = replace(body, T=now, T_first=first)
-    enter(body, tracks, rows)
-    return with_extent(body, tracks.local[rows])
+    points, A, _ = in_body_axes(body, tracks, rows)
+    return with_extent(replace(body, T=now, T_first=first), _means(points, A))
 
 
-def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> None:
+def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
     """Make tracks members of a body, in place; their points in it are what they measured over the window."""
+    if not len(rows):
+        return
     points, A, _ = in_body_axes(body, tracks, rows)
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.doubtful[rows] = body.id, 0, 0, False
     tracks.local[rows], tracks.local_information[rows] = _means(points, A), A.sum(axis=1)
+    tracks.sure[rows] = sure
 
 
 def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     """Make members free tracks again, in place; they must show anew how they move."""
+    if not len(rows):
+        return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
     tracks.forget_past(rows)
     tracks.missed[rows] = 1
 
 
-def regroup(body: Body, tracks: Tracks, slot: int, config: ObjectsConfig) -> Array:
+def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: ObjectsConfig) -> dict[int, Array]:
     """Tracks that go with a body join it, those that do not leave it, in place.
 
     Returns:
-        by how much χ² the body explains its seen members better than the still world (K,).
+        by body, by how much χ² it explains its seen members better than the still world (K,).
     """
-    _improve(body, tracks, slot)
+    gains = {}
+    for body in bodies.values():
+        _improve(body, tracks, slot)
+        gains[body.id] = _expel(body, tracks, config)
     free = np.flatnonzero((tracks.body < 0) & tracks.seen & (tracks.count >= 2))
-    free = free[_distances(body, tracks, free, config.margin) < _NEAR]
-    if len(free):
-        inside = _distances(body, tracks, free, _EDGE) < _INSIDE
-        v = verdict(body, tracks, free)
-        better = v.gain > np.where(inside, _BETTER_INSIDE, _BETTER)
-        enter(body, tracks, free[v.fits & better & (v.count >= 2)])
+    best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
+    for body in bodies.values():
+        near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
+        gain = _gain_of_joining(body, tracks, free[near])
+        better = gain > best[near]
+        best[near[better]], whose[near[better]] = gain[better], body.id
+    for body in bodies.values():
+        enter(body, tracks, free[whose == body.id])
+    return gains
+
+
+def _gain_of_joining(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+    """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
+    inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
+    proof = tracks.expelled[rows]
+    v = verdict(body, tracks, rows)
+    may = (
+        v.fits
+        & (v.count >= np.where(proof, _ENOUGH, 2))
+        & (v.gain > np.where(inside & ~proof, _BETTER_INSIDE, _BETTER))
+    )
+    return np.where(may, v.gain, -np.inf)
+
+
+def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
+    """Members that do not go with the body leave it, in place; the gain of those that are seen and stay (K,).
+
+    It is the `Verdict.gain` less what the body's poses, fitted to its members, would gain by chance.
+    """
     mine = np.flatnonzero(tracks.body == body.id)
-    gain, seen = verdict(body, tracks, mine).gain, tracks.seen[mine]
-    wrong = (tracks.misfit[mine] >= _MISFITS) | (seen & (gain < _WORSE))
+    v, seen = verdict(body, tracks, mine), tracks.seen[mine]
+    unfit = ~v.fits & (v.count >= _ENOUGH) & (v.fits[seen].mean() > _MOST if seen.any() else False)
+    wrong = (tracks.misfit[mine] >= _MISFITS) | (seen & ((v.gain < _WORSE) | unfit))
+    tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     leave(tracks, mine[wrong], body)
+    tracks.expelled[mine[wrong]] = True
     mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
         order = np.lexsort((worth, -tracks.missed[mine]))
         leave(tracks, mine[order[: len(mine) - config.max_points]], body)
-    return gain[seen & ~wrong]
+    stay = seen & ~wrong
+    return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
 def reject(tracks: Tracks | None, ids: IdArray) -> None:
@@ -151,20 +195,31 @@ def on_bodies(bodies: Mapping[int, Body], tracks: Tracks, margin: float) -> tupl
         close = free[_distances(body, tracks, free, margin) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
-        on[inside[verdict(body, tracks, inside).gain > _BETTER_INSIDE]] = True
+        asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
+        on[inside[verdict(body, tracks, inside).gain > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
-def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp]) -> Body | None:
-    """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None."""
+def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+    """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
+
+    Args:
+        bodies: all bodies.
+        tracks: all tracks.
+        rows: which of them.
+        own: a body made of them alone.
+    """
+    alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
     for body in bodies.values():
         if not body.measured:
             continue
         near = _distances(body, tracks, rows, _MERGED) < _NEAR
         points, A, known = in_body_axes(body, tracks, rows)
-        fixed = _squares(points, A)
-        still = _squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0))
-        if 2 * near.sum() > len(rows) and fixed.sum() < 2 * _EXPLAINED * still.sum():
+        fixed = float(_squares(points, A).sum())
+        still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
+        by_chance = float(chi_square_limits(np.array([6 * int(known.any(axis=0).sum())]), 0.99)[0])
+        apart = body.seen > _YOUNG and fixed - alone > _APART * by_chance and fixed > 2 * _APART * alone
+        if 2 * near.sum() > len(rows) and fixed < 2 * _EXPLAINED * still and not apart:
             return body
     return None
 
@@ -176,7 +231,7 @@ def proved(body: Body, gain: Array) -> Body | None:
         body: the body.
         gain: by how much χ² it explains its members better than the still world (K,).
     """
-    typical = float(np.median(gain)) if len(gain) else 0.0
+    typical = median(gain) if len(gain) else 0.0
     if body.proved or typical > _PROOF:
         return replace(body, proved=True)
     return body if typical > 0 and body.seen < _PROBATION else None
@@ -185,42 +240,25 @@ def proved(body: Body, gain: Array) -> Body | None:
 def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:
     """Squared distances (N,) of free tracks from a body's extent, in units of their own noise.
 
-    The extent is widened by `margin`, a share of its diagonal.
+    The extent is widened by `margin`, a share of what it measures across.
     """
-    out = np.full(len(rows), np.inf)
-    offset = tracks.position[rows] - body.T[:3, 3]
-    close = np.flatnonzero(np.linalg.norm(offset, axis=1) < body.reach)
-    R = body.T[:3, :3]
-    wider = margin * float(np.linalg.norm(body.upper - body.lower))
-    y = offset[close] @ R
-    away = (y - np.clip(y, body.lower - wider, body.upper + wider)) @ R.T
-    P = tracks.covariance[rows[close]]
-    P = P + (1e-9 * np.trace(P, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-    out[close] = (away * np.linalg.solve(P, away[..., None])[..., 0]).sum(axis=1)
-    return out
+    wider = margin * body.across
+    lower, upper = body.lower - wider, body.upper + wider
+    return np.asarray(squares_from_box(tracks.position, tracks.covariance, rows, body.T, lower, upper, body.reach))
 
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     """Take this frame's measurements into the members' points."""
     mine = np.flatnonzero((tracks.body == body.id) & (tracks.dof[:, slot] > 0))
-    R = body.T[:3, :3]
-    A = R.T @ tracks.A[mine, slot] @ R
-    point = (tracks.p[mine, slot] + tracks.anchor[mine] - body.T[:3, 3]) @ R
-    total = tracks.local_information[mine] + A
-    told = times_vectors(A, point - tracks.local[mine])
-    ridge = 1e-9 * np.trace(total, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    tracks.local[mine] += np.linalg.solve(total + ridge, told[..., None])[..., 0]
-    tracks.local_information[mine] = total
+    t = tracks
+    improve_members(t.A, t.p, t.anchor, mine, slot, body.T, t.local, t.local_information)
 
 
 def _squares(points: Array, A: Array) -> Array:
     """χ² (N,) of "one fixed point" for points by slot (N, W, 3) with information (N, W, 3, 3)."""
-    away = points - _means(points, A)[:, None]
-    return np.asarray((away * times_vectors(A, away)).sum(axis=(1, 2)))
+    return np.asarray(squares(points, A))
 
 
 def _means(points: Array, A: Array) -> Array:
     """Means (N, 3) of points by slot (N, W, 3), weighted by their information (N, W, 3, 3)."""
-    total = A.sum(axis=1)
-    ridge = (1e-6 * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-    return np.linalg.solve(total + ridge, times_vectors(A, points).sum(axis=1)[..., None])[..., 0]
+    return np.asarray(weighted_means(points, A))

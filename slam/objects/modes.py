@@ -11,8 +11,6 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.objects.config import ObjectsConfig
 from slam.objects.data import Judgement, MovingObject
-from slam.objects.detector import MovingObjectDetector
-from slam.objects.procedure1 import Procedure1Detector
 from slam.rig import StereoRig
 
 
@@ -70,5 +68,11 @@ def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels)
     if config.mode == "off":
         return NoDetector()
     if config.mode == "procedure1":
+        from slam.objects.procedure1 import Procedure1Detector
+
         return Procedure1Detector(rig, config, models)
+    from slam.compilation import announce_compilation  # brings Numba, as the detector does
+    from slam.objects.detector import MovingObjectDetector
+
+    announce_compilation("slam.objects", "the kernels for moving objects: some ten seconds")
     return MovingObjectDetector(rig, config, models)

@@ -15,29 +15,27 @@ pose, the estimate follows it, and it is the still world that seems to move.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
+from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
-from slam.objects.tracks import times_vectors
-from slam.se3 import Array, hat
+from slam.objects.tracks import median, times_vectors
+from slam.se3 import Array
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
-_POWERS = (0.5, 0.5, 0.5, 1.0, 1.0)  # rounds of reweighting: Huber's first, which has one minimum, then a sharper one
+_ROUNDS = (3, 2)  # of reweighting: Huber's first, which has one minimum, then a sharper one
 _LARGEST = 0.4  # share of all tracks that a body may have: the still world has most
-_PRIOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
+_PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  # keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
 _FITS = 14.2  # χ²(3) at 99.7 %
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _TAIL = 3.0  # tracks; see `limit`
 _MEDIAN = 2.37  # of χ²(3)
-_SIZES = ((0.1, 0.2), (0.2, 0.4), (0.4, 0.8))  # of windows: directions (x/z, y/z), and logarithm of the depth
-_OFFSETS = 0.5 * np.array(list(np.ndindex(2, 2, 2)))  # windows begin every half a width, along every axis
-_CELLS = 2**16  # more than there are windows along an axis
+_SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _MOST = 20  # windows looked into for the next group
 
@@ -70,7 +68,7 @@ class Scene:
     alone: Array
 
 
-def limit(test: float, size: Array | int) -> Array:
+def limit(test: float, size: NDArray[np.intp] | int) -> Array:
     """χ²(6) from which a group of so many tracks moved: small groups have the heavier tails of single tracks."""
     return test * (1.0 + _TAIL / np.maximum(size, 1.0))
 
@@ -93,7 +91,7 @@ def judge_scene(moved: Displacements, place: Array, test: float, support: int) -
     groups: list[Group] = []
     while True:
         alone = problem.squares(problem.common_motion(rest))
-        scale = max(1.0, float(np.median(alone[rest])) / _MEDIAN)
+        scale = max(1.0, median(alone[rest]) / _MEDIAN)
         alone = alone / scale
         group = _next_group(problem, windows, place, alone, scale, rest, test, support)
         if group is None:
@@ -111,7 +109,7 @@ def _next_group(
     """The group in the clearest window whose tracks hold together; None where there is none."""
     doubted = ~rest
     for window, value in _clearest(windows, problem, alone, scale, rest, test, support):
-        seeds = windows.inside(window) & ~doubted
+        seeds = windows.inside(window, len(rest)) & ~doubted
         if seeds.sum() < support:
             continue
         common = problem.common_motion(rest & ~seeds)
@@ -127,112 +125,82 @@ def _next_group(
 class _Problem:
     """Displacements as a linear problem in a common motion ξ = [θ, ρ] (6,): each track's normal equations.
 
-    The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ``, with ``Λ = Jᵀ W J`` (N, 36), ``η = Jᵀ W d`` (N, 6).
+    The χ² of a track is ``dᵀ W d − 2 ηᵀ ξ + ξᵀ Λ ξ``, with ``Λ = Jᵀ W J`` (N, 21: the lower triangle), ``η = Jᵀ W d``
+    (N, 6). The motion is by frame, so that J grows with the lag.
     """
 
     moved: Displacements
-    J: Array
     L: Array
     eta: Array
     dWd: Array
 
     @classmethod
     def of(cls, moved: Displacements) -> _Problem:
-        """Of displacements; the motion is by frame."""
-        n = len(moved.d)
-        J = np.concatenate([-hat(moved.points), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
-        J = moved.lag[:, None, None] * J
-        JW = np.swapaxes(J, 1, 2) @ moved.W
-        Wd = times_vectors(moved.W, moved.d)
-        return cls(moved, J, (JW @ J).reshape(n, 36), times_vectors(JW, moved.d), (moved.d * Wd).sum(axis=1))
+        """Of displacements."""
+        return cls(moved, *kernels.normal_equations(moved.points, moved.d, moved.W, moved.lag))
 
     def common_motion(self, rows: BoolArray) -> Array:
         """The motion (6,) on which tracks agree, by robust least squares."""
-        weight = np.ones(len(rows))
-        for power in _POWERS:
-            w = weight * rows
-            common = np.linalg.solve((w @ self.L).reshape(6, 6) + _PRIOR, w @ self.eta)
-            weight = np.minimum(1.0, _PULL / np.maximum(self.squares(common), 1e-9)) ** power
-        return common
+        return np.asarray(kernels.common_motion(self.L, self.eta, self.dWd, rows, _PRIOR, _PULL, *_ROUNDS))
 
     def squares(self, common: Array) -> Array:
         """χ²(3) of every displacement (N,) against a common motion."""
-        return np.asarray(self.dWd - 2 * self.eta @ common + self.L @ np.outer(common, common).ravel())
+        return np.asarray(kernels.squares_against(self.L, self.eta, self.dWd, common))
 
     def mean_gap(self, rows: NDArray[np.intp], common: Array) -> float:
         """How far tracks went against a common motion, in the weighted mean [m]."""
-        W, gap = self.moved.W[rows], (self.moved.d - self.J @ common)[rows]
+        moved, W = self.moved, self.moved.W[rows]
+        shift = np.cross(common[:3], moved.points[rows]) + common[3:]
+        gap = moved.d[rows] - moved.lag[rows, None] * shift
         mean = np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))
         return float(np.linalg.norm(mean))
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Windows of directions and depths with enough tracks: who is inside (sparse M, N), centres and widths (M, 3)."""
+    """Windows of directions and depths with enough tracks.
 
-    members: Any
+    Attributes:
+        starts: where the tracks of each window begin in `tracks` (M + 1,).
+        tracks: those of the first window, of the second, and so on.
+        centres, widths: of the windows (M, 3).
+    """
+
+    starts: NDArray[np.int64]
+    tracks: NDArray[np.int64]
     centres: Array
     widths: Array
 
     @classmethod
     def over(cls, place: Array, support: int) -> _Windows:
         """Windows of every size, each half a width from the next, along every axis."""
-        from scipy.sparse import csr_matrix
+        numbers = np.sort(kernels.cells(place, _SIZES))
+        return cls(*kernels.full_windows(numbers, _SIZES, support))
 
-        n = len(place)
-        rows, columns, centres, widths = [], [], [], []
-        first = 0
-        for across, deep in _SIZES:
-            width = np.array([across, across, deep])
-            cell = np.floor(place / width + _OFFSETS[:, None]).astype(np.int64)  # (8, N, 3)
-            code = (cell + _CELLS // 2) @ np.array([_CELLS**2, _CELLS, 1]) + _CELLS**3 * np.arange(8)[:, None]
-            _, one, which, count = np.unique(code.ravel(), return_index=True, return_inverse=True, return_counts=True)
-            full = count >= support
-            inside = np.flatnonzero(full[which])
-            rows.append(first + (np.cumsum(full) - 1)[which[inside]])
-            columns.append(inside % n)
-            centres.append((cell.reshape(-1, 3)[one[full]] + 0.5 - _OFFSETS[one[full] // n]) * width)
-            widths.append(np.broadcast_to(width, (full.sum(), 3)))
-            first += int(full.sum())
-        row, column = np.concatenate(rows), np.concatenate(columns)
-        members = csr_matrix((np.ones(len(row)), (row, column)), shape=(first, len(place)))
-        return cls(members, np.concatenate(centres), np.concatenate(widths))
-
-    def inside(self, window: int) -> BoolArray:
-        """Which tracks are inside a window (N,)."""
-        inside = np.zeros(self.members.shape[1], bool)
-        inside[self.members.indices[self.members.indptr[window] : self.members.indptr[window + 1]]] = True
+    def inside(self, window: int, count: int) -> BoolArray:
+        """Which of `count` tracks are inside a window."""
+        inside = np.zeros(count, bool)
+        inside[self.tracks[self.starts[window] : self.starts[window + 1]]] = True
         return inside
 
     def around(self, window: int, place: Array) -> BoolArray:
         """Which tracks are inside a window or near it (N,)."""
-        away = np.abs(place - self.centres[window]) / self.widths[window]
-        return np.asarray((away < 0.5 + _AROUND).all(axis=1))
+        near = np.abs(place - self.centres[window]) < (0.5 + _AROUND) * self.widths[window]
+        return np.asarray(near[:, 0] & near[:, 1] & near[:, 2])
 
 
 def _clearest(
     windows: _Windows, problem: _Problem, alone: Array, scale: float, rest: BoolArray, test: float, support: int
 ) -> list[tuple[int, float]]:
     """Windows that differ enough from the rest of the scene, and their χ²(6), the clearest first."""
-    weight = rest * np.minimum(1.0, _PULL / np.maximum(alone, 1e-9))
-    size = windows.members @ rest.astype(float)
-    asked = limit(test, size)
-    most = windows.members @ (weight * alone)
-    able = np.flatnonzero((size >= support) & (size <= _LARGEST * rest.sum()) & (most > asked))
-    if not len(able):
-        return []
-    inside, share = windows.members[able], (weight / scale)[:, None]
-    L, eta = share * problem.L, share * problem.eta
-    total, total_eta = L.sum(axis=0).reshape(6, 6), eta.sum(axis=0)
-    Lw, eta_w = (inside @ L).reshape(-1, 6, 6), inside @ eta
-    Lr = total - Lw + _PRIOR
-    Lw = Lw + _PRIOR
-    gap = np.linalg.solve(Lw, eta_w[..., None]) - np.linalg.solve(Lr, (total_eta - eta_w)[..., None])
-    both = Lw @ np.linalg.inv(total + 2 * _PRIOR) @ Lr
-    values = (np.swapaxes(gap, 1, 2) @ both @ gap)[:, 0, 0]
-    clear = values - asked[able]
+    weight = np.minimum(1.0, _PULL / np.maximum(alone, 1e-9))
+    asked = limit(test, np.arange(len(rest) + 1, dtype=np.intp))
+    values, clear = kernels.window_tests(
+        windows.starts, windows.tracks, problem.L, problem.eta, weight / scale, weight * alone, rest, asked, support,
+        _LARGEST * rest.sum(), _PRIOR,
+    )  # fmt: skip
     order = np.argsort(-clear, kind="stable")[:_MOST]
-    return [(int(able[i]), float(values[i])) for i in order if clear[i] > 0]
+    return [(int(i), float(values[i])) for i in order if clear[i] > 0]
 
 
 def _members(

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.objects.track_kernels import even_motions, fit_fixed_points, leave_window, measurements
 from slam.se3 import Array
 
-_RIDGE = 1e-9
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 _MOVES = 12.0  # χ²(3) of the velocity from which it counts: 1 % of still points
 _ROOM = 1000  # rows that a table begins with
@@ -47,6 +47,8 @@ class Tracks:
         local: point in the body's coordinates (N, 3), and
         local_information: its information (N, 3, 3).
         misfit: how often lately it disagreed with its body (N,).
+        sure: whether it moved with its body where the still world cannot have (N,).
+        expelled: whether a body's motion did not fit it (N,): it joins one again only on proof.
     """
 
     ids: IdArray
@@ -72,6 +74,8 @@ class Tracks:
     local: Array
     local_information: Array
     misfit: IdArray
+    sure: BoolArray
+    expelled: BoolArray
 
     @classmethod
     def empty(cls, dimensions: int, window: int, rows: int = _ROOM) -> Tracks:
@@ -84,7 +88,7 @@ class Tracks:
             np.zeros((rows, window, 3)), np.zeros((rows, window), np.int8), matrix.copy(), vector.copy(),
             np.zeros(rows),
             vector.copy(), matrix.copy(), vector.copy(), matrix.copy(), zero.copy(), np.zeros(rows, bool),
-            vector.copy(), matrix.copy(), zero.copy(),
+            vector.copy(), matrix.copy(), zero.copy(), np.zeros(rows, bool), np.zeros(rows, bool),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -98,7 +102,7 @@ class Tracks:
     @property
     def count(self) -> IdArray:
         """Number of measurements in the window (N,)."""
-        return (self.dof > 0).sum(axis=1)
+        return np.asarray(measurements(self.dof))
 
     def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
         """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""
@@ -112,7 +116,7 @@ class Tracks:
         self.ids[new], self.row[new], self.missed[new] = ids, rows, 0
         self.descriptors[new], self.laplacian[new] = features.descriptors[rows], features.laplacian[rows]
         self.anchor[new] = self.position[new] = points
-        self.landmark[new] = -1
+        self.landmark[new], self.expelled[new] = -1, False
         self.forget_past(new)
         return new
 
@@ -130,13 +134,8 @@ class Tracks:
 
 def make_room(tracks: Tracks, slot: int) -> None:
     """Let what `slot` held leave the window, in place."""
-    A = tracks.A[:, slot]
-    weight = np.trace(tracks.older_A, axis1=1, axis2=2)
-    tracks.older_age[:] = _MEMORY * (tracks.older_age + weight) + tracks.A.shape[1] * np.trace(A, axis1=1, axis2=2)
-    tracks.older_b[:] = _MEMORY * tracks.older_b + times_vectors(A, tracks.p[:, slot])
-    tracks.older_A[:] = _MEMORY * tracks.older_A + A
-    for array in (tracks.A, tracks.p, tracks.dof):
-        array[:, slot] = 0
+    t = tracks
+    leave_window(t.ids, t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, slot, _MEMORY)
 
 
 def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, information: Array, dof: NDArray) -> None:
@@ -148,22 +147,28 @@ def record(tracks: Tracks, rows: NDArray[np.intp], slot: int, points: Array, inf
 
 def fit_positions(tracks: Tracks, rows: NDArray[np.intp]) -> None:
     """Fit fixed points to the windows of tracks, in place."""
-    A = tracks.A[rows]
-    M = A.sum(axis=1)
-    P = np.linalg.inv(M + _ridge(M))
-    tracks.position[rows] = tracks.anchor[rows] + times_vectors(P, times_vectors(A, tracks.p[rows]).sum(axis=1))
-    tracks.covariance[rows] = P
-    tracks.velocity[rows] = 0
+    t = tracks
+    fit_fixed_points(t.A, t.p, t.anchor, rows, t.position, t.covariance)
+    t.velocity[rows] = 0
 
 
 @dataclass(frozen=True)
 class EvenMotion:
-    """Points with an even velocity, a row each: position now (N, 3), velocity (N, 3) [m/s], covariances (N, 3, 3)."""
+    """Points with an even velocity, a row each.
+
+    Attributes:
+        position: now (N, 3).
+        covariance: of the position (N, 3, 3).
+        velocity: (N, 3) [m/s].
+        velocity_covariance: (N, 3, 3).
+        test: χ²(3) of the velocity (N,).
+    """
 
     position: Array
     covariance: Array
     velocity: Array
     velocity_covariance: Array
+    test: Array
 
 
 def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> EvenMotion:
@@ -175,36 +180,25 @@ def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed:
         times: of the window's slots less the present (W,) [s].
         max_speed: deviation of velocities before anything is known [m/s].
     """
-    A = tracks.A[rows]
-    b = times_vectors(A, tracks.p[rows])
-    n, w = len(rows), A.shape[1]
-    powers = np.stack([np.ones(w), times, times * times])
-    M0, M1, M2 = (powers @ A.reshape(n, w, 9)).reshape(n, 3, 3, 3).transpose(1, 0, 2, 3)
-    B0, B1 = (powers[:2] @ b).transpose(1, 0, 2)
-    P0 = np.linalg.inv(M0 + _ridge(M0))
-    G = P0 @ M1
-    S = M2 - np.swapaxes(G, 1, 2) @ M1 + np.eye(3) / max_speed**2
-    PV = np.linalg.inv(S + _ridge(S))
-    V = times_vectors(PV, B1 - times_vectors(np.swapaxes(G, 1, 2), B0))
-    position = tracks.anchor[rows] + times_vectors(P0, B0) - times_vectors(G, V)
-    return EvenMotion(position, P0 + G @ PV @ np.swapaxes(G, 1, 2), V, PV)
+    points, *rest = even_motions(tracks.A, tracks.p, rows, times, max_speed**-2)
+    return EvenMotion(tracks.anchor[rows] + points, *rest)
 
 
 def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> None:
     """Give tracks their even motion, in place, where a fixed point does not explain them; see `even_motion`."""
     m = even_motion(tracks, rows, times, max_speed)
-    test = (m.velocity * np.linalg.solve(m.velocity_covariance, m.velocity[..., None])[..., 0]).sum(axis=1)
-    moves = test > _MOVES
-    tracks.velocity[rows[moves]] = m.velocity[moves]
-    tracks.velocity_covariance[rows[moves]] = m.velocity_covariance[moves]
-    tracks.position[rows[moves]], tracks.covariance[rows[moves]] = m.position[moves], m.covariance[moves]
+    moves = m.test > _MOVES
+    moving = rows[moves]
+    tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
+    tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]
+
+
+def median(values: Array) -> float:
+    """The median of a few values; NumPy's takes longer to begin than these need."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
 
 
 def times_vectors(M: Array, v: Array) -> Array:
     """Products (..., 3) of matrices (..., 3, 3) and vectors (..., 3)."""
     return np.asarray((M @ v[..., None])[..., 0])
-
-
-def _ridge(M: Array) -> Array:
-    """What makes (N, 3, 3) information matrices invertible and changes nothing else."""
-    return (_RIDGE * np.trace(M, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)

@@ -171,17 +171,17 @@ def test_options_override_a_configuration():
 
 
 def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):
-    from frontends.surf import kernels
+    from slam import compilation
 
-    real = kernels.njit
+    real = compilation.njit
 
     def no_folder(**options):
         if options.pop("cache", False):
             raise RuntimeError("cannot cache function: no locator available")
         return real(**options)
 
-    monkeypatch.setattr(kernels, "njit", no_folder)
-    assert kernels.kernel(lambda x: x + 1)(2) == 3
+    monkeypatch.setattr(compilation, "njit", no_folder)
+    assert compilation.kernel(lambda x: x + 1)(2) == 3
     assert "set NUMBA_CACHE_DIR" in caplog.text
 
 

@@ -1,0 +1,71 @@
+"""KITTI raw 0013 with the labels of KITTI tracking: which object is which car, how fast, and what hides behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.data import StereoFeatures
+from slam.se3 import Array
+
+_COLOUR_SHIFT = 44.9  # the labels' boxes are of a camera to the right of the left one: shift by so much / z [px m]
+_NEAR = 3.0  # an object within so far of a labelled car, in the ground plane, is that car [m]
+_SPAN = 5  # frames over which a labelled speed is taken, to both sides
+
+
+@dataclass(frozen=True)
+class Car:
+    """A labelled car in a frame.
+
+    Attributes:
+        place: middle of its bottom (3,) in left-camera coordinates [m].
+        box: left, top, right, bottom (4,) in the left image [px].
+    """
+
+    place: Array
+    box: Array
+
+
+Labels = dict[int, dict[int, Car]]
+
+
+def read_labels(path: Path) -> Labels:
+    """Labelled cars by frame and number."""
+    labels: Labels = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        words = line.split()
+        if int(words[1]) >= 0:
+            place, box = np.array(words[13:16], float), np.array(words[6:10], float)
+            box[[0, 2]] += _COLOUR_SHIFT / place[2]
+            labels.setdefault(int(words[0]), {})[int(words[1])] = Car(place, box)
+    return labels
+
+
+def nearest_car(cars: Mapping[int, Car], centre: Array) -> int:
+    """Number of the labelled car near a point (3,) in left-camera coordinates, −1 for none."""
+    gaps = {number: float(np.linalg.norm((car.place - centre)[[0, 2]])) for number, car in cars.items()}
+    best = min(gaps, key=lambda number: gaps[number], default=-1)
+    return best if best >= 0 and gaps[best] < _NEAR else -1
+
+
+def labelled_speed(labels: Labels, poses: Array, stamps: Array, number: int, frame: int) -> float:
+    """Speed [m/s] of a car about a frame, from its labelled places and the camera's poses (N, 4, 4); NaN if unknown."""
+    frames = [k for k in (max(frame - _SPAN, 0), min(frame + _SPAN, len(poses) - 1)) if number in labels.get(k, {})]
+    if len(frames) < 2:
+        return float("nan")
+    first, last = (poses[k, :3, :3] @ labels[k][number].place + poses[k, :3, 3] for k in frames)
+    return float(np.linalg.norm(last - first) / (stamps[frames[1]] - stamps[frames[0]]))
+
+
+def hidden(features: StereoFeatures, cars: Mapping[int, Car], numbers: tuple[int, ...]) -> np.ndarray:
+    """Which features (N,) lie in the boxes of these cars."""
+    inside = np.zeros(len(features), bool)
+    for number in numbers:
+        if number in cars:
+            left, top, right, bottom = cars[number].box
+            u, v = features.uv_left.T
+            inside |= (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
+    return inside

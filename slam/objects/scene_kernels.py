@@ -1,0 +1,286 @@
+"""Compiled loops of the test of the scene: sums of normal equations over many sets of tracks, and what they say.
+
+Symmetric 6x6 matrices of tracks are kept as their lower triangles (21,), row by row: see `slam.objects.regions` for the
+meaning of Λ, η and ξ.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.compilation import helper, kernel
+
+_CELLS = 2**12  # more than there are windows along an axis
+_TRACKS = 2**20  # more than there are tracks
+
+# ---------------------------------------------------------------------------------------------- a common motion
+
+
+@kernel
+def normal_equations(points, d, W, lag):
+    """Each track's Λ (N, 21), η (N, 6), and dᵀ W d (N,), of displacements d with information W at `points`."""
+    n = len(d)
+    L, eta, dWd = np.empty((n, 21)), np.zeros((n, 6)), np.zeros(n)
+    J, WJ = np.zeros((3, 6)), np.empty((3, 6))
+    for m in range(n):
+        x, y, z, t = points[m, 0], points[m, 1], points[m, 2], lag[m]
+        J[0, 1], J[0, 2], J[1, 2] = t * z, -t * y, t * x
+        J[1, 0], J[2, 0], J[2, 1] = -t * z, t * y, -t * x
+        J[0, 3] = J[1, 4] = J[2, 5] = t
+        for i in range(3):
+            for j in range(6):
+                WJ[i, j] = W[m, i, 0] * J[0, j] + W[m, i, 1] * J[1, j] + W[m, i, 2] * J[2, j]
+                eta[m, j] += WJ[i, j] * d[m, i]
+            dWd[m] += d[m, i] * (W[m, i, 0] * d[m, 0] + W[m, i, 1] * d[m, 1] + W[m, i, 2] * d[m, 2])
+        k = 0
+        for i in range(6):
+            for j in range(i + 1):
+                L[m, k] = J[0, i] * WJ[0, j] + J[1, i] * WJ[1, j] + J[2, i] * WJ[2, j]
+                k += 1
+    return L, eta, dWd
+
+
+@kernel
+def common_motion(L, eta, dWd, rows, prior, pull, soft, sharp):
+    """The motion ξ (6,) on which tracks agree, by reweighted least squares.
+
+    Args:
+        L: Λ of the tracks (N, 21).
+        eta: η of the tracks (N, 6).
+        dWd: ``dᵀ W d`` of the tracks (N,).
+        rows: which of them (N,).
+        prior: on the diagonal of the sum of Λ (6,).
+        pull: χ² above which tracks weigh less.
+        soft: rounds with Huber's weights, after which come those
+        sharp: where such tracks bring that much χ² each.
+    """
+    weight = np.ones(len(dWd))
+    total, told, motion, products = np.empty(21), np.empty(6), np.empty(6), np.empty(21)
+    factor = np.empty((6, 6))
+    for k in range(soft + sharp):
+        total[:], told[:] = 0.0, 0.0
+        for m in range(len(dWd)):
+            if rows[m]:
+                _add_weighted(total, L[m], weight[m])
+                _add_weighted(told, eta[m], weight[m])
+        _factorise(total, prior, factor)
+        _solve(factor, told, motion)
+        _products(motion, products)
+        for m in range(len(dWd)):
+            if rows[m]:
+                square = _square(L[m], eta[m], dWd[m], motion, products)
+                share = min(1.0, pull / max(square, 1e-9))
+                weight[m] = np.sqrt(share) if k < soft else share
+    return motion
+
+
+@kernel
+def squares_against(L, eta, dWd, motion):
+    """χ²(3) of every displacement (N,) against a motion ξ (6,)."""
+    squares, products = np.empty(len(dWd)), np.empty(21)
+    _products(motion, products)
+    for m in range(len(dWd)):
+        squares[m] = _square(L[m], eta[m], dWd[m], motion, products)
+    return squares
+
+
+@helper
+def _add_weighted(total, part, weight):
+    for k in range(len(total)):
+        total[k] += weight * part[k]
+
+
+@helper
+def _products(motion, out):
+    """Products of a motion's entries, so that ``ξᵀ Λ ξ`` is a sum over the triangle of Λ."""
+    k = 0
+    for i in range(6):
+        for j in range(i):
+            out[k] = 2 * motion[i] * motion[j]
+            k += 1
+        out[k] = motion[i] * motion[i]
+        k += 1
+
+
+@helper
+def _square(L, eta, dWd, motion, products):
+    """χ²(3) of a displacement against a motion, in sums that need not wait for one another."""
+    s0 = s1 = s2 = s3 = 0.0
+    for k in range(7):
+        s0 += L[k] * products[k]
+        s1 += L[k + 7] * products[k + 7]
+        s2 += L[k + 14] * products[k + 14]
+    for i in range(6):
+        s3 += eta[i] * motion[i]
+    return dWd + (s0 + s1 + s2) - 2 * s3
+
+
+@helper
+def _factorise(triangle, prior, out):
+    """A triangle's matrix, with `prior` (6,) on its diagonal, as L D Lᵀ: L below the diagonal of `out`, D on it."""
+    k = 0
+    for i in range(6):
+        for j in range(i + 1):
+            value = triangle[k] + (prior[i] if i == j else 0.0)
+            k += 1
+            for h in range(j):
+                value -= out[i, h] * out[j, h] * out[h, h]
+            out[i, j] = value if i == j else value / out[j, j]
+
+
+@helper
+def _solve(factor, right, out):
+    """The solution for a right side (6,), from `_factorise`."""
+    for i in range(6):
+        out[i] = right[i]
+        for h in range(i):
+            out[i] -= factor[i, h] * out[h]
+    for i in range(6):
+        out[i] /= factor[i, i]
+    for i in range(5, -1, -1):
+        for h in range(i + 1, 6):
+            out[i] -= factor[h, i] * out[h]
+
+
+@helper
+def _times(triangle, prior, v, out):
+    """The product of a triangle's matrix, with `prior` on its diagonal, and a vector (6,)."""
+    for i in range(6):
+        out[i] = prior[i] * v[i]
+    k = 0
+    for i in range(6):
+        for j in range(i):
+            out[i] += triangle[k] * v[j]
+            out[j] += triangle[k] * v[i]
+            k += 1
+        out[i] += triangle[k] * v[i]
+        k += 1
+
+
+# ---------------------------------------------------------------------------------------------- windows
+
+
+@kernel
+def cells(place, sizes):
+    """In which window every track lies: a number for each size, each of 8 offsets by half a width, and each track.
+
+    Sorted, tracks in the same window stand together, ascending. `place` (N, 3), `sizes` (S, 3).
+    """
+    out = np.empty(len(sizes) * 8 * len(place), np.int64)
+    k = 0
+    for s in range(len(sizes)):
+        for offset in range(8):
+            for n in range(len(place)):
+                code = 8 * s + offset
+                for axis in range(3):
+                    half = 0.5 * ((offset >> (2 - axis)) & 1)
+                    cell = int(np.floor(place[n, axis] / sizes[s, axis] + half))
+                    code = code * _CELLS + min(max(cell + _CELLS // 2, 0), _CELLS - 1)
+                out[k] = code * _TRACKS + n
+                k += 1
+    return out
+
+
+@kernel
+def full_windows(numbers, sizes, support):
+    """Windows with at least `support` tracks.
+
+    Args:
+        numbers: sorted, from `cells`.
+        sizes: of windows (S, 3).
+        support: least number of tracks in a window.
+
+    Returns:
+        starts (M + 1,) of the windows in the list of their tracks, that list, and centres and widths (M, 3).
+    """
+    first = np.empty(len(numbers) // support + 1, np.int64)
+    windows, total, begin = 0, 0, 0
+    starts = np.zeros(len(first) + 1, np.int64)
+    tracks = np.empty(len(numbers), np.int64)
+    for k in range(1, len(numbers) + 1):
+        if k < len(numbers) and numbers[k] // _TRACKS == numbers[begin] // _TRACKS:
+            continue
+        if k - begin >= support:
+            first[windows] = numbers[begin] // _TRACKS
+            for i in range(begin, k):
+                tracks[total] = numbers[i] % _TRACKS
+                total += 1
+            windows += 1
+            starts[windows] = total
+        begin = k
+    centres, widths = np.empty((windows, 3)), np.empty((windows, 3))
+    for m in range(windows):
+        code = first[m]
+        kind = code // _CELLS**3
+        for axis in range(2, -1, -1):
+            half = 0.5 * ((kind >> (2 - axis)) & 1)
+            widths[m, axis] = sizes[kind // 8, axis]
+            centres[m, axis] = (code % _CELLS - _CELLS // 2 + 0.5 - half) * widths[m, axis]
+            code //= _CELLS
+    return starts[: windows + 1].copy(), tracks[:total].copy(), centres, widths
+
+
+@kernel
+def window_tests(starts, tracks, L, eta, weight, brought, rest, asked, support, largest, prior):
+    """Test of every window: whether the motion of the tracks inside is that of the rest.
+
+    Args:
+        starts: of the windows in the list of their tracks (M + 1,).
+        tracks: that list.
+        L: Λ of the tracks (N, 21).
+        eta: η of the tracks (N, 6).
+        weight: of the tracks (N,).
+        brought: χ²(3) that each track can bring (N,).
+        rest: which tracks are in no group yet (N,).
+        asked: χ²(6) from which a window with so many tracks moved (N + 1,).
+        support: least number of tracks in a window, and
+        largest: greatest.
+        prior: on the diagonals (6,).
+
+    Returns:
+        χ²(6) (M,), and by how much it exceeds what is asked (M,); −∞ where there is no test.
+    """
+    total, told = np.zeros(21), np.zeros(6)
+    for n in range(len(weight)):
+        if rest[n]:
+            _add_weighted(total, L[n], weight[n])
+            _add_weighted(told, eta[n], weight[n])
+    both, own, other, twice = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    for i in range(6):
+        twice[i] = 2 * prior[i]
+    _factorise(total, twice, both)
+    inside, told_inside, outside, told_outside = np.empty(21), np.empty(6), np.empty(21), np.empty(6)
+    gap, motion, left, right = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    values, clear = np.full(len(starts) - 1, -np.inf), np.full(len(starts) - 1, -np.inf)
+    for m in range(len(values)):
+        size, most = 0, 0.0
+        for k in range(starts[m], starts[m + 1]):
+            if rest[tracks[k]]:
+                size += 1
+                most += brought[tracks[k]]
+        if size < support or size > largest or most <= asked[size]:
+            continue
+        inside[:], told_inside[:] = 0.0, 0.0
+        for k in range(starts[m], starts[m + 1]):
+            n = tracks[k]
+            if rest[n]:
+                _add_weighted(inside, L[n], weight[n])
+                _add_weighted(told_inside, eta[n], weight[n])
+        for k in range(21):
+            outside[k] = total[k] - inside[k]
+        for i in range(6):
+            told_outside[i] = told[i] - told_inside[i]
+        _factorise(inside, prior, own)
+        _factorise(outside, prior, other)
+        _solve(own, told_inside, gap)
+        _solve(other, told_outside, motion)
+        for i in range(6):
+            gap[i] -= motion[i]
+        _times(inside, prior, gap, left)
+        _times(outside, prior, gap, right)
+        _solve(both, right, motion)
+        values[m] = 0.0
+        for i in range(6):
+            values[m] += left[i] * motion[i]
+        clear[m] = values[m] - asked[size]
+    return values, clear

@@ -1,0 +1,444 @@
+"""Compiled loops over tracks: 3x3 matrices are worked through in place of many small batches of arrays.
+
+Windows are those of `slam.objects.tracks.Tracks`: information ``A`` (N, W, 3, 3) and points ``p`` (N, W, 3) by slot;
+`rows` (M,) names the tracks. A fixed point fitted to a window is ``(Σ A)⁻¹ Σ A p``; a small share of the trace on the
+diagonal makes information invertible that knows nothing along the ray.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.compilation import helper, kernel
+
+_RIDGE = 1e-9  # share of the trace, for information over a whole window, and
+_PART = 1e-6  # for a part of it
+_LEAST = 1e-12  # and this for windows that are empty
+
+
+# ---------------------------------------------------------------------------------------------- 3x3 matrices
+
+
+@helper
+def _invert(M, ridge, out):
+    """Inverse of a symmetric matrix with `ridge` on its diagonal, by M = L D Lᵀ."""
+    d0 = M[0, 0] + ridge
+    l10, l20 = M[1, 0] / d0, M[2, 0] / d0
+    d1 = M[1, 1] + ridge - l10 * M[1, 0]
+    rest = M[2, 1] - l20 * M[1, 0]
+    l21 = rest / d1
+    d2 = M[2, 2] + ridge - l20 * M[2, 0] - l21 * rest
+    m20 = l10 * l21 - l20  # of the inverse of L
+    out[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
+    out[1, 0] = out[0, 1] = -l10 / d1 - m20 * l21 / d2
+    out[2, 0] = out[0, 2] = m20 / d2
+    out[1, 1] = 1 / d1 + l21 * l21 / d2
+    out[2, 1] = out[1, 2] = -l21 / d2
+    out[2, 2] = 1 / d2
+
+
+@helper
+def _trace(M):
+    return M[0, 0] + M[1, 1] + M[2, 2]
+
+
+@helper
+def _row_times(M, i, v):
+    """Entry i of M v."""
+    return M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2]
+
+
+@helper
+def _column_times(M, i, v):
+    """Entry i of Mᵀ v."""
+    return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
+
+
+@helper
+def _add(total, M, factor):
+    for i in range(3):
+        for j in range(3):
+            total[i, j] += factor * M[i, j]
+
+
+@helper
+def _add_times(total, M, v, factor):
+    for i in range(3):
+        total[i] += factor * _row_times(M, i, v)
+
+
+@helper
+def _multiply(A, B, out):
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@helper
+def _turn(R, M, out):
+    """``R M Rᵀ`` of a symmetric M."""
+    for i in range(3):
+        x, y, z = _row_times(M, 0, R[i]), _row_times(M, 1, R[i]), _row_times(M, 2, R[i])
+        for j in range(3):
+            out[i, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2]
+
+
+@helper
+def _turn_back(R, M, out):
+    """``Rᵀ M R`` of a symmetric M."""
+    for i in range(3):
+        x = M[0, 0] * R[0, i] + M[0, 1] * R[1, i] + M[0, 2] * R[2, i]
+        y = M[1, 0] * R[0, i] + M[1, 1] * R[1, i] + M[1, 2] * R[2, i]
+        z = M[2, 0] * R[0, i] + M[2, 1] * R[1, i] + M[2, 2] * R[2, i]
+        for j in range(3):
+            out[i, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]
+
+
+# ---------------------------------------------------------------------------------------------- windows of tracks
+
+
+@kernel
+def measurements(dof):
+    """In how many slots (N,) tracks were measured."""
+    out = np.zeros(len(dof), np.int64)
+    for n in range(len(dof)):
+        for w in range(dof.shape[1]):
+            out[n] += dof[n, w] > 0
+    return out
+
+
+@kernel
+def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
+    """Move what `slot` holds from the windows of all tracks to their fading sums, in place."""
+    for n in range(len(ids)):
+        if ids[n] < 0:
+            continue
+        leaving = A[n, slot]
+        older_age[n] = memory * (older_age[n] + _trace(older_A[n])) + A.shape[1] * _trace(leaving)
+        for i in range(3):
+            older_b[n, i] = memory * older_b[n, i] + _row_times(leaving, i, p[n, slot])
+            for j in range(3):
+                older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
+        leaving[:] = 0.0
+        p[n, slot] = 0.0
+        dof[n, slot] = 0
+
+
+@kernel
+def fit_fixed_points(A, p, anchor, rows, position, covariance):
+    """Fixed points that fit the windows best, and their covariances, into `position` (N, 3), `covariance` (N, 3, 3)."""
+    total, told = np.empty((3, 3)), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        total[:], told[:] = 0.0, 0.0
+        for w in range(A.shape[1]):
+            _add(total, A[n, w], 1.0)
+            _add_times(told, A[n, w], p[n, w], 1.0)
+        _invert(total, _RIDGE * _trace(total) + _LEAST, covariance[n])
+        for i in range(3):
+            position[n, i] = anchor[n, i] + _row_times(covariance[n], i, told)
+
+
+@kernel
+def even_motions(A, p, rows, times, prior):
+    """Points with an even velocity that fit the windows best.
+
+    Args:
+        A: information by slot.
+        p: points by slot.
+        rows: of the tracks.
+        times: of the slots (W,) [s]; the point is where it is at 0.
+        prior: information on each axis of the velocity before anything is known [s²/m²].
+
+    Returns:
+        points (M, 3) and their covariances (M, 3, 3), velocities (M, 3) [m/s] and theirs (M, 3, 3), and χ²(3) of the
+        velocities (M,).
+    """
+    n = len(rows)
+    points, P, velocity, PV = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
+    test = np.zeros(n)
+    M0, M1, M2 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    P0, G, S = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b0, b1, told = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(n):
+        M0[:], M1[:], M2[:], b0[:], b1[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        for w in range(A.shape[1]):
+            t, Aw, pw = times[w], A[rows[m], w], p[rows[m], w]
+            _add(M0, Aw, 1.0)
+            _add(M1, Aw, t)
+            _add(M2, Aw, t * t)
+            _add_times(b0, Aw, pw, 1.0)
+            _add_times(b1, Aw, pw, t)
+        _invert(M0, _RIDGE * _trace(M0) + _LEAST, P0)
+        _multiply(P0, M1, G)
+        for i in range(3):
+            told[i] = b1[i] - _column_times(G, i, b0)
+            for j in range(3):
+                S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
+            S[i, i] += prior
+        _invert(S, _RIDGE * _trace(S) + _LEAST, PV[m])
+        for i in range(3):
+            velocity[m, i] = _row_times(PV[m], i, told)
+            test[m] += velocity[m, i] * told[i]
+        _turn(G, PV[m], P[m])
+        _add(P[m], P0, 1.0)
+        for i in range(3):
+            points[m, i] = _row_times(P0, i, b0) - _row_times(G, i, velocity[m])
+    return points, P, velocity, PV, test
+
+
+@kernel
+def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent):
+    """How far tracks went from the older to the recent frames of their windows: see `slam.objects.displacements`.
+
+    Args:
+        A: information by slot, and so on: see `slam.objects.tracks.Tracks`.
+        p: points by slot.
+        dof: numbers measured by slot.
+        older_A: information of what has left the window.
+        older_b: the same times the points.
+        older_age: its ages, weighted.
+        rows: of the tracks.
+        ages: of the slots (W,) in frames.
+        most_recent: so many frames are recent, at most.
+
+    Returns:
+        displacements (M, 3), their information (M, 3, 3), and the lag (M,) in frames.
+    """
+    d, W, lag = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), np.empty(len(rows))
+    now, before, P_now, P_before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    b_now, b_before = np.empty(3), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        count = 0
+        for w in range(A.shape[1]):
+            count += dof[n, w] > 0
+        recent = min(max(count // 2, 2), most_recent)
+        now[:], b_now[:], before[:] = 0.0, 0.0, 0.0
+        _add(before, older_A[n], 1.0)
+        for i in range(3):
+            b_before[i] = older_b[n, i]
+        late, early = 0.0, older_age[n]
+        for w in range(A.shape[1]):
+            if ages[w] < recent:
+                _add(now, A[n, w], 1.0)
+                _add_times(b_now, A[n, w], p[n, w], 1.0)
+                late += ages[w] * _trace(A[n, w])
+            else:
+                _add(before, A[n, w], 1.0)
+                _add_times(b_before, A[n, w], p[n, w], 1.0)
+                early += ages[w] * _trace(A[n, w])
+        lag[m] = max(early / max(_trace(before), _LEAST) - late / max(_trace(now), _LEAST), 1.0)
+        _invert(now, _PART * _trace(now) + 1e3 * _LEAST, P_now)
+        _invert(before, _PART * _trace(before) + 1e3 * _LEAST, P_before)
+        for i in range(3):
+            d[m, i] = _row_times(P_now, i, b_now) - _row_times(P_before, i, b_before)
+        _add(P_now, P_before, 1.0)
+        _invert(P_now, 0.0, W[m])
+    return d, W, lag
+
+
+# ---------------------------------------------------------------------------------------------- windows and bodies
+
+
+@helper
+def _into_body(A, p, dof, anchor, history, known, points, turned, there):
+    """One track's window in a body's coordinates, into `points` (W, 3), `turned` (W, 3, 3), and `there` (W,)."""
+    for w in range(len(dof)):
+        T = history[w]
+        x, y, z = p[w, 0] + anchor[0] - T[0, 3], p[w, 1] + anchor[1] - T[1, 3], p[w, 2] + anchor[2] - T[2, 3]
+        for i in range(3):
+            points[w, i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
+        there[w] = known[w] and dof[w] > 0
+        if there[w]:
+            _turn_back(T, A[w], turned[w])
+        else:
+            turned[w] = 0.0
+
+
+@helper
+def _mean(points, A, mean):
+    """Mean of a window's points (W, 3), weighted by their information (W, 3, 3)."""
+    total, P, told = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
+    for w in range(len(points)):
+        _add(total, A[w], 1.0)
+        _add_times(told, A[w], points[w], 1.0)
+    _invert(total, _PART * _trace(total) + _LEAST, P)
+    for i in range(3):
+        mean[i] = _row_times(P, i, told)
+
+
+@helper
+def _square(points, A, mean):
+    """χ² of "one fixed point" for a window's points (W, 3) with information (W, 3, 3); `mean` is overwritten."""
+    _mean(points, A, mean)
+    square = 0.0
+    for w in range(len(points)):
+        x, y, z = points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]
+        square += x * (A[w, 0, 0] * x + A[w, 0, 1] * y + A[w, 0, 2] * z)
+        square += y * (A[w, 1, 0] * x + A[w, 1, 1] * y + A[w, 1, 2] * z)
+        square += z * (A[w, 2, 0] * x + A[w, 2, 1] * y + A[w, 2, 2] * z)
+    return square
+
+
+@kernel
+def windows_in_body(A, p, dof, anchor, rows, history, known):
+    """What tracks measured, in the coordinates of a body.
+
+    Args:
+        A: information by slot.
+        p: points by slot, relative to the anchors.
+        dof: numbers measured by slot.
+        anchor: of the tracks, in world coordinates.
+        rows: of the tracks.
+        history: poses of the body by slot (W, 4, 4).
+        known: at which slots there is one (W,).
+
+    Returns:
+        points (M, W, 3), their information (M, W, 3, 3), and whether there is any (M, W).
+    """
+    size = A.shape[1]
+    points, turned = np.empty((len(rows), size, 3)), np.empty((len(rows), size, 3, 3))
+    there = np.empty((len(rows), size), np.bool_)
+    for m in range(len(rows)):
+        n = rows[m]
+        _into_body(A[n], p[n], dof[n], anchor[n], history, known, points[m], turned[m], there[m])
+    return points, turned, there
+
+
+@kernel
+def weighted_means(points, A):
+    """Means (M, 3) of points by slot (M, W, 3), weighted by their information (M, W, 3, 3)."""
+    means = np.empty((len(points), 3))
+    for m in range(len(points)):
+        _mean(points[m], A[m], means[m])
+    return means
+
+
+@kernel
+def squares(points, A):
+    """χ² (M,) of "one fixed point" for points by slot (M, W, 3) with information (M, W, 3, 3)."""
+    out, mean = np.empty(len(points)), np.empty(3)
+    for m in range(len(points)):
+        out[m] = _square(points[m], A[m], mean)
+    return out
+
+
+@kernel
+def squares_of_both(A, p, dof, anchor, rows, history, known):
+    """How well fixed points explain what tracks measured while there was a body: one in it, and one in the world.
+
+    The arguments are those of `windows_in_body`.
+
+    Returns:
+        χ² in the body (M,), in the world (M,), of how many numbers (M,), and of how many measurements (M,).
+    """
+    in_body, in_world = np.empty(len(rows)), np.empty(len(rows))
+    numbers, count = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
+    points, turned, mean = np.empty(p.shape[1:]), np.empty(A.shape[1:]), np.empty(3)
+    there = np.empty(A.shape[1], np.bool_)
+    for m in range(len(rows)):
+        n = rows[m]
+        _into_body(A[n], p[n], dof[n], anchor[n], history, known, points, turned, there)
+        in_body[m] = _square(points, turned, mean)
+        for w in range(len(there)):
+            turned[w] = 0.0
+            if there[w]:
+                _add(turned[w], A[n, w], 1.0)
+                numbers[m] += dof[n, w]
+                count[m] += 1
+        in_world[m] = _square(p[n], turned, mean)
+    return in_body, in_world, numbers, count
+
+
+@kernel
+def squares_from_box(position, covariance, rows, T, lower, upper, reach):
+    """Squared distances (M,) of tracks from a box in a body's coordinates, in units of their noise.
+
+    Infinite for those farther than `reach` from the origin of the body, whose pose is T (4, 4).
+    """
+    squares = np.full(len(rows), np.inf)
+    offset, inside, away, P = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    for m in range(len(rows)):
+        n = rows[m]
+        for i in range(3):
+            offset[i] = position[n, i] - T[i, 3]
+        if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 >= reach**2:
+            continue
+        for i in range(3):
+            y = _column_times(T, i, offset)
+            inside[i] = y - min(max(y, lower[i]), upper[i])
+        for i in range(3):
+            away[i] = _row_times(T, i, inside)
+        _invert(covariance[n], _RIDGE * _trace(covariance[n]) + _LEAST, P)
+        squares[m] = 0.0
+        for i in range(3):
+            squares[m] += away[i] * _row_times(P, i, away)
+    return squares
+
+
+@kernel
+def improve_members(A, p, anchor, rows, slot, T, local, information):
+    """Take what tracks measured in a slot into their points in a body's coordinates, in place.
+
+    Args:
+        A: information by slot.
+        p: points by slot, relative to the anchors.
+        anchor: of the tracks, in world coordinates.
+        rows: of the body's tracks.
+        slot: of the measurements.
+        T: pose of the body (4, 4).
+        local: points in the body's coordinates (N, 3).
+        information: of these (N, 3, 3).
+    """
+    turned, P = np.empty((3, 3)), np.empty((3, 3))
+    away, gap, told = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        for i in range(3):
+            away[i] = p[n, slot, i] + anchor[n, i] - T[i, 3]
+        for i in range(3):
+            gap[i] = _column_times(T, i, away) - local[n, i]
+        _turn_back(T, A[n, slot], turned)
+        for i in range(3):
+            told[i] = _row_times(turned, i, gap)
+        _add(information[n], turned, 1.0)
+        _invert(information[n], _RIDGE * _trace(information[n]), P)
+        for i in range(3):
+            local[n, i] += _row_times(P, i, told)
+
+
+@kernel
+def members_ahead(local, information, rows, T, P_body, least):
+    """Where a body's points are (M, 3), in world coordinates, and their covariances (M, 3, 3).
+
+    Args:
+        local: points in the body's coordinates.
+        information: of these.
+        rows: of the body's tracks.
+        T: pose of the body (4, 4).
+        P_body: its covariance (6, 6), body axes.
+        least: information that is added to that of every point.
+    """
+    points, P = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
+    own, J, JP = np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 6))
+    for m in range(len(rows)):
+        y = local[rows[m]]
+        for i in range(3):
+            points[m, i] = _row_times(T, i, y) + T[i, 3]
+        J[:] = 0.0
+        J[0, 1], J[0, 2], J[1, 2] = y[2], -y[1], y[0]
+        J[1, 0], J[2, 0], J[2, 1] = -y[2], y[1], -y[0]
+        J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+        for i in range(3):
+            for j in range(6):
+                JP[i, j] = 0.0
+                for k in range(6):
+                    JP[i, j] += J[i, k] * P_body[k, j]
+        _invert(information[rows[m]], least, own)
+        for i in range(3):
+            for j in range(3):
+                for k in range(6):
+                    own[i, j] += JP[i, k] * J[j, k]
+        _turn(T, own, P[m])
+    return points, P

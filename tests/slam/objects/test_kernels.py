@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import numpy as np
+
+from slam.objects import scene_kernels, track_kernels
+from slam.se3 import exp
+
+RNG = np.random.default_rng(5)
+TRACKS, SLOTS = 7, 6
+
+
+def windows():
+    """Information and points by slot, as of stereo measurements; the last slot of the first track is empty."""
+    J = 100 * RNG.standard_normal((TRACKS, SLOTS, 3, 3))
+    A = np.swapaxes(J, 2, 3) @ J
+    A[0, -1] = 0.0
+    return A, 0.1 * RNG.standard_normal((TRACKS, SLOTS, 3)), np.where(A[..., 0, 0] > 0, 3, 0).astype(np.int8)
+
+
+def test_fixed_points_solve_the_normal_equations():
+    A, p, _ = windows()
+    anchor, position, covariance = RNG.standard_normal((TRACKS, 3)), np.zeros((TRACKS, 3)), np.zeros((TRACKS, 3, 3))
+    track_kernels.fit_fixed_points(A, p, anchor, np.array([0, 3]), position, covariance)
+    for n in (0, 3):
+        P = np.linalg.inv(A[n].sum(axis=0))
+        np.testing.assert_allclose(covariance[n], P, rtol=1e-6)  # 1e-9 of the trace on the diagonal, condition < 1e3
+        np.testing.assert_allclose(position[n] - anchor[n], P @ np.einsum("wij,wj->i", A[n], p[n]), atol=1e-7)
+    assert not position[1].any()
+
+
+def test_even_motions_are_least_squares_in_point_and_velocity():
+    A, p, _ = windows()
+    times = np.linspace(-0.5, 0.0, SLOTS)
+    points, P, velocity, PV, test = track_kernels.even_motions(A, p, np.arange(TRACKS), times, 0.25)
+    for n in range(TRACKS):
+        H = np.stack([np.hstack([np.eye(3), t * np.eye(3)]) for t in times])
+        normal = np.einsum("wki,wkl,wlj->ij", H, A[n], H) + np.diag([0.0] * 3 + [0.25] * 3)
+        x = np.linalg.solve(normal, np.einsum("wki,wkl,wl->i", H, A[n], p[n]))
+        covariance = np.linalg.inv(normal)
+        np.testing.assert_allclose(np.concatenate([points[n], velocity[n]]), x, atol=1e-6)
+        np.testing.assert_allclose(P[n], covariance[:3, :3], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(PV[n], covariance[3:, 3:], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(test[n], x[3:] @ np.linalg.solve(covariance[3:, 3:], x[3:]), rtol=1e-5)
+
+
+def test_both_squares_are_the_same_where_the_body_stands_at_the_worlds_origin():
+    """And a turned body only adds the turn of the points: χ² of a fixed point depends on no axes."""
+    A, p, dof = windows()
+    anchor, rows, known = np.zeros((TRACKS, 3)), np.arange(TRACKS), np.ones(SLOTS, bool)
+    still = np.tile(np.eye(4), (SLOTS, 1, 1))
+    turned = np.tile(exp(np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])), (SLOTS, 1, 1))
+    for history in (still, turned):
+        body, world, numbers, count = track_kernels.squares_of_both(A, p, dof, anchor, rows, history, known)
+        np.testing.assert_allclose(body, world, rtol=1e-6)
+        assert list(numbers[:2]) == [15, 18] and list(count[:2]) == [5, 6]
+    points, information, _ = track_kernels.windows_in_body(A, p, dof, anchor, rows, turned, known)
+    np.testing.assert_allclose(track_kernels.squares(points, information), world, rtol=1e-6)
+
+
+def test_the_common_motion_solves_the_normal_equations_where_no_track_pulls():
+    n = 30
+    points, lag = RNG.normal((0, 0, 3), 1.0, (n, 3)), np.full(n, 2.0)
+    motion = np.array([0.01, -0.02, 0.005, 0.01, 0.02, -0.01])
+    d = lag[:, None] * (np.cross(motion[:3], points) + motion[3:])
+    problem = scene_kernels.normal_equations(points, d, np.repeat(1e4 * np.eye(3)[None], n, axis=0), lag)
+    found = scene_kernels.common_motion(*problem, np.ones(n, bool), np.full(6, 1e-9), 16.0, 3, 2)
+    np.testing.assert_allclose(found, motion, atol=1e-9)
+    np.testing.assert_allclose(scene_kernels.squares_against(*problem, found), 0.0, atol=1e-6)
+    np.testing.assert_allclose(scene_kernels.squares_against(*problem, np.zeros(6)), 1e4 * (d**2).sum(axis=1))

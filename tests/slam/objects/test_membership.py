@@ -1,0 +1,133 @@
+"""Who belongs to a body: on tables of tracks whose points and motions are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.data import StereoFeatures
+from slam.objects import membership
+from slam.objects.bodies import Body, new_body, with_extent
+from slam.objects.config import ObjectsConfig
+from slam.objects.tracks import Tracks, fit_positions, record
+from slam.se3 import Array, exp, transform
+
+WINDOW = 12
+SLOT = WINDOW - 1
+SIGMA = 0.002  # [m]
+TIMES = (np.arange(WINDOW) - SLOT) / 30.0
+
+
+def table(seen: Array) -> Tracks:
+    """Tracks that measured the points (N, W, 3) in world coordinates, one slot a frame."""
+    n = len(seen)
+    features = StereoFeatures(
+        0.0, np.zeros((n, 2)), np.zeros((n, 2)), np.ones(n), np.zeros(n), np.ones(n), np.ones(n, np.int8),
+        np.zeros((n, 16), np.float32), (320, 240),
+    )  # fmt: skip
+    tracks = Tracks.empty(16, WINDOW)
+    rows = tracks.begin(np.arange(n), features, np.arange(n), seen[:, 0])
+    information = np.broadcast_to(np.eye(3) / SIGMA**2, (n, 3, 3))
+    for slot in range(WINDOW):
+        record(tracks, rows, slot, seen[:, slot], information, np.full(n, 3, np.int8))
+    fit_positions(tracks, rows)
+    return tracks
+
+
+def path(velocity: Array) -> Array:
+    """Poses (W, 4, 4) of a body with an even twist [ω, v] (6,), the last one 1 m before the camera."""
+    poses = exp(TIMES[:, None] * velocity)
+    poses[:, 2, 3] += 1.0
+    return poses
+
+
+def seen_from(poses: Array, local: Array, seed: int) -> Array:
+    """Measured points (N, W, 3) of points (N, 3) that go with poses (W, 4, 4)."""
+    points = np.stack([transform(T, local) for T in poses], axis=1)
+    return points + SIGMA * np.random.default_rng(seed).standard_normal(points.shape)
+
+
+def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
+    """A settled body with these poses whose members are these rows."""
+    body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    body = replace(body, T=poses[SLOT], T_first=poses[0], history=poses, seen=50, proved=True)
+    membership.enter(body, tracks, members, sure=True)
+    return with_extent(body, tracks.local[members])
+
+
+def corners(n: int, seed: int, lid: int = 0) -> Array:
+    """Points (n, 3) of a body; the last `lid` of them lie well off its x axis."""
+    points = np.random.default_rng(seed).uniform(-0.1, 0.1, (n, 3))
+    points[n - lid :, 1] = 0.15
+    return points
+
+
+STILL = np.tile(np.eye(4), (WINDOW, 1, 1))
+AHEAD = np.array([0.0, 0.0, 1.0])
+
+
+MOVING = np.array([0.0, 0.4, 0.0, 0.3, 0.0, 0.0])
+LID = np.array([1.2, 0.4, 0.0, 0.3, 0.0, 0.0])  # turns about the body's x axis besides
+
+
+def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> None:
+    local = corners(16, 1, lid=4)
+    poses = path(MOVING)
+    seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
+    tracks = table(seen)
+    body = body_along(poses, np.arange(16), tracks)
+    gains = membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    lid = np.arange(12, 16)
+    assert (tracks.body[:12] == 1).all()
+    assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
+    assert len(gains[1]) == 12
+    record(tracks, lid, SLOT, seen[lid, SLOT], np.broadcast_to(np.eye(3) / SIGMA**2, (4, 3, 3)), np.full(4, 3, np.int8))
+    membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    assert (tracks.body[lid] == -1).all()
+
+
+@pytest.mark.parametrize(("velocity", "same"), [(MOVING, True), (LID, False)])
+def test_a_group_is_part_of_a_body_only_where_it_has_no_motion_of_its_own(velocity: Array, same: bool) -> None:
+    local = corners(16, 4, lid=6)
+    poses = path(MOVING)
+    tracks = table(np.concatenate([seen_from(poses, local[:10], 5), seen_from(path(velocity), local[10:], 6)]))
+    whole = body_along(poses, np.arange(10), tracks)
+    group = np.arange(10, 16)
+    own = new_body(2, path(velocity)[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    own = membership.fitted(replace(own, history=path(velocity)), tracks, group, TIMES, SLOT)
+    assert (membership.overlapped({1: whole}, tracks, group, own) is whole) == same
+
+
+def test_poses_fitted_to_still_points_prove_nothing() -> None:
+    """A body that is made of still tracks fits their noise better than the still world does, for its poses are free."""
+    proofs = []
+    for seed in range(20):
+        tracks = table(seen_from(STILL, corners(6, seed) + AHEAD, 100 + seed))
+        body = new_body(1, AHEAD, np.zeros(6), TIMES, 0.0, 0.0)
+        body = membership.fitted(body, tracks, np.arange(6), TIMES, SLOT)
+        membership.enter(body, tracks, np.arange(6), sure=True)
+        gain = membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1]
+        kept = membership.proved(body, gain)
+        proofs.append(kept is not None and kept.proved)
+    assert sum(proofs) <= 1  # 5 % of the bodies
+
+
+def test_poses_fitted_to_moving_points_prove_a_body() -> None:
+    tracks = table(seen_from(path(MOVING), corners(6, 7), 8))
+    body = new_body(1, AHEAD, MOVING, TIMES, 0.0, 0.0)
+    body = membership.fitted(body, tracks, np.arange(6), TIMES, SLOT)
+    membership.enter(body, tracks, np.arange(6), sure=True)
+    kept = membership.proved(body, membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1])
+    assert kept is not None and kept.proved
+
+
+def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
+    """Still features behind a body that rests may count as its own; they must not make it larger."""
+    local = np.concatenate([corners(8, 9), [[0.12, 0.0, 0.0]]])
+    still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
+    tracks = table(seen_from(still, local, 10))
+    body = body_along(still, np.arange(8), tracks)
+    membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    assert tracks.sure[:8].all() and not tracks.sure[8]
