@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
 from frontends import create
 from slam.association_truth import AssociationScore, SurfacePoints
 from slam.config import SystemConfig
@@ -156,10 +158,8 @@ def main() -> int:
     draw_top_view(runs, sequence.ground_truth, arguments.out / "top_view.png")
     draw_errors(runs, sequence.ground_truth, arguments.out / "errors.png")
     draw_map_over_time([arguments.out / backend for backend in BACKENDS], arguments.out / "map.png")
-    print("| " + " | ".join(HEADER) + " |\n| --- | --- |" + " ---: |" * (len(HEADER) - 2))
-    for values in rows:
-        print("| " + " | ".join(f"{x:.2f}" if isinstance(x, float) else str(x) for x in values) + " |")
-    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+    print(markdown(HEADER, rows, 2))
+    write_json(arguments.out / "table.json", HEADER, rows)
     return 0
 
 

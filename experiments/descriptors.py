@@ -10,6 +10,7 @@ the papers' filter on rendered worlds where the surface point behind every landm
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
@@ -23,8 +24,9 @@ from frontends.surf import Surf
 from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant
 from slam.compare.scheduler import LocalScheduler, available_cores
-from slam.compare.statistics import difference, sentence
+from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
+from slam.compare.wording import sentence
 
 WORLDS = ("synthetic:aisle?frames={}", "synthetic:desk?frames={}")
 VARIANTS = tuple(Variant(f"{d}-D", "surf", (f"frontend.descriptor={d}",)) for d in (64, 16))
@@ -48,6 +50,7 @@ def known_points(frames: int, seeds: int, out: Path) -> tuple[list[str], dict[st
     """What follows for each world, and the landmark errors [mm] (2, seeds) of 64-D and 16-D."""
     lines, errors = [], {}
     plan = Plan(tuple(w.format(frames) for w in WORLDS), ("ekf",), VARIANTS, seeds, replay=False)
+    shutil.rmtree(out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, out / "runs", LocalScheduler(available_cores()))
     for world in plan.sequences:
         own = [[r for r in runs if (r.trial.sequence, r.trial.variant) == (world, v)] for v in plan.variants]

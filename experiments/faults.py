@@ -4,12 +4,12 @@
 
 Each fault on the rendered world ``desk``, both back ends. Prints a Markdown table: the sequence of states, the position
 error before and after the fault, how long it took to recognise the map again, and the share of right associations.
+Draws the error frame by frame.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
 from frontends import create
 from slam.association_truth import SurfacePoints
 from slam.config import SystemConfig
@@ -55,17 +58,18 @@ class Fault:
 
 def faults(quick: bool) -> list[Fault]:
     """The recordings; frame numbers are in the recording, after any are dropped."""
-    n = 40 if quick else 120
+    n, dark = (24, 20) if quick else (120, 60)
     rng = np.random.default_rng(0)  # frame 0 keeps its right image: without it there is no map that could be kept
     chosen = ",".join(str(k) for k in range(1, 2 * n) if rng.random() < 0.3)
-    return [
+    every = [
         Fault("none", f"frames={2 * n}", n, n + 1),
-        Fault("2 s of blackout", f"frames={2 * n + 60}&black={n}:{n + 60}", n - 1, n + 60),
+        Fault(f"{dark / 30:.2g} s of blackout", f"frames={2 * n + dark}&black={n}:{n + dark}", n - 1, n + dark),
         Fault("30 % of frames dropped", f"frames={2 * n}&drop=0.3", n // 2, n // 2 + 1),
         Fault("30 % of right images dropped", f"frames={2 * n}&dropright={chosen}", n, n + 1),
-        Fault("carried off to a known place", "frames=900", n - 1, n, (n, 20 if quick else 30)),
+        Fault("carried off to a known place", "frames=900", n - 1, n, (n, 12 if quick else 30)),
         Fault("carried off to an unknown place", "frames=900", n - 1, n, (n, 450)),
     ]
+    return [every[1], every[3], every[4]] if quick else every
 
 
 def frames(fault: Fault, count: int) -> Iterator[tuple[int, StereoFrame]]:
@@ -88,8 +92,8 @@ def extract(fault: Fault, count: int) -> list[tuple[int, StereoFeatures]]:
     return [(k, frontend.extract(frame)) for k, frame in frames(fault, count)]
 
 
-def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) -> list[Any]:
-    """One row of the table."""
+def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) -> tuple[list[Any], list[float]]:
+    """One row of the table, and the error of every frame [cm]."""
     sequence = open_sequence(f"synthetic:desk?{fault.options}")
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind))
     truth = sequence.ground_truth.poses
@@ -107,10 +111,11 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
         results.append(result)
     found = [i for i in range(fault.over, len(results)) if results[i].status.value == "tracked"]
     after = errors[found[0] :] if found else [float("nan")]
-    return [
+    row = [
         fault.name, backend, states(results), errors[fault.last_good], float(np.mean(after)), max(after), errors[-1],
         found[0] - fault.over if found else None, 100 * right / max(total, 1), strays,
     ]  # fmt: skip
+    return row, errors
 
 
 def states(results: list[FrameResult]) -> str:
@@ -118,20 +123,42 @@ def states(results: list[FrameResult]) -> str:
     return ", ".join(f"{name} {len(list(group))}" for name, group in groupby(r.status.value for r in results))
 
 
+def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
+    """Position error over the frames, a panel a fault; grey from the last good frame to the first after the fault."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(fault for fault, _ in errors))
+    figure = Figure((11, 5.6), layout="constrained")
+    axes = figure.subplots(2, -(-len(names) // 2), sharey=True)
+    for axis, fault in zip(axes.ravel(), names):
+        axis.axvspan(fault.last_good, fault.over, color="0.85")
+        for backend in BACKENDS:
+            axis.semilogy(np.maximum(errors[fault, backend], 1e-2), lw=1, label=backend)
+        axis.set_title(fault.name, fontsize=9)
+        axis.set_xlabel("frame")
+    for axis in axes.ravel()[len(names) :]:
+        axis.remove()
+    for axis in axes[:, 0]:
+        axis.set_ylabel("error [cm]")
+    figure.axes[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter recordings")
+    parser.add_argument("--quick", action="store_true", help="three of the faults, shorter recordings")
     parser.add_argument("--out", type=Path, default=Path("results/faults"))
     arguments = parser.parse_args()
-    rows = []
+    rows, errors = [], {}
     for fault in faults(arguments.quick):
-        features = extract(fault, 80 if arguments.quick else 300)
-        rows += [run(fault, backend, features) for backend in BACKENDS]
-        for row in rows[-len(BACKENDS) :]:
-            print("| " + " | ".join(f"{x:.2f}" if isinstance(x, float) else str(x) for x in row) + " |", flush=True)
-    print("| " + " | ".join(HEADER) + " |\n" + "| --- | --- | --- |" + " ---: |" * (len(HEADER) - 3))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+        features = extract(fault, 48 if arguments.quick else 300)
+        for backend in BACKENDS:
+            row, errors[fault, backend] = run(fault, backend, features)
+            rows.append(row)
+            print(row, file=sys.stderr, flush=True)
+    print(markdown(HEADER, rows, 3))
+    write_json(arguments.out / "table.json", HEADER, rows)
+    draw(errors, arguments.out / "faults.png")
     return 0
 
 

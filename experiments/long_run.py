@@ -334,7 +334,7 @@ def main() -> int:
                 done.append(c)
                 print(f"{name} {world} {row(c)}", file=sys.stderr, flush=True)
                 write_csv(arguments.out / f"{name}_{world}.csv", done)
-            texts.append(f"### {name}, {world}, {frames} frames\n\n{table(done)}")
+            texts.append(f"# {name}, {world}, {frames} frames\n\n{table(done)}")
             (arguments.out / "long_run.md").write_text("\n\n".join(texts) + "\n")
             draw(arguments.out / "long_run.png", runs)
     print("\n\n".join(texts))

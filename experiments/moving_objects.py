@@ -14,8 +14,6 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +23,26 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
 from experiments.labelled_cars import Labels, hidden, labelled_speed, nearest_car, read_labels
+from experiments.object_runs import (
+    body_row,
+    camera_figures,
+    features_where,
+    path_of,
+    scored_run,
+    seen_in,
+    steps,
+    system_for,
+)
 from experiments.twins import Twins
 from slam import registry
 from slam.compare.measure import Metric
 from slam.compare.statistics import difference
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
-from slam.evaluation import consistency, evaluate
-from slam.objects.metrics import ObjectScore, body_alignment, labels_in_images, score_for
+from slam.evaluation import evaluate
+from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 from slam.se3 import inverse, rotation_angle
-from slam.trajectory import Trajectory
 
 BACKENDS = ("ekf", "smoother")
 PARTS = ("table1", "moving", "paired", "boxes", "still", "street", "kitti")
@@ -44,79 +51,13 @@ KITTI = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 MOVING_CARS = (0, 1, 5)  # two that overtake, and a van that comes towards the camera
 
 
-def features_with_labels(sequence: Any, system: slam.StereoSlam, k: int, images: bool) -> tuple[StereoFeatures, Any]:
-    """Features of a frame and the body of each."""
-    if not images:
-        seen = sequence.simulate(k)
-        return seen.features, seen.objects
-    features = system.frontend.extract(sequence.frame(k))
-    return features, labels_in_images(sequence, k, features)
-
-
-def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:
-    frontend = "surf" if images else None
-    config = SystemConfig.for_kind(sequence.kind, frontend, backend).with_settings(settings)
-    return slam.StereoSlam(sequence.rig, frontend, backend, config=config)
-
-
-def steps(
-    sequence: Any, system: slam.StereoSlam, images: bool, frames: int, without: bool = False
-) -> Iterator[tuple[int, FrameResult, Any]]:
-    """Every frame's number, result and labels; `without` leaves out the features on moving bodies."""
-    for k in range(min(frames, len(sequence))):
-        features, labels = features_with_labels(sequence, system, k, images)
-        if without:
-            keep = labels == 0 if images else labels <= 0  # features on its outline move with it
-            features, labels = features_where(features, keep), labels[keep]
-        yield k, system.process_features(features), labels
-
-
-def features_where(features: StereoFeatures, keep: Any) -> StereoFeatures:
-    """Those features (M) for which `keep` (N,) is true."""
-    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
-    return replace(features, **{name: getattr(features, name)[keep] for name in names})
-
-
-def path_of(results: list[FrameResult]) -> Trajectory:
-    return Trajectory(
-        np.array([r.estimate.stamp for r in results]), np.array([r.estimate.T_world_left for r in results])
-    )
-
-
-def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:
-    path = path_of(results)
-    truth = consistency(path, np.array([r.estimate.covariance for r in results]), sequence)
-    return {"ATE [mm]": 1e3 * evaluate(path, sequence)["ATE RMSE [m]"], "camera NEES": truth["mean NEES"]}
-
-
-def scored_run(name: str, backend: str, images: bool, frames: int, *settings: str) -> dict[str, Any]:
-    """One run of a world: the score's figures, the camera's, and the detector's time."""
-    sequence = slam.open_sequence(f"synthetic:{name}")
-    score = score_for(sequence) or ObjectScore(
-        np.zeros((0, len(sequence), 4, 4)), sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu
-    )
-    system = system_for(sequence, backend, images, list(settings))
-    results = []
-    for k, result, labels in steps(sequence, system, images, frames):
-        score.add(k, result, labels)
-        results.append(result)
-    longest = max((len(life.frames) for life in score.lives.values() if life.truth == 0), default=0)
-    return {
-        "world": name,
-        "back end": backend,
-        **camera_figures(sequence, results),
-        **score.summary(),
-        "longest false object [frames]": longest,
-        "objects [ms]": float(np.median([r.milliseconds["objects"] for r in results])),
-    }
-
-
 # ------------------------------------------------------------------------------------------- the parts
 
 
-def table1(images: bool, quick: bool) -> list[dict[str, Any]]:
+def table1(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Paper B, Table 1: where the box is said to be at its four places, and the errors."""
-    sequence = slam.open_sequence("synthetic:box?density=300&camera=still")
+    name = "box?density=300&camera=still"
+    sequence = slam.open_sequence(f"synthetic:{name}")
     frames = 40 if quick else len(sequence)
     true = np.array([sequence.objects(k).T_world_object[0] for k in range(frames)])
     rows = []
@@ -124,10 +65,10 @@ def table1(images: bool, quick: bool) -> list[dict[str, Any]]:
         for mode in ("detect", "procedure1"):
             system = system_for(sequence, backend, images, [])
             if mode == "procedure1":
-                system.objects = known_box(sequence, system, images)
+                system.objects = known_box(sequence, system, *seen_in(name, images, frames)[0])
             poses: dict[int, dict[int, np.ndarray]] = {}
             world = None
-            for k, result, _ in steps(sequence, system, images, frames):
+            for k, result, _ in steps(name, system, images, frames):
                 if world is None:
                     world = inverse(result.estimate.T_world_left @ inverse(sequence.ground_truth.poses[0]))
                 for thing in result.objects:
@@ -137,9 +78,8 @@ def table1(images: bool, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def known_box(sequence: Any, system: slam.StereoSlam, images: bool) -> Procedure1Detector:
+def known_box(sequence: Any, system: slam.StereoSlam, features: StereoFeatures, labels: Any) -> Procedure1Detector:
     """The papers' detector with the box's features of the first frame."""
-    features, labels = features_with_labels(sequence, system, 0, images)
     start = np.eye(4) if system.config.models.T_world_left is None else system.config.models.initial_pose
     corner = inverse(sequence.ground_truth.poses[0]) @ sequence.objects(0).T_world_object[0]
     database = ObjectDatabase.of(features, labels == 1, sequence.rig, start, (start @ corner)[:3, 3])
@@ -167,32 +107,57 @@ def place_rows(sequence: Any, true: Any, poses: dict[int, Any], backend: str, mo
     return rows
 
 
-def moving(images: bool, quick: bool) -> list[dict[str, Any]]:
+def moving(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box under a moving camera, and the same run without the box's features."""
-    name, frames = "box?density=300&camera=moving", 40 if quick else 10**6
-    rows = []
+    name, frames = "box?density=300&camera=moving&seed=0", 90 if quick else 10**6
+    rows, scores = [], {}
     for backend in BACKENDS:
-        row = scored_run(name, backend, images, frames)
+        row, scores[backend] = scored_run(name, backend, images, frames)
         sequence = slam.open_sequence(f"synthetic:{name}")
         system = system_for(sequence, backend, images, ["objects.mode=off"])
-        bare = [result for _, result, _ in steps(sequence, system, images, frames, without=True)]
+        bare = [result for _, result, _ in steps(name, system, images, frames, without=True)]
         row["ATE without the box [mm]"] = camera_figures(sequence, bare)["ATE [mm]"]
         rows.append(row)
+    draw_errors(scores, out / "box.png")
     return rows
 
 
-def paired(images: bool, quick: bool) -> list[dict[str, Any]]:
+def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
+    """How far the box's pose is from the truth over the run, by back end, after one change of body frame each."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
+    for (backend, score), colour in zip(scores.items(), ("tab:orange", "tab:blue")):
+        found = score.poses_of(1)
+        if found is not None:
+            frames, own, true = found
+            errors = absolute_pose_errors(own, true)
+            axes[0].plot(score.stamps[frames], errors.rotation, ".", ms=3, color=colour, label=backend)
+            axes[1].plot(score.stamps[frames], 1e3 * errors.translation, ".", ms=3, color=colour)
+    axes[0].set(ylabel="rotation error [deg]", ylim=(0, None))
+    axes[1].set(ylabel="translation error [mm]", xlabel="time [s]", ylim=(0, None))
+    if axes[0].lines:
+        axes[0].legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def paired(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Both back ends on identical measurements, bodies included: the filter drives, the smoother is given the same."""
-    seeds, frames = (1, 40) if quick else (6, 200)
+    seeds, frames = (1, 90) if quick else (6, 200)
     values: dict[str, list[list[float]]] = {}
     for seed in range(seeds):
-        sequence = slam.open_sequence(f"synthetic:box?density=300&camera=moving&seed={seed}")
+        name = f"box?density=300&camera=moving&seed={seed}"
+        sequence = slam.open_sequence(f"synthetic:{name}")
         config = SystemConfig.for_kind(sequence.kind, "surf" if images else None, "ekf")
         pair = [registry.create("backends", name, sequence.rig, models=config.models) for name in BACKENDS]
         twins = Twins(*pair)
         system = slam.StereoSlam(sequence.rig, "surf" if images else None, twins, config=config)
         scores = [score_for(sequence) for _ in BACKENDS]
-        for k, result, labels in steps(sequence, system, images, frames):
+        for k, result, labels in steps(name, system, images, frames):
             scores[0].add(k, result, labels)
             scores[1].add(k, twins.seen_by_follower(result), labels)
         bodies = [score.body(1) for score in scores]
@@ -212,25 +177,25 @@ def paired(images: bool, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def boxes(images: bool, quick: bool) -> list[dict[str, Any]]:
+def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Three boxes and an articulated one."""
     frames = 20 if quick else 300
-    return [scored_run("boxes?density=300", backend, images, frames) for backend in BACKENDS]
+    return [scored_run("boxes?density=300", backend, images, frames)[0] for backend in BACKENDS]
 
 
-def still(images: bool, quick: bool) -> list[dict[str, Any]]:
+def still(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Nothing moves."""
     seeds, frames = (1, 15) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
-    return [scored_run(f"{w}seed={seed}", "ekf", images, frames) for w in worlds for seed in range(seeds)]
+    return [scored_run(f"{w}seed={seed}", "ekf", images, frames)[0] for w in worlds for seed in range(seeds)]
 
 
-def street(images: bool, quick: bool) -> list[dict[str, Any]]:
+def street(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Cars that drive ahead and come towards the camera."""
-    return [scored_run("street?density=3", backend, images, 20 if quick else 10**6) for backend in BACKENDS]
+    return [scored_run("street?density=3", backend, images, 20 if quick else 10**6)[0] for backend in BACKENDS]
 
 
-def kitti(images: bool, quick: bool) -> list[dict[str, Any]]:
+def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """KITTI raw 0013: two cars overtake, a van comes; parked cars must not be made objects."""
     data = os.environ.get("SLAM_DATA")
     folder = Path(data or "") / KITTI
@@ -296,17 +261,22 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """A Markdown table of the rows' plain values; nested ones stand below it as JSON."""
+    """A Markdown table of the rows' plain values; where they have bodies, these follow in a table of their own."""
     if not rows:
         return "(nothing)"
+    bodies = [
+        body_row(row["world"], row["back end"], number, body)
+        for row in rows
+        for number, body in row.get("bodies", {}).items()
+        if body["frames in view"]
+    ]
+    return plain_table(rows) + ("\n\n" + plain_table(bodies) if bodies else "")
+
+
+def plain_table(rows: list[dict[str, Any]]) -> str:
     columns = [key for key, value in rows[0].items() if not isinstance(value, dict)]
     lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    lines += ["| " + " | ".join(text(row.get(c)) for c in columns) + " |" for row in rows]
-    for row in rows:
-        for key in ("features", "bodies"):
-            if key in row:
-                lines.append(f"{row.get('world')} {row.get('back end')} {key}: {json.dumps(rounded(row[key]))}")
-    return "\n".join(lines)
+    return "\n".join(lines + ["| " + " | ".join(text(row.get(c)) for c in columns) + " |" for row in rows])
 
 
 def text(value: Any) -> str:
@@ -337,7 +307,7 @@ def main() -> int:
         "kitti": kitti,
     }
     for name in arguments.only.split(","):
-        rows = parts[name](not arguments.observations, arguments.quick)
+        rows = parts[name](not arguments.observations, arguments.quick, arguments.out)
         print(f"\n## {name}\n{table(rows)}", flush=True)
         (arguments.out / f"{name}.json").write_text(json.dumps(rounded(rows), indent=2, default=str) + "\n")
     return 0

@@ -5,7 +5,8 @@
 Search windows of fixed sizes (paper A, Fig. 4) against windows by the innovation's covariance; with and without erasing
 bad landmarks (paper A, IV); an adaptive against a fixed D_threshold (paper A, III.A), judged on the bare stretch, which
 the middle of these frames shows; landmarks looked for from anywhere, and a map that is not thinned. Every seed has
-sensor noise, shelves and a gait of its own. Prints a Markdown table: medians over the seeds, and the worst peak.
+sensor noise, shelves and a gait of its own. Prints a Markdown table: medians over the seeds, and the worst peak, and
+draws every seed's mean error.
 
 Each seed's figures go to a file in DIR when it is done; a run that was broken off goes on with the seeds that are
 missing. About three minutes of CPU time a seed.
@@ -26,6 +27,9 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
 from frontends import create
 from slam.association_truth import surface_points
 from slam.config import SystemConfig
@@ -152,6 +156,26 @@ def row(policy: Policy, backend: str, runs: list[dict[str, float]]) -> list[Any]
     return [policy.name, backend, *(middle[n] if n else worst for n in names)]
 
 
+def draw(found: dict[tuple[str, str], list[dict[str, float]]], path: Path) -> None:
+    """Mean error of every seed by policy and back end, and the medians."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((9, 0.9 + 0.42 * len(POLICIES)), layout="constrained")
+    axis = figure.subplots()
+    for shift, backend in zip((-0.13, 0.13), BACKENDS):
+        values = [[one["mean"] for one in found[policy.name, backend]] for policy in POLICIES]
+        places = np.arange(len(POLICIES)) + shift
+        points = axis.plot(np.concatenate(values), np.repeat(places, [len(v) for v in values]), ".", alpha=0.45)
+        colour = points[0].get_color()
+        axis.plot([np.median(v) for v in values], places, "|", ms=13, mew=2, color=colour, label=f"{backend}, median")
+    axis.set_yticks(range(len(POLICIES)), [policy.name for policy in POLICIES])
+    axis.invert_yaxis()
+    axis.set_xscale("log")
+    axis.set_xlabel("mean position error of a seed [cm]")
+    axis.legend(frameon=False, fontsize=8, ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0))
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one seed, 20 frames")
@@ -173,10 +197,9 @@ def main() -> int:
             found.setdefault((one["policy"], one["backend"]), []).append(one)
     rows = [row(policy, backend, found[policy.name, backend]) for policy in POLICIES for backend in BACKENDS]
     print(f"{arguments.world}, frames {frames.start} to {frames.stop - 1}, {len(seeds)} seeds\n")
-    print("| " + " | ".join(HEADER) + " |\n| --- | --- |" + " ---: |" * (len(HEADER) - 2))
-    for values in rows:
-        print("| " + " | ".join(f"{x:.2f}" if isinstance(x, float) else x for x in values) + " |")
-    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+    print(markdown(HEADER, rows, 2))
+    write_json(arguments.out / "table.json", HEADER, rows)
+    draw(found, arguments.out / "policies.png")
     return 0
 
 

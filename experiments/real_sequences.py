@@ -3,22 +3,29 @@
     SLAM_DATA=/path/to/data python experiments/real_sequences.py [--quick] [--out DIR]
 
 Runs every sequence that the folder holds with the default settings of its kind, and prints a Markdown table: accuracy
-of the online and of the final path, share of frames tracked, and the median time of a frame.
+of the online and of the final path, share of frames tracked, and the median time of a frame. Draws the paths from above
+with the true one.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 from typing import Any
 
-from slam.compare.measure import Lifetimes
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
+from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
+from slam.metrics import align, associate
 from slam.runner import RunOptions, run
 from slam.sequences import open_sequence
+from slam.trajectory import Trajectory
 
 SEQUENCES = {
     "KITTI odometry 06": "kitti_odometry/sequences/06",
@@ -30,13 +37,17 @@ HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", 
           "landmark lifetime, median [frames]", "ms per frame")  # fmt: skip
 
 
+def folder_of(name: str, backend: str, out: Path) -> Path:
+    return out / name.replace(" ", "_").replace(",", "") / backend
+
+
 def run_one(name: str, folder: Path, backend: str, out: Path, frames: int | None) -> dict[str, Any]:
     sequence = open_sequence(folder)
-    target = out / name.replace(" ", "_").replace(",", "") / backend
+    target = folder_of(name, backend, out)
     lifetimes = Lifetimes()
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
     summary = run(sequence, RunOptions(backend, "surf", config, target, 0, frames), lifetimes.add)
-    return {**summary, "lifetime": lifetimes.median}
+    return {**summary, "lifetime": lifetimes.figures()["lifetime_frames"]}
 
 
 def row(name: str, summary: dict[str, Any]) -> list[str]:
@@ -48,6 +59,34 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
     return [name, summary["backend"], tracked, *texts, *times]
 
 
+def draw(names: dict[str, Path], out: Path) -> None:
+    """Paths from above, online, and the true one laid upon the first of them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((4.6 * len(names), 4), layout="constrained")
+    for axis, (name, folder) in zip(figure.subplots(1, len(names), squeeze=False)[0], names.items()):
+        paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in BACKENDS]
+        for backend, path in zip(BACKENDS, paths):
+            axis.plot(*path.positions[:, [0, 2]].T, lw=1.5, label=backend)
+        truth = true_path(folder, paths[0])
+        if truth is not None:
+            axis.plot(*truth[:, [0, 2]].T, "k--", lw=1, label="truth")
+        axis.set(title=name, xlabel="right [m]", ylabel="forward [m]")
+        axis.axis("equal")
+        axis.locator_params(nbins=6)
+        axis.legend(frameon=False, fontsize=8)
+    figure.savefig(out / "paths.png", dpi=110, metadata={"Software": None})
+
+
+def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
+    """True positions (N, 3) in the estimate's axes; None where there are none in space."""
+    truth = open_sequence(folder).ground_truth
+    if truth is None:
+        return None
+    own, true = associate(estimate, truth, 0.02, interpolated=True)
+    return align(true, own).apply(true.positions)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="ten frames of each sequence")
@@ -57,19 +96,16 @@ def main() -> int:
     if not data:
         print("real sequences: set SLAM_DATA to the folder that holds them; nothing was run")
         return 0
-    rows = []
-    for name, folder in SEQUENCES.items():
-        if not (Path(data) / folder).is_dir():
-            print(f"{name}: not in {data}, left out", file=sys.stderr)
-            continue
-        for backend in BACKENDS:
-            summary = run_one(name, Path(data) / folder, backend, arguments.out, 10 if arguments.quick else None)
-            rows.append(row(name, summary))
-    table = ["| " + " | ".join(HEADER) + " |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
-    table += ["| " + " | ".join(r) + " |" for r in rows]
-    print("\n".join(table))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "table.json").write_text(json.dumps([dict(zip(HEADER, r)) for r in rows], indent=2) + "\n")
+    found = {name: Path(data) / folder for name, folder in SEQUENCES.items() if (Path(data) / folder).is_dir()}
+    if len(found) < len(SEQUENCES):
+        print(f"left out, not in {data}: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
+    if not found:
+        return 0
+    frames = 10 if arguments.quick else None
+    rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in BACKENDS]
+    print(markdown(HEADER, rows, 2))
+    write_json(arguments.out / "table.json", HEADER, rows)
+    draw(found, arguments.out)
     return 0
 
 

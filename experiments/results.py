@@ -1,4 +1,4 @@
-"""The results page: every experiment in one command, its tables and figures with what the papers had.
+"""The results page and the gallery: every experiment in one command, its tables and figures with what the papers had.
 
     SLAM_DATA=/path/to/data python experiments/results.py [--quick] [--only NAME …] [--out DIR] [--page FILE]
         [--processes N] [--resume]
@@ -6,16 +6,20 @@
 Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of the
 page, and the pictures that it leaves are copied beside the page. A script that fails is said on the page, and the exit
 status is 1; the others run all the same. ``--processes 2`` runs two at once, which spoils their times; ``--resume``
-takes what ran to its end in an earlier call, of the same code, from its folder.
+takes from its folder what ran to its end in an earlier call with the same code and versions, and runs the rest. The
+pictures make up the gallery, ``gallery.md`` beside the page.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
+import json
 import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +27,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from slam.compare.revision import made_with
 from slam.runner import versions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,12 +42,18 @@ class Experiment:
         title: heading of its section.
         paper: what the paper had; empty for our own.
         pictures: of those that it leaves, the ones to be shown, as patterns.
+        arguments: of its long form.
     """
 
     name: str
     title: str
     paper: str = ""
     pictures: tuple[str, ...] = ("*.png",)
+    arguments: tuple[str, ...] = ()
+
+    def command(self, quick: bool) -> list[str]:
+        """Script and arguments, without the folder."""
+        return [f"experiments/{self.name}.py", *(["--quick"] if quick else self.arguments)]
 
 
 EXPERIMENTS = (
@@ -73,12 +84,19 @@ EXPERIMENTS = (
         "moving_objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
         "A box at four places by three features; Table 1 prints roll, pitch, yaw and translation, no ground truth.",
     ),
-    Experiment("consistency", "Do the back ends know how sure they are?"),
-    Experiment("policies", "Policies of map management"),
+    Experiment("consistency", "Do the back ends know how sure they are?", arguments=("--seeds", "30")),
+    Experiment("long_run", "Cost growth: time and memory along a walk", arguments=("--frames", "4000")),
+    Experiment(
+        "policies", "Policies of map management", arguments=("--frames", "930:1050", "--seeds", "6", "--processes", "1")
+    ),
     Experiment("faults", "Blackout, dropped frames, a camera that is carried off"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip
+
+
+#: Those whose pictures are among the documentation's.
+WORLDS = ("aisle", "box", "boxes", "desk", "field", "startup", "street")
 
 
 def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
@@ -86,7 +104,7 @@ def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
     script = ROOT / "experiments" / f"{experiment.name}.py"
     if not script.exists():
         return "", "there is no such script"
-    command = [sys.executable, str(script), "--out", str(out), *(["--quick"] if quick else [])]
+    command = [sys.executable, *experiment.command(quick), "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
     if done.returncode:
@@ -96,37 +114,76 @@ def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
 
 
 def printed_by(experiment: Experiment, folder: Path, quick: bool, resume: bool) -> tuple[str, str]:
-    """What a script prints, now or in an earlier call, and why it failed; it is kept beside its files."""
+    """What a script prints, now or in an earlier call of the same code, and why it failed; kept beside its files."""
     out = (folder / experiment.name).absolute()
     out.mkdir(parents=True, exist_ok=True)
-    kept = out / ("printed_quick.md" if quick else "printed.md")
+    kept = out / "printed.json"
+    made = {"command": experiment.command(quick), "versions": made_with([ROOT / "experiments"])}
     if resume and kept.exists():
-        return kept.read_text(encoding="utf-8"), ""
-    kept.unlink(missing_ok=True)
+        before = json.loads(kept.read_text(encoding="utf-8"))
+        if before["made"] == made:
+            return before["printed"], ""
+        print(f"{experiment.name}: made by other code, run again", file=sys.stderr, flush=True)
+    for left in [kept, *out.glob("*.png")]:
+        left.unlink(missing_ok=True)
     print(f"{experiment.name} …", file=sys.stderr, flush=True)
+    began = time.monotonic()
     printed, failure = run(experiment, out, quick)
-    if failure:
-        print(f"{experiment.name}: {failure}", file=sys.stderr, flush=True)
-    else:
-        kept.write_text(printed, encoding="utf-8")
+    ended = failure or f"done in {time.monotonic() - began:.0f} s"
+    print(f"{experiment.name}: {ended}", file=sys.stderr, flush=True)
+    if not failure:
+        kept.write_text(json.dumps({"made": made, "printed": printed}, indent=2) + "\n", encoding="utf-8")
     return printed, failure
 
 
-def section(experiment: Experiment, printed: str, failure: str, out: Path, page: Path) -> str:
-    """A script's section of the page; its pictures go to ``images/results`` beside the page."""
-    lines = [f"## {experiment.title}", ""]
+def described(experiment: Experiment) -> str:
+    """What a script is about: the first paragraph of its docstring."""
+    script = ROOT / "experiments" / f"{experiment.name}.py"
+    text = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) if script.exists() else None
+    return " ".join((text or "").split("\n\n")[0].split())
+
+
+def copied_pictures(experiment: Experiment, out: Path, page: Path) -> list[str]:
+    """Markdown for the pictures that a script has left; they go to ``images/results`` beside the page."""
+    shown = []
+    for picture in sorted({p for pattern in experiment.pictures for p in out.glob(pattern)}):
+        target = page.parent / "images" / "results" / f"{experiment.name}_{picture.name}"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(picture, target)
+        shown.append(f"![{experiment.title}: {picture.stem}](images/results/{target.name})")
+    return shown
+
+
+def section(experiment: Experiment, printed: str, failure: str, pictures: Sequence[str], quick: bool) -> str:
+    """A script's section of the page."""
+    lines = [f"## {experiment.title}", "", described(experiment), ""]
     if experiment.paper:
         lines += [f"**The paper:** {experiment.paper}", ""]
     if failure:
         lines += [f"**Failed:** {failure}", ""]
     lines += [demoted(printed), ""]
-    for picture in sorted({p for pattern in experiment.pictures for p in out.glob(pattern)}):
-        target = page.parent / "images" / "results" / f"{experiment.name}_{picture.name}"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(picture, target)
-        lines += [f"![{experiment.title}: {picture.stem}](images/results/{target.name})", ""]
-    lines += [f"`python experiments/{experiment.name}.py`", ""]
+    for picture in pictures:
+        lines += [picture, ""]
+    lines += [f"`python {' '.join(experiment.command(quick))}`", ""]
     return "\n".join(lines)
+
+
+def gallery(pictures: Sequence[tuple[Experiment, Sequence[str]]]) -> str:
+    """The page of pictures; of the worlds and the demo they are there already."""
+    lines = [
+        "# Gallery", "",
+        "This page is written by `python experiments/results.py`. What each picture shows: [results](results.md).", "",
+    ]  # fmt: skip
+    for experiment, shown in pictures:
+        if shown:
+            lines += [f"## {experiment.title}", "", *(line for picture in shown for line in (picture, ""))]
+    lines += [
+        "## The demo", "",
+        "`slam demo`: each back end's map of the bookshelf aisle, red what was measured in the last frame.",
+        "", "![Top view of both maps](images/demo_top_view.png)", "",
+        "## The worlds", "", "`python docs/make_world_pictures.py`:", "",
+    ]  # fmt: skip
+    return "\n".join([*lines, *(f"![{name}](images/worlds/{name}.jpg)" for name in WORLDS), ""])
 
 
 def demoted(text: str) -> str:
@@ -151,17 +208,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for what the scripts leave")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md", help="the page")
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
-    parser.add_argument("--resume", action="store_true", help="do not run again what ran to its end in --out")
+    parser.add_argument("--resume", action="store_true", help="take what the same code has left in --out")
     given = parser.parse_args(arguments)
     if given.only and given.page == parser.get_default("page"):
         parser.error("--only would leave the other sections out of the page: name another --page")
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
     with ThreadPoolExecutor(given.processes) as pool:
         outcomes = list(pool.map(lambda e: printed_by(e, given.out, given.quick, given.resume), chosen))
-    sections = [section(e, *outcome, given.out / e.name, given.page) for e, outcome in zip(chosen, outcomes)]
+    pictures = [(e, copied_pictures(e, given.out / e.name, given.page)) for e in chosen]
+    sections = [section(e, *outcome, shown, given.quick) for (e, shown), outcome in zip(pictures, outcomes)]
     failed = [e.name for e, (_, failure) in zip(chosen, outcomes) if failure]
     given.page.parent.mkdir(parents=True, exist_ok=True)
     given.page.write_text("\n".join([head(given.quick), *sections]), encoding="utf-8")
+    if not given.only:  # a part of the pictures would be no gallery
+        given.page.with_name("gallery.md").write_text(gallery(pictures), encoding="utf-8")
     print(f"{len(sections)} experiments, {len(failed)} failed. Page: {given.page}", file=sys.stderr)
     return 1 if failed else 0
 

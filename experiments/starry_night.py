@@ -24,6 +24,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
+from experiments.tables import markdown
 from slam import se3
 from slam.data import Observations
 from slam.metrics import absolute_errors, nees, pose_residuals
@@ -68,8 +69,11 @@ def load(path: Path) -> Data:
     return Data(rig, raw["t"][0], T_world_vehicle @ T_vehicle_left, raw["rho_i_pj_i"].T, pixels)
 
 
-def run(data: Data, name: str, start: int, stop: int, models: EstimatorModels) -> dict[str, float | int]:
-    """One back end over some steps, from the true pose at the first."""
+Figures = dict[str, float | int]
+
+
+def run(data: Data, name: str, start: int, stop: int, models: EstimatorModels) -> tuple[Figures, Array]:
+    """One back end over some steps, from the true pose at the first: figures, and the position error by step [m]."""
     backend = backends.create(name, data.rig, models=models)
     known: set[int] = set()
     status = {"ok": 0, "empty": 0, "failed": 0}
@@ -91,7 +95,7 @@ def run(data: Data, name: str, start: int, stop: int, models: EstimatorModels) -
     truth = data.poses[start:stop]
     online, final = (pose_residuals(path, truth) for path in (np.array(poses), backend.trajectory().poses))
     off = np.linalg.norm(last.positions - data.points[last.ids], axis=1)
-    return {
+    figures: Figures = {
         **status,
         "rejected": rejected,
         "online": rms(online[:, 3:]),
@@ -101,6 +105,7 @@ def run(data: Data, name: str, start: int, stop: int, models: EstimatorModels) -
         "landmarks": rms(off[:, None]),
         "nees": float(np.median(nees(online, np.array(covariances)))),
     }
+    return figures, np.linalg.norm(online[:, 3:], axis=1)
 
 
 def aligned_ate(data: Data, poses: Array, start: int, stop: int) -> float:
@@ -115,24 +120,59 @@ def rms(errors: Array) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
-def rows(data: Data, parts: list[tuple[int, int]], sigma: float) -> Iterator[tuple[str, str, dict[str, float | int]]]:
+@dataclass(frozen=True)
+class Part:
+    """One back end over one part of the recording: its figures, and the position error by step [m]."""
+
+    start: int
+    stop: int
+    backend: str
+    figures: Figures
+    errors: Array
+
+    @property
+    def span(self) -> str:
+        """For the table."""
+        return f"{self.start}–{self.stop}"
+
+
+def run_parts(data: Data, parts: list[tuple[int, int]], sigma: float) -> Iterator[Part]:
     for start, stop in parts:
         for name in BACKENDS:
             models = EstimatorModels(
                 MotionModel(1.0, 1.0), pixel_sigma=sigma, T_world_left=data.poses[start],
                 initial_position_sigma=0.01, initial_rotation_sigma=0.01,
             )  # fmt: skip
-            yield f"{start}–{stop}", name, run(data, name, start, stop, models)
+            yield Part(start, stop, name, *run(data, name, start, stop, models))
 
 
-def cells(span: str, name: str, r: dict[str, float | int]) -> list[str]:
+def draw(data: Data, found: list[Part], path: Path) -> None:
+    """Landmarks seen and position error, step by step."""
+    from matplotlib.figure import Figure
+
+    spans = list(dict.fromkeys(part.span for part in found))
+    figure = Figure((9, 1.6 * (1 + len(spans))), layout="constrained")
+    top, *others = figure.subplots(1 + len(spans), 1, sharex=True)
+    top.plot([len(data.seen(k)) for k in range(max(part.stop for part in found))], color="0.4", lw=0.8)
+    top.set_ylabel("landmarks seen")
+    for axis, span in zip(others, spans):
+        for part in (p for p in found if p.span == span):
+            axis.semilogy(range(part.start, part.stop), part.errors, lw=1, label=part.backend)
+        axis.set_ylabel("error [m]")
+    others[0].legend(frameon=False, fontsize=8)
+    others[-1].set_xlabel("step")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def cells(part: Part) -> list[str]:
+    r = part.figures
     return [
-        span, name, f"{r['ok']} / {r['empty']} / {r['failed']}", str(r["rejected"]), f"{r['online']:.3f}",
+        part.span, part.backend, f"{r['ok']} / {r['empty']} / {r['failed']}", str(r["rejected"]), f"{r['online']:.3f}",
         f"{r['turn']:.2f}", f"{r['final']:.3f}", f"{r['aligned']:.3f}", f"{r['landmarks']:.3f}", f"{r['nees']:.1f}",
     ]  # fmt: skip
 
 
-def part(text: str) -> tuple[int, int]:
+def span(text: str) -> tuple[int, int]:
     """``A:B`` as a range of steps."""
     start, stop = text.split(":")
     return int(start), int(stop)
@@ -142,7 +182,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a hundred steps from one start")
     parser.add_argument("--sigma", type=float, default=6.0, help="assumed pixel noise [px]")
-    parser.add_argument("--parts", type=part, nargs="*", default=PARTS, metavar="A:B", help="steps from A to before B")
+    parser.add_argument("--parts", type=span, nargs="*", default=PARTS, metavar="A:B", help="steps from A to before B")
     parser.add_argument("--out", type=Path, default=Path("results/starry_night"))
     arguments = parser.parse_args()
     folder = os.environ.get("SLAM_DATA")
@@ -150,18 +190,19 @@ def main() -> int:
         print(f"starry night: set SLAM_DATA to the folder that holds {FILE}; nothing was run")
         return 0
     data = load(Path(folder) / FILE)
-    found, lines = [], ["| " + " | ".join(HEADER) + " |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
-    print("\n".join(lines))
-    for row in rows(data, [(130, 230)] if arguments.quick else arguments.parts, arguments.sigma):
-        found.append(row)
-        lines.append("| " + " | ".join(cells(*row)) + " |")
-        print(lines[-1], flush=True)
+    found = []
+    for part in run_parts(data, [(130, 230)] if arguments.quick else arguments.parts, arguments.sigma):
+        found.append(part)
+        print(cells(part), file=sys.stderr, flush=True)
+    text = markdown(HEADER, [cells(part) for part in found], 2)
+    print(text)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "table.md").write_text("\n".join(lines) + "\n")
+    (arguments.out / "table.md").write_text(text + "\n", encoding="utf-8")
     with (arguments.out / "starry_night.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["steps", "back_end", *found[0][2]])
-        writer.writerows([span, name, *result.values()] for span, name, result in found)
+        writer.writerow(["steps", "back_end", *found[0].figures])
+        writer.writerows([part.span, part.backend, *part.figures.values()] for part in found)
+    draw(data, found, arguments.out / "starry_night.png")
     return 0
 
 

@@ -10,11 +10,13 @@ back ends, with the errors against the truth.
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler, available_cores
 from slam.compare.sweep import Run, sweep
@@ -49,11 +51,11 @@ def main() -> int:
     arguments = parser.parse_args()
     stop = 20 if arguments.quick else None
     plan = Plan(("synthetic:field",), ("ekf", "smoother"), stop=stop, replay=False)
+    shutil.rmtree(arguments.out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, arguments.out / "runs", LocalScheduler(available_cores()))
-    lines = ["| " + " | ".join(HEADER) + " |", "| --- |" + " ---: |" * (len(HEADER) - 1)]
-    lines += ["| " + " | ".join(row(run)) + " |" for run in runs]
-    print("\n".join(lines))
-    (arguments.out / "tables.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = markdown(HEADER, [row(run) for run in runs])
+    print(text)
+    (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
     truth = open_sequence(next(plan.trials_of(CLOSED_LOOP)).source).ground_truth
     draw_map_3d(data, arguments.out / "map_3d.png")

@@ -24,6 +24,8 @@ from slam.trajectory import Trajectory
 #: Lengths of KITTI's segments [m].
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
+_ROUNDING = 1e-6  # [s] by which a stamp may differ that was written to a file and read again
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -126,7 +128,8 @@ def associate(
     """
     if interpolated:
         rows = _covered(truth.stamps, estimate.stamps, tolerance)
-        true = interpolate(truth, estimate.stamps[rows]) if len(rows) else truth
+        stamps = estimate.stamps[rows]
+        true = Trajectory(stamps, interpolate(truth, stamps.clip(*truth.stamps[[0, -1]])).poses) if len(rows) else truth
     else:
         partner = pair(estimate.stamps, truth.stamps, tolerance)
         rows = np.flatnonzero(partner >= 0)
@@ -159,8 +162,10 @@ def interpolate(trajectory: Trajectory, stamps: Array) -> Trajectory:
 
 
 def _covered(own: Array, stamps: Array, tolerance: float) -> np.ndarray:
-    """Rows of `stamps` inside the span of `own` and within `tolerance` of one of its stamps."""
-    inside = np.flatnonzero((stamps >= own[0]) & (stamps <= own[-1])) if len(own) else np.zeros(0, int)
+    """Rows of `stamps` inside the span of `own`, but for rounding, and within `tolerance` of one of its stamps."""
+    if not len(own):
+        return np.zeros(0, int)
+    inside = np.flatnonzero((stamps >= own[0] - _ROUNDING) & (stamps <= own[-1] + _ROUNDING))
     after = np.searchsorted(own, stamps[inside]).clip(0, max(len(own) - 1, 0))
     before = (after - 1).clip(0)
     nearest = np.minimum(np.abs(own[after] - stamps[inside]), np.abs(own[before] - stamps[inside]))

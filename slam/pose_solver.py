@@ -18,6 +18,7 @@ _MINIMAL = 3  # stereo points that fix a pose
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5
+_STEPS = 10  # of Gauss-Newton at most
 _BATCH = 50  # hypotheses tried at once
 _APPROACHES = 3
 _ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
@@ -111,8 +112,7 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array,
     for _ in range(_POLISHING_ROUNDS):
         if inliers.sum() < _MINIMAL:
             break
-        rows = _some(inliers)
-        better = refine_pose(rig, points[rows], measured[rows], T_left_world)
+        better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], _STEPS)[0]
         again = _agreement(rig, points, measured, better[None], threshold)[0]
         if again.sum() < inliers.sum():
             break
@@ -130,8 +130,8 @@ def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Arra
         good = np.isfinite(error)
         if good.sum() < _MINIMAL:
             break
-        rows = _some(good & (error <= np.median(error[good])))
-        T_left_world = refine_pose(rig, points[rows], measured[rows], T_left_world, steps=2)
+        rows = _some(good & (error <= _median(error[good])))
+        T_left_world = _refined(rig, points, measured, rows[None], T_left_world[None], 2)[0]
     return T_left_world
 
 
@@ -143,11 +143,30 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
     return rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
 
 
-def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = 10) -> Array:
+def _median(values: Array) -> float:
+    """The median of a few numbers; NumPy's takes longer to begin than these need."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
+
+
+def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = _STEPS) -> Array:
     """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
+    return _refined(rig, points, measured, np.arange(len(points))[None], T_left_world[None], steps)[0]
+
+
+def _refined(
+    rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T_left_world: Array, steps: int
+) -> Array:
+    """Least-squares poses (H, 4, 4) from poses T_left_world, each by the matches `rows` (H, K)."""
+    if rig.is_rectified:
+        from slam.pose_kernels import refine_rectified
+
+        T = T_left_world.copy()
+        refine_rectified(rig.rectified_parameters, points, measured, rows, T, steps, _CONVERGED)
+        return T
     T = T_left_world
     for _ in range(steps):
-        delta = _gauss_newton_steps(rig, points, measured, T[None])[0]
+        delta = _gauss_newton_steps(rig, points[rows], measured[rows], T)
         T = exp(delta) @ T
         if np.abs(delta).max() < _CONVERGED:
             break
@@ -166,8 +185,7 @@ def _minimal_poses(
     if not len(triples):
         return np.zeros((0, 4, 4))
     poses = rigid_fit(points[triples], local[triples])
-    for _ in range(_REFINEMENTS):
-        poses = exp(_gauss_newton_steps(rig, points[triples], measured[triples], poses)) @ poses
+    poses = _refined(rig, points, measured, triples, poses, _REFINEMENTS)
     return poses[np.isfinite(poses).all(axis=(1, 2))]
 
 
@@ -186,10 +204,7 @@ def rigid_fit(source: Array, target: Array) -> Array:
 
 
 def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
-    """Steps (H, 6) that reduce the errors of poses T_left_world (H, 4, 4).
-
-    `points` and `measured` are (K, 3), or (H, K, 3) with a set for each pose.
-    """
+    """Steps (H, 6) that reduce the errors of poses T_left_world (H, 4, 4), with a set of matches (H, K, 3) each."""
     from slam.pose_kernels import gauss_newton_steps
 
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
@@ -206,6 +221,10 @@ def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Arr
 
 def _errors(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
     """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
+    if rig.is_rectified:
+        from slam.pose_kernels import errors_rectified
+
+        return np.asarray(errors_rectified(rig.rectified_parameters, points, measured, T_left_world))
     local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
     z = rig.project_stereo(local.reshape(-1, 3), jacobian=False)[0].reshape(local.shape)
     error = np.abs(measured - z)

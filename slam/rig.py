@@ -132,22 +132,18 @@ class StereoRig:
         z = np.concatenate([left, right[:, :1]], axis=1)
         return z, np.concatenate([J_left, (J_right @ self.R)[:, :1]], axis=1)
 
-    def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
-        """`project_stereo` of a rectified rig, where one division serves all."""
+    @cached_property
+    def rectified_parameters(self) -> Array:
+        """What projection by a rectified rig depends on (7,): fu, fv, u0, v0, fu and u0 of the right camera, b_x."""
         a, c = self.left, self.right
-        centre = np.array([a.u0, a.v0, c.u0])
-        inverse = 1 / np.where(points[:, 2] > 1e-9, points[:, 2], np.nan)
-        z = np.empty((len(points), 3))
-        z[:, 0], z[:, 1], z[:, 2] = points[:, 0], points[:, 1], points[:, 0] + self.b[0]
-        z *= np.array([a.fu, a.fv, c.fu]) * inverse[:, None]
-        if not jacobian:
-            return z + centre, np.empty((0, 3, 3))
-        J = np.zeros((len(points), 3, 3))
-        J[:, 0, 0] = a.fu * inverse
-        J[:, 1, 1] = a.fv * inverse
-        J[:, 2, 0] = c.fu * inverse
-        J[:, :, 2] = -z * inverse[:, None]
-        return z + centre, J
+        return np.array([a.fu, a.fv, a.u0, a.v0, c.fu, c.u0, self.b[0]])
+
+    def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
+        """`project_stereo` of a rectified rig."""
+        from slam.rig_kernels import project_rectified
+
+        z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
+        return z, J
 
     def triangulate(self, uv_left: Array, uv_right: Array) -> Array:
         """Points (N, 3) [m] in left-camera coordinates by paper A, Eqs. (8)-(9).
@@ -155,6 +151,11 @@ class StereoRig:
         The misprints of Eqs. (8b) and (8c) are mended: all three use the right image's x. Rows whose rays are
         parallel, whose depth comes out negative, or whose pixels are NaN are NaN.
         """
+        if self.is_rectified:
+            from slam.rig_kernels import triangulate_rectified
+
+            left, right = np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float)
+            return np.asarray(triangulate_rectified(self.rectified_parameters, left, right))
         left = self.left.normalise(uv_left)
         x_right = self.right.normalise(uv_right)[:, 0]
         rays = np.concatenate([left, np.ones((len(left), 1))], axis=1)

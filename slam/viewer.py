@@ -6,6 +6,7 @@ Rerun is an optional dependency (``pip install 'surf-stereo-slam[viewer]'``), lo
 from __future__ import annotations
 
 import csv
+import logging
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ class Viewer:
 
     def __init__(self, target: str, rig: StereoRig | None = None, truth: Trajectory | None = None) -> None:
         self._rr = _rerun()
+        self._target = target
         self._recording = _open(self._rr, target)
         self._rig = rig
         self._start: float | None = None
@@ -52,8 +54,13 @@ class Viewer:
     def __enter__(self) -> Viewer:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._recording.flush()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self._recording.flush()
+        except RuntimeError as error:  # a window that was closed or never opened takes nothing from the run
+            if kind is None and self._target != LIVE:
+                raise SlamError(f"viewer {self._target}: {_first_line(error)}") from error
+            logging.getLogger(__name__).warning("viewer %s: not all was shown: %s", self._target, _first_line(error))
 
     def show(self, frame: StereoFrame, result: FrameResult, system: StereoSlam) -> None:
         """One more frame, right after its step."""
@@ -171,5 +178,10 @@ def _open(rr: Any, target: str) -> Any:
             path.parent.mkdir(parents=True, exist_ok=True)
             recording.save(str(path))
     except (OSError, RuntimeError) as error:
-        raise SlamError(f"viewer {target}: {error}") from error
+        raise SlamError(f"viewer {target}: {_first_line(error)}") from error
     return recording
+
+
+def _first_line(error: BaseException) -> str:
+    """What an exception says, without the advice that follows."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

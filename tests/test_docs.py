@@ -73,3 +73,30 @@ def test_every_page_in_the_documentation_links_to_what_exists():
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
             if not target.startswith(("http:", "https:", "mailto:")):
                 assert (page.parent / target).exists(), f"{page.relative_to(DOCS)}: {target}"
+
+
+def table_rows(text, columns):
+    """Cells of the table rows of a Markdown text that have so many columns; an empty first cell is the row's above."""
+    rows, name = [], ""
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if line.startswith("|") and len(cells) == columns and set(cells[1]) - set("-: "):
+            name = cells[0] or name
+            rows.append([name, *cells[1:]])
+    return rows
+
+
+def test_the_figures_in_the_readme_are_those_of_the_results_page():
+    page = (DOCS / "results.md").read_text(encoding="utf-8")
+    if "\n## Real sequences" not in page:
+        pytest.skip("the results page has no real sequences: run experiments/results.py with SLAM_DATA")
+    section = page.split("\n## Real sequences")[1].split("\n## ")[0]
+    measured = {(row[0], row[1]): row[2:6] for row in table_rows(section, 8)}
+    readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
+    shown = [row for row in table_rows(readme, 6) if row[1] in ("ekf", "smoother")]
+    assert len(shown) == 6
+    for name, backend, *cells in shown:
+        own = next(values for (short, other), values in measured.items() if name.startswith(short) and other == backend)
+        for cell, value in zip(cells, own):
+            digits = len(cell.partition(".")[2])
+            assert cell == (f"{float(value):.{digits}f}" if digits else value), (name, backend, cell, value)

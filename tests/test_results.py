@@ -24,6 +24,7 @@ def scripts(results, tmp_path, monkeypatch):
     folder = tmp_path / "experiments"
     folder.mkdir()
     (folder / "good.py").write_text(
+        '"""What is\nshown.\n\nMore."""\n'
         "import sys\nfrom pathlib import Path\nout = Path(sys.argv[sys.argv.index('--out') + 1])\n"
         "(out / 'a.png').write_bytes(b'picture')\n"
         "print('# A heading\\n\\n| a |\\n| - |\\n| 1 |', '--quick' in sys.argv)\n"
@@ -42,6 +43,7 @@ def test_every_section_is_on_the_page_also_those_that_failed(results, scripts, c
     text = page.read_text()
     for words in (
         "## Good",
+        "What is shown.\n",
         "**The paper:** the paper's",
         "### A heading",
         "| 1 | True",
@@ -52,6 +54,9 @@ def test_every_section_is_on_the_page_also_those_that_failed(results, scripts, c
     assert "half" in text
     assert "there is no such script" in text
     assert (page.parent / "images" / "results" / "good_a.png").read_bytes() == b"picture"
+    pictures = page.with_name("gallery.md").read_text()
+    assert "![Good: a](images/results/good_a.png)" in pictures
+    assert "## Bad" not in pictures
     assert "2 failed" in capsys.readouterr().err
 
 
@@ -59,3 +64,26 @@ def test_one_alone(results, scripts, capsys):
     page = scripts / "page.md"
     assert results.main(["--only", "good", "--out", str(scripts / "out"), "--page", str(page)]) == 0
     assert "short form" not in page.read_text()
+    assert not page.with_name("gallery.md").exists()
+
+
+def test_only_what_the_same_code_has_left_is_taken_again(results, scripts, capsys):
+    def run(*more):
+        results.main(["--only", "good", "--out", str(scripts / "out"), "--page", str(scripts / "page.md"), *more])
+        return capsys.readouterr().err
+
+    assert "good …" in run()
+    assert "good …" not in run("--resume")
+    assert "| 1 | False" in (scripts / "page.md").read_text()
+    assert "good …" in run("--resume", "--quick")
+    assert "good …" in run("--resume")
+    script = scripts / "experiments" / "good.py"
+    script.write_text(script.read_text() + "print('more')\n")
+    assert "made by other code" in run("--resume")
+    assert "more" in (scripts / "page.md").read_text()
+    assert "good …" in run()
+
+
+def test_every_experiment_has_its_script(results):
+    for experiment in results.EXPERIMENTS:
+        assert (ROOT / "experiments" / f"{experiment.name}.py").exists()

@@ -137,15 +137,16 @@ class ObjectFilter:
         if len({o.id for o in observations}) != len(observations):
             raise MeasurementError("ekf: an object stands twice among the observations")
         for o in observations:
-            depths = np.isfinite(self._rig.triangulate(o.uv_left, o.uv_right)).all(axis=1)
-            if o.id not in self._bodies and depths.sum() < 3:
+            if o.id in self._bodies:
+                continue
+            if np.isfinite(self._rig.triangulate(o.uv_left, o.uv_right)).all(axis=1).sum() < 3:
                 raise MeasurementError(f"ekf: object {o.id} is new and has fewer than three points with a depth")
 
     def _start(self, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
         h = self._rig.triangulate(o.uv_left, o.uv_right)
         T, near = first_frame(camera.T_world_left, h)
         body = found(o.id, T, self._models.objects, len(camera.columns))
-        body = self._join(body, o, near, camera)
+        body, _ = self._join(body, o, near, camera)
         return body, Sight(True, np.sort(body.ids))
 
     def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
@@ -154,8 +155,9 @@ class ObjectFilter:
         Where nothing agrees with the body (or too little), it is not known where it is, and nothing joins.
         """
         place = {i: row for row, i in enumerate(body.ids.tolist())}
-        known = np.array([i in place for i in o.points.tolist()], bool)
-        rows = np.array([place[i] for i in o.points[known].tolist()], np.intp)
+        rows = np.array([place.get(i, -1) for i in o.points.tolist()], np.intp)
+        known = rows >= 0
+        rows = rows[known]
         body, used = self._correct(body, o, known, rows, camera)
         if len(rows) and not used.any():
             return body, Sight(rejected=np.sort(o.points[known]))
@@ -163,11 +165,13 @@ class ObjectFilter:
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         seen[rows] = self._now
         sights[rows] += used
+        wanted = ~known
+        wanted[known] = failures[rows] >= _FAILURES
         body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= _FAILURES)
-        old = body.ids
-        body = self._join(body, o, ~np.isin(o.points, old), camera)
-        good = np.union1d(o.points[known][used], np.setdiff1d(body.ids, old))
-        return body, Sight(bool(used.any()), good, np.setdiff1d(o.points[known][~used], good))
+        body, new = self._join(body, o, wanted, camera)
+        bad = np.flatnonzero(known)[~used]
+        good = np.concatenate([o.points[known][used], o.points[new]])
+        return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~np.isin(bad, new)]]))
 
     def _correct(
         self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief
@@ -184,7 +188,7 @@ class ObjectFilter:
             return body, nothing
         if solution is None or not _enough(solution, body):
             return body, nothing
-        after = corrected(wider, covariances, solution.s, solution.B)
+        after = corrected(wider, camera, covariances, solution.s, solution.B)
         if not (np.isfinite(after.T).all() and (after.covariance.diagonal() > 0).all()):
             return body, nothing
         return after, solution.used
@@ -222,19 +226,26 @@ class ObjectFilter:
             self._models.gate_probability, change,
         )  # fmt: skip
 
-    def _join(self, body: Body, o: ObjectObservations, wanted: BoolArray, camera: CameraBelief) -> Body:
-        """With those of the wanted points that have a depth, as far as there is room."""
-        most = self._models.objects.points
-        h = self._rig.triangulate(o.uv_left, o.uv_right)
-        rows = np.flatnonzero(wanted & np.isfinite(h).all(axis=1))
-        body = without(body, room_makers(self._now - body.seen, body.sights, len(rows), most))
-        rows = rows[: most - len(body.ids)]
+    def _join(
+        self, body: Body, o: ObjectObservations, wanted: BoolArray, camera: CameraBelief
+    ) -> tuple[Body, NDArray[np.intp]]:
+        """With those of the wanted points that have a depth, as far as there is room; and which they are."""
+        rows = np.flatnonzero(wanted)
         if not len(rows):
-            return body
-        shape = self._shape(body, h[rows], inverse(camera.T_world_left) @ body.T)
-        z = np.concatenate([o.uv_left, o.uv_right[:, :1]], axis=1)[rows]
-        h, noise = with_shape(self._rig.project_stereo, z, h[rows], self._models.pixel_sigma, shape)
-        return joined(body, camera, o.points[rows], h, noise, self._now)
+            return body, rows
+        h = self._rig.triangulate(o.uv_left[rows], o.uv_right[rows])
+        deep = np.isfinite(h).all(axis=1)
+        rows, h = rows[deep], h[deep]
+        most = self._models.objects.points
+        body = without(body, room_makers(self._now - body.seen, body.sights, len(rows), most))
+        room = most - len(body.ids)
+        rows, h = rows[:room], h[:room]
+        if not len(rows):
+            return body, rows
+        shape = self._shape(body, h, inverse(camera.T_world_left) @ body.T)
+        z = np.concatenate([o.uv_left[rows], o.uv_right[rows, :1]], axis=1)
+        h, noise = with_shape(self._rig.project_stereo, z, h, self._models.pixel_sigma, shape)
+        return joined(body, camera, o.points[rows], h, noise, self._now), rows
 
     def _shape(self, body: Body, h: Array, T_left_body: Array) -> Shape:
         """The body's shape in camera coordinates, by the points it has, or else by the new ones at h (M, 3)."""

@@ -10,9 +10,11 @@ covariance knows how much of the camera's error is the same in all frames, and a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dgemm
 
 from backends.ekf.objects_measurement import BodyPoints, moved
 from slam.data import BoolArray, IdArray
@@ -36,15 +38,15 @@ class CameraBelief:
     by_state: Array
     columns: Array
 
-    @property
+    @cached_property
     def covariance(self) -> Array:
         """Covariance (6, 6) of the pose's right perturbation."""
         return self.by_state @ self.columns[:6] @ self.by_state.T
 
-    @property
+    @cached_property
     def cross(self) -> Array:
-        """Covariance (N, 6) of the filter's whole state with the pose's right perturbation."""
-        return self.columns @ self.by_state.T
+        """Covariance (6, N) of the pose's right perturbation with the filter's whole state."""
+        return np.ascontiguousarray(self.by_state @ self.columns.T)
 
 
 @dataclass(frozen=True)
@@ -124,22 +126,20 @@ def joined(body: Body, camera: CameraBelief, ids: IdArray, h: Array, noise: Arra
         return body
     T = inverse(body.T) @ camera.T_world_left
     points = BodyPoints.at(T, h)
-    by_position = np.linalg.inv(points.derivatives())
-    eye = np.broadcast_to(np.eye(3), (len(ids), 3, 3))
-    by_pose = (by_position @ np.concatenate([hat(points.cartesian()), -eye], axis=2)).reshape(-1, 6)
-    by_local = by_position @ T[:3, :3]
-    by_camera = (by_local @ np.concatenate([-hat(h), eye], axis=2)).reshape(-1, 6)
+    by_pose = points.by_frame()
+    by_local = points.by_position() @ T[:3, :3]
+    by_camera = np.concatenate([by_local @ hat(-h), by_local], axis=2).reshape(-1, 6)
     with_camera = body.cross[:, :6] @ camera.by_state.T  # covariance (n, 6) of the body with the camera's pose
     with_body = by_pose @ body.covariance[:6] + by_camera @ with_camera.T
     own = with_body[:, :6] @ by_pose.T + (by_pose @ with_camera[:6] + by_camera @ camera.covariance) @ by_camera.T
     for i, block in enumerate(by_local @ noise @ np.swapaxes(by_local, 1, 2)):
         own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
-    with_filter = by_pose @ body.cross[:6] + by_camera @ camera.cross.T
+    with_filter = by_pose @ body.cross[:6] + by_camera @ camera.cross
     return replace(
         body,
         ids=np.concatenate([body.ids, ids]),
         points=body.points.with_more(points),
-        covariance=np.block([[body.covariance, with_body.T], [with_body, 0.5 * (own + own.T)]]),
+        covariance=_enlarged(body.covariance, with_body, 0.5 * (own + own.T)),
         cross=np.concatenate([body.cross, with_filter]),
         failures=np.concatenate([body.failures, np.zeros(len(ids), np.int64)]),
         seen=np.concatenate([body.seen, np.full(len(ids), now)]),
@@ -147,16 +147,24 @@ def joined(body: Body, camera: CameraBelief, ids: IdArray, h: Array, noise: Arra
     )
 
 
+def _enlarged(P: Array, cross: Array, own: Array) -> Array:
+    """The covariance P (n, n) with more rows and columns: `cross` (m, n) with it, `own` (m, m)."""
+    n = len(P)
+    out = np.empty((n + len(own), n + len(own)))
+    out[:n, :n], out[n:, :n], out[:n, n:], out[n:, n:] = P, cross, cross.T, own
+    return out
+
+
 def without(body: Body, gone: BoolArray) -> Body:
     """Without some of its points (mask (p,))."""
     if not gone.any():
         return body
-    rows = np.concatenate([np.ones(RIGID, bool), np.repeat(~gone, 3)])
+    rows = np.flatnonzero(np.concatenate([np.ones(RIGID, bool), np.repeat(~gone, 3)]))
     return replace(
         body,
         ids=body.ids[~gone],
         points=body.points.select(~gone),
-        covariance=body.covariance[np.ix_(rows, rows)],
+        covariance=body.covariance[rows[:, None], rows],
         cross=body.cross[rows],
         failures=body.failures[~gone],
         seen=body.seen[~gone],
@@ -170,13 +178,25 @@ class Gathered:
 
     Attributes:
         own: of g itself (6 + 3M, 6 + 3M).
-        body: of the body's error state (12 + 3p, 6 + 3M).
-        filter: of the filter's state (N, 6 + 3M).
+        body: of g with the body's error state (6 + 3M, 12 + 3p).
+        rows: those (6 + 3M,) of the body's error state that g is made of.
+        by_camera: derivatives (6, 6) of [r, φ] by the camera's perturbation.
+        by_points: derivatives (M, 3, 3) of the points by theirs.
     """
 
     own: Array
     body: Array
-    filter: Array
+    rows: NDArray[np.intp]
+    by_camera: Array
+    by_points: Array
+
+    def backward(self, B: Array) -> tuple[Array, Array]:
+        """Columns B (6 + 3M, K) of g as such of the body's error state, at `rows`, and of the camera's pose (6, K)."""
+        out = np.empty(B.shape)
+        np.negative(B[:6], out=out[:6])
+        points = np.swapaxes(self.by_points, 1, 2) @ B[6:].reshape(-1, 3, B.shape[1])
+        out[6:] = points.reshape(-1, B.shape[1])
+        return out, self.by_camera.T @ B[:6]
 
 
 def gathered(body: Body, camera: CameraBelief, rows: NDArray[np.intp]) -> Gathered:
@@ -186,49 +206,38 @@ def gathered(body: Body, camera: CameraBelief, rows: NDArray[np.intp]) -> Gather
     pose in the body; g has it with opposite sign, translation first.
     """
     A = adjoint(inverse(body.T) @ camera.T_world_left)[[3, 4, 5, 0, 1, 2]]
-    columns = np.concatenate([[3, 4, 5, 0, 1, 2], (RIGID + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
-    sign = np.ones(len(columns))
-    sign[:6] = -1
+    mine = np.concatenate([[3, 4, 5, 0, 1, 2], (RIGID + 3 * rows[:, None] + np.arange(3)).reshape(-1)])
+    D = body.points.derivatives()[rows]
     with_camera = body.cross[:, :6] @ camera.by_state.T
-    by_body: Array = body.covariance[:, columns] * sign
-    by_body[:, :6] += with_camera @ A.T
-    by_camera: Array = with_camera.T[:, columns] * sign
-    by_camera[:, :6] += camera.covariance @ A.T
-    by_filter = body.cross.T[:, columns] * sign
-    by_filter[:, :6] += camera.cross @ A.T
-    D = body.points.select(rows).derivatives()
-    by_body, by_camera = _in_positions(by_body, D), _in_positions(by_camera, D)
-    own = by_body[columns] * sign[:, None]
-    own[:6] += A @ by_camera
-    own = _in_positions(own.T, D)
-    return Gathered(0.5 * (own + own.T), by_body, _in_positions(by_filter, D))
+
+    def forward(of_body: Array, of_camera: Array) -> Array:
+        """Of g, from the same of the body's rows `mine` (6 + 3M, K), and of the camera (6, K)."""
+        points = D @ of_body[6:].reshape(-1, 3, of_body.shape[1])
+        return np.concatenate([A @ of_camera - of_body[:6], points.reshape(-1, of_body.shape[1])])
+
+    by_body = forward(body.covariance[mine], with_camera.T)
+    by_camera = forward(with_camera[mine], camera.covariance)
+    own = forward(by_body.T[mine], by_camera.T)
+    return Gathered(0.5 * (own + own.T), by_body, mine, A, D)
 
 
-def _in_positions(columns: Array, D: Array) -> Array:
-    """Columns (K, 6 + 3M) with those of the points' coordinates taken to positions by D (M, 3, 3)."""
-    points = columns[:, 6:].reshape(len(columns), -1, 1, 3) @ np.swapaxes(D, 1, 2)
-    return np.concatenate([columns[:, :6], points.reshape(len(columns), -1)], axis=1)
-
-
-def corrected(body: Body, covariances: Gathered, s: Array, B: Array) -> Body:
+def corrected(body: Body, camera: CameraBelief, covariances: Gathered, s: Array, B: Array) -> Body:
     """After an update whose solution, in g, is s and B (see `backends.ekf.solve.Solution`).
 
     The solved shift is in the axes after the turn. What hangs on the pose (the velocity above all, which brought it
     there) was predicted to hang on the shift in the axes before: after a long step the two differ.
     """
-    turn = (covariances.body[:3] @ s)[:3]
-    shift = covariances.body[3:6] @ s
+    turn = s @ covariances.body[:, :3]
+    shift = s @ covariances.body[:, 3:6]
     off = np.zeros(len(s))
     off[:3] = shift - so3_exp(turn) @ shift  # of r = −τ
-    change = covariances.body @ (s + np.linalg.solve(covariances.own, off))
+    change = (s + np.linalg.solve(covariances.own, off)) @ covariances.body
     change[:6] = np.concatenate([turn, shift])
-    W = covariances.body @ B
-    after = replace(
-        _changed(body, change),
-        covariance=body.covariance - W @ W.T,
-        cross=body.cross - W @ (covariances.filter @ B).T,
-    )
-    return _with_free_frame(body, after)
+    W = covariances.body.T @ B
+    of_body, of_camera = covariances.backward(B)
+    # The filter's state has the covariance `crossᵀ of_body + camera.crossᵀ of_camera` with B.
+    gain = W @ np.concatenate([of_body, of_camera]).T
+    return _learnt(body, change, W, gain, np.concatenate([body.cross[covariances.rows], camera.cross]))
 
 
 def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, W: Array) -> Body:
@@ -237,43 +246,31 @@ def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, 
     """
     mine = body.cross[:, columns]
     V = mine @ B
-    after = replace(
-        _changed(body, mine @ s),
-        covariance=body.covariance - V @ V.T,
-        cross=body.cross - V @ W[: body.cross.shape[1]].T,
-    )
-    return _with_free_frame(body, after)
+    return _learnt(body, mine @ s, V, V, W[: body.cross.shape[1]].T)
 
 
-def _changed(body: Body, change: Array) -> Body:
-    """With the mean changed by (12 + 3p,)."""
+def _learnt(body: Body, change: Array, W: Array, gain: Array, rows: Array) -> Body:
+    """With the mean changed by (12 + 3p,), covariance less ``W Wᵀ``, cross-covariance less ``gain @ rows``.
+
+    No measurement says where in the body its frame lies: a change [θ, τ] of it changes the points by ``N [θ, τ]`` and
+    no prediction. N depends on the points; were the covariance kept in the coordinates of their old places, each
+    update would seem to say something of it. So both covariances are carried over to the new N.
+    """
+    points = body.points.plus(change[RIGID:].reshape(-1, 3))
+    P = body.covariance - W @ W.T
+    turned = rows.flags.f_contiguous  # BLAS reads both orders; scipy would copy one
+    rows, cross = rows if turned else rows.T, body.cross.T.copy(order="F")
+    cross = dgemm(-1.0, rows, gain.T, beta=1.0, c=cross, trans_a=turned, overwrite_c=1).T
+    if len(points):
+        moved_on = points.by_frame() - body.points.by_frame()
+        P[RIGID:] += moved_on @ P[:6]
+        P[:, RIGID:] += P[:, :6] @ moved_on.T
+        cross[RIGID:] += moved_on @ cross[:6]
     return replace(
         body,
         T=moved(body.T, change[:6]),
         velocity=body.velocity + change[6:RIGID],
-        points=body.points.plus(change[RIGID:].reshape(-1, 3)),
+        points=points,
+        covariance=P,
+        cross=cross,
     )
-
-
-def _with_free_frame(before: Body, after: Body) -> Body:
-    """With covariances that know where the body's frame lies no better than before the points were changed.
-
-    No measurement says where in the body its frame lies: a change [θ, τ] of it changes the points by ``N [θ, τ]`` and
-    no prediction. N depends on the points; were the covariance kept in the coordinates of their old places, each
-    update would seem to say something of it.
-    """
-    if not len(after.ids):
-        return after
-    moved_on = _by_frame(after.points) - _by_frame(before.points)
-    P, cross = after.covariance.copy(), after.cross.copy()
-    P[RIGID:] += moved_on @ P[:6]
-    P[:, RIGID:] += P[:, :6] @ moved_on.T
-    cross[RIGID:] += moved_on @ cross[:6]
-    return replace(after, covariance=P, cross=cross)
-
-
-def _by_frame(points: BodyPoints) -> Array:
-    """Change (3p, 6) of the points' coordinates with a change [θ, τ] of the body's frame that leaves them in place."""
-    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    by_frame = np.concatenate([hat(points.cartesian()), -eye], axis=2)
-    return np.asarray(np.linalg.solve(points.derivatives(), by_frame).reshape(-1, 6))

@@ -7,6 +7,7 @@ the camera, and is solved by the same `backends.ekf.solve`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -58,18 +59,53 @@ class BodyPoints:
 
     def cartesian(self) -> Array:
         """Positions (M, 3) in body coordinates [m]; NaN for a point that came to lie behind its first camera."""
-        a, b, w = self.coordinates.T
-        w = np.where(w > 0, w, np.nan)
-        h = np.stack([a / w, b / w, 1 / w], axis=1)
-        return (self.T_body_anchor[:, :3, :3] @ h[:, :, None])[:, :, 0] + self.T_body_anchor[:, :3, 3]
+        return self._positions
 
     def derivatives(self) -> Array:
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
-        a, b, w = self.coordinates.T
-        D = np.zeros((len(w), 3, 3))
-        D[:, 0, 0] = D[:, 1, 1] = 1 / w
-        D[:, 0, 2], D[:, 1, 2], D[:, 2, 2] = -a / w**2, -b / w**2, -1 / w**2
+        return self._derivatives
+
+    def by_position(self) -> Array:
+        """Derivatives (M, 3, 3) of the coordinates by the positions."""
+        return self._by_position
+
+    def by_frame(self) -> Array:
+        """Change (3M, 6) of the coordinates with a change [θ, τ] of the body's frame that leaves points in place."""
+        return self._by_frame
+
+    # The arrays never change, so that all of this is computed once.
+
+    @cached_property
+    def _positions(self) -> Array:
+        c, inverse_depth = self.coordinates, self.coordinates[:, 2:]
+        h = np.empty_like(c)
+        h[:, :2], h[:, 2] = c[:, :2], 1
+        h /= np.where(inverse_depth > 0, inverse_depth, np.nan)
+        return np.asarray((self.T_body_anchor[:, :3, :3] @ h[:, :, None])[:, :, 0] + self.T_body_anchor[:, :3, 3])
+
+    @cached_property
+    def _derivatives(self) -> Array:
+        depth = 1 / self.coordinates[:, 2]
+        D = np.zeros((len(depth), 3, 3))
+        D[:, 0, 0] = D[:, 1, 1] = depth
+        D[:, :2, 2] = -self.coordinates[:, :2] * (depth * depth)[:, None]
+        D[:, 2, 2] = -depth * depth
         return np.asarray(self.T_body_anchor[:, :3, :3] @ D)
+
+    @cached_property
+    def _by_position(self) -> Array:
+        w = self.coordinates[:, 2]
+        D = np.zeros((len(w), 3, 3))
+        D[:, 0, 0] = D[:, 1, 1] = w
+        D[:, :, 2] = -w[:, None] * self.coordinates
+        return np.asarray(D @ np.swapaxes(self.T_body_anchor[:, :3, :3], 1, 2))
+
+    @cached_property
+    def _by_frame(self) -> Array:
+        out = np.empty((len(self), 3, 6))
+        np.matmul(self._by_position, hat(self._positions), out=out[:, :, :3])
+        np.negative(self._by_position, out=out[:, :, 3:])
+        return out.reshape(-1, 6)
 
 
 class BodyMeasurement:
@@ -94,11 +130,11 @@ class BodyMeasurement:
         self._t = self._R @ T_body_left[:3, 3]
         self._points = points
         self._Y = points.cartesian()
-        self._by_Y = np.linalg.inv(points.derivatives())
+        self._by_Y = points.by_position()
 
     def predict(self, x: Array) -> Array:
         """Predicted components (M, 3) [px]; NaN behind a camera."""
-        return self._rig.project_stereo(self._local(x, self._changed(x).cartesian())[0])[0]
+        return self._rig.project_stereo(self._local(x, self._changed(x).cartesian())[0], jacobian=False)[0]
 
     def linearise(self, x: Array) -> Linearisation:
         """The same with derivatives by [Y − r, φ]."""
@@ -112,6 +148,8 @@ class BodyMeasurement:
         )
 
     def _changed(self, x: Array) -> BodyPoints:
+        if not x[6:].any():
+            return self._points
         return self._points.plus((self._by_Y @ x[6:].reshape(-1, 3, 1))[:, :, 0])
 
     def _local(self, x: Array, Y: Array) -> tuple[Array, Array, Array]:

@@ -25,6 +25,7 @@ from backends.smoother.prediction import (
 from backends.smoother.records import IndexArray, Records
 from backends.smoother.stereo import RectifiedStereo
 from slam.blas import one_blas_thread
+from slam.compilation import announce_compilation
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.known_landmarks import require_known
@@ -52,6 +53,7 @@ class SmootherBackend:
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
+        announce_compilation("backends.smoother", "the smoother's kernels: some ten seconds")
         self.rig = rig
         self.models = models
         self.config = from_options(SmootherConfig, "smoother", options)

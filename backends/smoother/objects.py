@@ -103,7 +103,8 @@ class ObjectSmoother:
         T, near = first_frame(X, seen.local)
         window = opened(frame, float(path.stamps[-1]), T, X)
         cameras = _cameras(window.frames, path, camera)
-        window = self._solver.solved(self._join(window, cameras, seen, near), cameras)
+        window, _ = self._join(window, cameras, seen, near)
+        window = self._solver.solved(window, cameras)
         return window, Sight(True, np.sort(window.ids))
 
     def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
@@ -163,34 +164,40 @@ class ObjectSmoother:
 
         Where nothing agrees with the body, it is not known where it is, and nothing joins.
         """
-        mine = seen.ids[known]
         if len(rows) and not used.any():
-            return window, Sight(rejected=np.sort(mine))
+            return window, Sight(rejected=np.sort(seen.ids[known]))
         failures, unseen, sights = window.failures.copy(), window.unseen.copy(), window.sights.copy()
         failures[rows] = np.where(used, 0, failures[rows] + 1)
         unseen[rows] = 0
         sights[rows] += used
+        wanted = ~known
+        wanted[known] = failures[rows] >= _FAILURES
         window = replace(window, failures=failures, unseen=unseen, sights=sights)
         window = without_points(window, failures >= _FAILURES)
-        old = window.ids
-        window = self._join(window, camera, seen, ~np.isin(seen.ids, old))
-        good = np.union1d(mine[used], np.setdiff1d(window.ids, old))
-        return window, Sight(bool(used.any()), good, np.setdiff1d(mine[~used], good))
+        window, new = self._join(window, camera, seen, wanted)
+        bad = np.flatnonzero(known)[~used]
+        good = np.concatenate([seen.ids[known][used], seen.ids[new]])
+        return window, Sight(bool(used.any()), np.sort(good), np.sort(seen.ids[bad[~np.isin(bad, new)]]))
 
-    def _join(self, window: Window, camera: CameraWindow, seen: _Measured, wanted: BoolArray) -> Window:
-        """With those of the wanted points that have a depth, as far as there is room."""
+    def _join(
+        self, window: Window, camera: CameraWindow, seen: _Measured, wanted: BoolArray
+    ) -> tuple[Window, IndexArray]:
+        """With those of the wanted points that have a depth, as far as there is room; and which they are."""
         most = self._models.objects.points
         rows = np.flatnonzero(wanted & seen.deep)
+        if not len(rows):
+            return window, rows
         gone = room_makers(window.unseen, window.sights, len(rows), most)
         if gone.any():
             window = without_points(self._solver.with_measured(window, camera, gone), gone)
         rows = rows[: most - len(window.ids)]
         if not len(rows):
-            return window
+            return window, rows
         Y = inverse(window.prior.X[-1]) @ window.T[-1]
-        shape = self._shape(window, seen.local[rows], inverse(Y)).seen_from(Y)
+        T_body_left = inverse(Y)
+        shape = self._shape(window, seen.local[rows], T_body_left).seen_from(Y)
         h, _ = with_shape(self._stereo.project, seen.z[rows], seen.local[rows], self._sigma, shape)
-        return with_points(window, seen.ids[rows], transform(inverse(Y), h), shape, seen.z[rows])
+        return with_points(window, seen.ids[rows], transform(T_body_left, h), shape, seen.z[rows]), rows
 
     def _shape(self, window: Window, h: Array, T_body_left: Array) -> Shape:
         """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
@@ -247,8 +254,9 @@ class _Measured:
     def known(self, window: Window) -> tuple[BoolArray, IndexArray]:
         """Which of the points the window has (M,), and their rows there."""
         place = {i: row for row, i in enumerate(window.ids.tolist())}
-        known = np.array([i in place for i in self.ids.tolist()], bool)
-        return known, np.array([place[i] for i in self.ids[known].tolist()], np.intp)
+        rows = np.array([place.get(i, -1) for i in self.ids.tolist()], np.intp)
+        known = rows >= 0
+        return known, rows[known]
 
 
 def _cameras(frames: IndexArray, path: Path, known: PoseSet) -> CameraWindow:

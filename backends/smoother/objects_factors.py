@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from backends.smoother import objects_kernels as kernels
 from backends.smoother.records import IndexArray
 from backends.smoother.stereo import RectifiedStereo
 from slam.objects.models import ObjectModels
-from slam.se3 import Array, hat
+from slam.se3 import Array
 
 FRAME = 12  #: unknowns of a frame: body pose (6), camera pose (6)
 
@@ -29,11 +30,6 @@ class System:
     def empty(cls, size: int) -> System:
         """Nothing known of `size` unknowns."""
         return cls(np.zeros((size, size)), np.zeros(size))
-
-    def add(self, unknowns: IndexArray, J: Array, residual: Array) -> None:
-        """A factor with whitened residual (K,) and its derivatives (K, U), with opposite sign, by `unknowns` (U,)."""
-        self.information[np.ix_(unknowns, unknowns)] += J.T @ J
-        self.vector[unknowns] += J.T @ residual
 
     def eliminated(self, gone: IndexArray) -> System:
         """Without the unknowns `gone` (G,), which are marginalised."""
@@ -59,27 +55,10 @@ def add_measurements(
         points: in body coordinates (p, 3).
         first_point: where the points' unknowns begin.
     """
-    n, p = z.shape[:2]
-    R = Y[:, :3, :3]
-    h = points @ np.swapaxes(R, 1, 2) + Y[:, None, :3, 3]
-    predicted, J = stereo.project(h.reshape(-1, 3))
-    r, J = (z - predicted.reshape(n, p, 3)) / sigma, J.reshape(n, p, 3, 3) / sigma
-    missing = ~np.isfinite(r)
-    r[missing], J[missing] = 0, 0
-    by_point = J @ R[:, None]
-    G = np.concatenate([-by_point @ hat(points), by_point, J @ hat(h), -J], axis=3)  # (n, p, 3, FRAME)
-    frames, start = n * FRAME, np.arange(n)[:, None] * FRAME + np.arange(FRAME)
-    H, g = system.information, system.vector
-    flat = np.swapaxes(G.reshape(n, 3 * p, FRAME), 1, 2)
-    H[start[:, :, None], start[:, None, :]] += flat @ np.swapaxes(flat, 1, 2)
-    g[:frames] += (flat @ r.reshape(n, 3 * p, 1)).reshape(-1)
-    cross = (np.swapaxes(G, 2, 3) @ by_point).transpose(0, 2, 1, 3).reshape(frames, 3 * p)
-    H[:frames, first_point:] += cross
-    H[first_point:, :frames] += cross.T
-    E = by_point.transpose(1, 0, 2, 3).reshape(p, 3 * n, 3)
-    own = first_point + np.arange(3 * p).reshape(p, 3)
-    H[own[:, :, None], own[:, None, :]] += np.swapaxes(E, 1, 2) @ E
-    g[first_point:] += (np.swapaxes(E, 1, 2) @ r.transpose(1, 0, 2).reshape(p, 3 * n, 1)).reshape(-1)
+    kernels.add_measurements(
+        system.information, system.vector, stereo.intrinsics, stereo.twin.R_left, sigma,
+        np.ascontiguousarray(z), Y, points, first_point,
+    )  # fmt: skip
 
 
 def velocities(T: Array, stamps: Array) -> tuple[Array, Array, Array]:
@@ -87,32 +66,8 @@ def velocities(T: Array, stamps: Array) -> tuple[Array, Array, Array]:
 
     Returns them with their derivatives (n − 1, 6, 6) by the earlier and by the later pose.
     """
-    dt = np.diff(stamps)[:, None]
-    R = T[:, :3, :3]
-    a, inverse_J = _turns(R[1:] @ np.swapaxes(R[:-1], 1, 2))
-    velocity = np.concatenate([a, np.diff(T[:, :3, 3], axis=0)], axis=1) / dt
-    before, after = np.zeros((len(a), 6, 6)), np.zeros((len(a), 6, 6))
-    before[:, :3, :3] = -np.swapaxes(inverse_J, 1, 2) @ R[:-1]  # the right Jacobian is the transposed left one
-    after[:, :3, :3] = inverse_J @ R[1:]
-    before[:, 3:, 3:], after[:, 3:, 3:] = -R[:-1], R[1:]
-    return velocity, before / dt[:, :, None], after / dt[:, :, None]
-
-
-def _turns(R: Array) -> tuple[Array, Array]:
-    """Rotation vectors (M, 3) of rotations by less than a half turn, and their inverse left Jacobians (M, 3, 3).
-
-    Many times faster than by way of `so3_log`, whose care at half turns no body needs within a frame.
-    """
-    odd = 0.5 * (R - np.swapaxes(R, 1, 2))
-    axis = odd[:, (2, 0, 1), (1, 2, 0)]
-    sine = np.sqrt((axis * axis).sum(axis=1))
-    angle = np.arctan2(sine, 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1))
-    small = sine < 1e-6
-    scale = np.where(small, 1.0, angle / np.where(small, 1.0, sine))
-    half = 0.5 * np.where(small, 1.0, angle)
-    bend = np.where(small, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
-    K = scale[:, None, None] * odd
-    return scale[:, None] * axis, np.eye(3) - 0.5 * K + bend[:, None, None] * (K @ K)
+    velocity, before, after = kernels.velocities(T, stamps)
+    return velocity, before, after
 
 
 def impulse_sigmas(models: ObjectModels, dt: float, scale: float) -> Array:
@@ -143,18 +98,10 @@ def add_motion(
     """
     if len(T) < 2 or not len(steps):
         return
-    velocity, before, after = velocities(T, stamps)
-    for i in steps:
-        if i == 0 and not fresh:
-            continue
-        dt, at = stamps[i + 1] - stamps[i], np.arange(6)
-        if i == 0:
-            weight = 1 / first_sigmas(models, dt, scales[1])[:, None]
-            J = np.concatenate([before[0], after[0]], axis=1)
-            unknowns, change = np.concatenate([at, FRAME + at]), velocity[0]
-        else:
-            weight = 1 / impulse_sigmas(models, dt, scales[i + 1])[:, None]
-            J = np.concatenate([-before[i - 1], before[i] - after[i - 1], after[i]], axis=1)
-            unknowns = np.concatenate([FRAME * (i - 1) + at, FRAME * i + at, FRAME * (i + 1) + at])
-            change = velocity[i] - velocity[i - 1]
-        system.add(unknowns, weight * J, -weight[:, 0] * change)
+    sigmas = scales[1:, None] * impulse_sigmas(models, 1.0, 1.0) * np.sqrt(np.diff(stamps))[:, None]  # a random walk
+    first = steps.start
+    if fresh:
+        sigmas[0] = first_sigmas(models, float(stamps[1] - stamps[0]), float(scales[1]))
+    else:
+        first = max(1, first)
+    kernels.add_motion(system.information, system.vector, *velocities(T, stamps), sigmas, first, steps.stop)

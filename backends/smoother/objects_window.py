@@ -10,17 +10,20 @@ nothing is known twice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from backends.smoother import objects_kernels as kernels
 from backends.smoother.objects_factors import FRAME, System, add_measurements, add_motion
+from backends.smoother.pose_kernels import moved
 from backends.smoother.records import IndexArray
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray
 from slam.objects.models import ObjectModels
 from slam.objects.points import Shape
-from slam.se3 import Array, exp, hat, inverse, log, transform
+from slam.se3 import Array, hat, inverse, transform
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
@@ -37,6 +40,11 @@ class CameraWindow:
 
     poses: Array
     covariance: Array
+
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of the covariance."""
+        return np.linalg.inv(self.covariance)
 
 
 @dataclass(frozen=True)
@@ -175,8 +183,8 @@ def without_points(window: Window, gone: BoolArray) -> Window:
     """Without some points (mask (p,)): what has left the window of them is marginalised, the rest is forgotten."""
     if not gone.any():
         return window
-    rows = window.first_point + (3 * np.flatnonzero(gone)[:, None] + np.arange(3)).reshape(-1)
-    kept = np.setdiff1d(np.arange(len(window.prior.system.vector)), rows)
+    is_gone = np.concatenate([np.zeros(window.first_point, bool), np.repeat(gone, 3)])
+    rows, kept = np.flatnonzero(is_gone), np.flatnonzero(~is_gone)
     prior = replace(window.prior, system=window.prior.system.eliminated(rows), points=window.prior.points[~gone])
     return replace(
         window,
@@ -187,7 +195,7 @@ def without_points(window: Window, gone: BoolArray) -> Window:
         unseen=window.unseen[~gone],
         sights=window.sights[~gone],
         prior=prior,
-        covariance=window.covariance[np.ix_(kept, kept)],
+        covariance=window.covariance[kept[:, None], kept],
     )
 
 
@@ -214,23 +222,26 @@ class Solver:
             LinAlgError: the equations are singular, or the solution is not finite.
         """
         n = len(window)
-        is_camera, C = _cameras(n), np.linalg.inv(camera.covariance)
+        is_camera, C = _cameras(n), camera.information
         c, now = np.zeros(6 * n), window
         for _ in range(self._iterations):
-            system = self._system(now, camera.poses @ exp(c.reshape(n, 6)), n, range(n - 1))
+            system = self._system(now, moved(camera.poses, c.reshape(n, 6)), n, range(n - 1))
             system.information[np.ix_(is_camera, is_camera)] += C
             system.vector[is_camera] -= C @ c
-            L, failed = dpotrf(system.information.T, lower=1)  # symmetric, and transposed in the order LAPACK wants
+            L, failed = dpotrf(
+                system.information.T, lower=1, overwrite_a=1
+            )  # symmetric, and transposed in the order LAPACK wants
             if failed:
                 raise np.linalg.LinAlgError("the window's equations are singular")
             step = dpotrs(L, system.vector, lower=1)[0]
             frames = step[: FRAME * n].reshape(n, 2, 6)
             c = c + frames[:, 1].reshape(-1)
-            now = replace(now, T=now.T @ exp(frames[:, 0]), points=now.points + step[FRAME * n :].reshape(-1, 3))
+            now = replace(now, T=moved(now.T, frames[:, 0]), points=now.points + step[FRAME * n :].reshape(-1, 3))
             if np.abs(frames[:, 0, :3]).max() < _LINEAR:
                 break
         lower = dpotri(L, lower=1)[0]
-        covariance = np.tril(lower) + np.tril(lower, -1).T
+        covariance = lower + lower.T  # above the diagonal of `lower` stand zeros
+        covariance.reshape(-1)[:: len(covariance) + 1] *= 0.5
         if not (np.isfinite(now.T).all() and (covariance.diagonal() > 0).all()):
             raise np.linalg.LinAlgError("the window has no usable solution")
         return replace(now, covariance=covariance)
@@ -255,7 +266,7 @@ class Solver:
         n = len(window)
         is_camera = _cameras(n)
         system = self._system(window, camera.poses, count, range(min(count + 1, n - 1)))
-        system.information[np.ix_(is_camera, is_camera)] += np.linalg.inv(camera.covariance)
+        system.information[np.ix_(is_camera, is_camera)] += camera.information
         later = is_camera[6 * count :]
         system.information[np.ix_(later, later)] -= np.linalg.inv(camera.covariance[6 * count :, 6 * count :])
         gone = np.arange(FRAME * count)
@@ -293,22 +304,10 @@ def _prior_at(window: Window, X: Array) -> System:
     to the N of their old places, and with every marginalisation seem to say something of the frame, it is taken to be
     one on the body's poses and on where the points are beside the oldest of them.
     """
-    p, n = window.prior, len(window)
-    moved = log(inverse(np.concatenate([p.T, p.X])) @ np.concatenate([window.T, X]))
-    before, now = _by_frame(p.points), _by_frame(window.points)
-    beside = transform(inverse(p.T[0]) @ window.T[0], window.points) - p.points + before @ moved[0]
-    delta = np.concatenate([moved.reshape(2, n, 6).swapaxes(0, 1).reshape(-1), beside.ravel()])
-    H, vector = p.system.information.copy(), p.system.vector - p.system.information @ delta
-    moved_on, points = (now - before).reshape(-1, 6), slice(window.first_point, None)
-    H[:, :6] -= H[:, points] @ moved_on
-    H[:6] -= moved_on.T @ H[points]
-    vector[:6] -= moved_on.T @ vector[points]
-    return System(H, vector)
-
-
-def _by_frame(points: Array) -> Array:
-    """Change (p, 3, 6) of points with a change [θ, τ] of the body's frame that leaves them in place."""
-    return np.concatenate([hat(points), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
+    p = window.prior
+    return System(*kernels.relinearised(
+        p.system.information, p.system.vector, p.T, p.X, p.points, window.T, X, window.points
+    ))  # fmt: skip
 
 
 def _cameras(n: int) -> IndexArray:

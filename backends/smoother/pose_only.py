@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from backends.smoother.stereo import RectifiedStereo, by_pose
+from backends.smoother import pose_kernels as kernels
+from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
 from slam.gating import chi_square_gate
 from slam.se3 import Array, inverse
@@ -62,9 +63,9 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
 
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
     """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
-    local = (problem.points - T[:3, 3]) @ T[:3, :3]
-    h, J = problem.stereo.project(local)
-    return problem.z - h, by_pose(J, local)
+    stereo = problem.stereo
+    r, J = kernels.residuals(stereo.intrinsics, stereo.twin.R_left, problem.points, problem.z, T)
+    return r, J
 
 
 def _gate(problem: PoseProblem, T: Array) -> BoolArray:
@@ -82,27 +83,11 @@ def _whiteners(noise: Array, z: Array) -> Array:
 
 def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: BoolArray | None) -> Array:
     """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
-    T = start
-    information = problem.information
-    prior = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ T))
-    enough = _ROUGH if used is None else _CONVERGED
-    for _ in range(_STEPS):
-        r, J = residuals(problem, T)
-        missing = np.isnan(r)
-        r[missing] = 0
-        J[missing] = 0
-        r, J = (whitener @ r[:, :, None])[:, :, 0], whitener @ J
-        weight = _huber(r) if used is None else used.astype(float)
-        J_w = (J * weight[:, None, None]).reshape(-1, 6).T
-        step = np.linalg.solve(information + J_w @ J.reshape(-1, 6), J_w @ r.reshape(-1) - information @ prior)
-        T = T @ gtsam.Pose3.Expmap(step).matrix()
-        prior = prior + step  # exact to first order: enough for a prior that only keeps few measurements in bounds
-        if np.abs(step).max() < enough:
-            break
-    return T
-
-
-def _huber(r: Array) -> Array:
-    """Weights (M,) of whitened residuals (M, 3)."""
-    size = np.sqrt((r * r).sum(axis=1))
-    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-12))
+    stereo = problem.stereo
+    prior = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ start))
+    robust = used is None
+    counted = np.ones(len(problem.points), bool) if used is None else used
+    return np.asarray(kernels.gauss_newton(
+        stereo.intrinsics, stereo.twin.R_left, problem.points, problem.z, whitener, counted, problem.information,
+        prior, start, _HUBER if robust else np.inf, _STEPS, _ROUGH if robust else _CONVERGED,
+    ))  # fmt: skip

@@ -7,6 +7,7 @@ is no right pixel. The body frame is the rig's own left camera, the sensor its r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class RectifiedStereo:
     baseline: float
     doffs: float
     scale: float
+
+    @cached_property
+    def intrinsics(self) -> Array:
+        """f, u0, v0, baseline (4,), for compiled loops."""
+        return np.array([self.f, self.u0, self.v0, self.baseline])
 
     @classmethod
     def of(cls, rig: StereoRig) -> RectifiedStereo:

@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from slam.compare.plan import Plan, Trial, Variant, parse_variant
-from slam.compare.report import conclusions, write_report
+from slam.compare.report import conclusions, most_trials, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler, available_cores
-from slam.compare.statistics import caution
 from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import groups, write_tables
+from slam.compare.wording import caution
 from slam.errors import ConfigurationError
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
@@ -77,11 +77,14 @@ def compare(
 
 
 def _print_conclusions(plan: Plan, runs: Sequence[Run], report: Path) -> None:
-    for name, lines in conclusions(groups(plan, runs)):
-        print(name)
-        for line in lines:
+    every = groups(plan, runs)
+    for found in conclusions(every):
+        print(found.name)
+        for line in found.short:
             print(f"  {line}")
-    if caution(plan.trials):
-        print(caution(plan.trials))
+        for line in found.full:
+            print(f"    {line}")
+    if caution(most_trials(every)):
+        print(caution(most_trials(every)))
     failed = sum(not run.completed for run in runs)
     print(f"{len(runs)} runs, {failed} failed. Report: {report}")

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare.measure import SERIES_COLUMNS, Metric
+from slam.compare.collect import SERIES_COLUMNS
+from slam.compare.measure import Metric
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.compare.trial import SERIES
@@ -81,7 +82,8 @@ def draw_paths(group: Group) -> str:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color="0.3", lw=1, label="truth")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     axis.axis("equal")
-    axis.legend(frameon=False, fontsize=8)
+    axis.locator_params(nbins=6)
+    _legend_above(axis)
     return _svg(figure)
 
 
@@ -98,7 +100,7 @@ def draw_errors(group: Group) -> str:
     for axis, label in zip(axes, ("right", "down", "forward")):
         axis.axhline(0, color="0.6", lw=0.5)
         axis.set_ylabel(f"{label} [cm]")
-    axes[0].legend(frameon=False, fontsize=8, ncols=3, loc="upper left")
+    _legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
     return _svg(figure)
 
@@ -108,22 +110,24 @@ def draw_nees(group: Group) -> str:
     from matplotlib.ticker import LogLocator
 
     figure, axis = _axes(2.8)
+    fewest = group.trials
     for name, runs in group.runs.items():
         every = [read_series(run) for run in runs if run.completed]
         if not every:
             continue
+        fewest = min(fewest, len(every))
         length = min(len(s["nees"]) for s in every)
         nees = np.array([s["nees"][1:length] for s in every])
         t = (every[0]["stamp"] - every[0]["stamp"][0])[1:length]
         axis.plot(t, nees.mean(axis=0) / 6, color=colours(group)[name], lw=1.2, label=name)
-    low, high = chi_square_band(6, max(1, group.trials))
-    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {group.trials}")
+    low, high = chi_square_band(6, fewest)
+    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {fewest}")
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
     axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    axis.legend(frameon=False, fontsize=8, ncols=3)
+    _legend_above(axis)
     return _svg(figure)
 
 
@@ -143,7 +147,7 @@ def draw_timing(group: Group) -> str:
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_xlabel("ms per frame, one thread")
-    axis.legend(frameon=False, fontsize=7, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0))
+    _legend_above(axis)
     return _svg(figure)
 
 
@@ -202,6 +206,11 @@ _STYLE: Mapping[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+
+
+def _legend_above(axis: Any) -> None:
+    """A legend that hides nothing."""
+    axis.legend(frameon=False, fontsize=8, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
 
 
 def _axes(height: float) -> tuple[Any, Any]:

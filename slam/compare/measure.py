@@ -1,32 +1,13 @@
-"""What a run is worth in numbers: gathered frame by frame, summed up at its end."""
+"""The figures of merit of a comparison: their names, the units in which people see them, and which way is better."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-
-from slam.alignment import align
-from slam.association_truth import SurfacePoints, TrueWorld
-from slam.data import FrameResult, FrameStatus, IdArray
-from slam.errors import TrajectoryError
-from slam.evaluation import consistency, evaluate
-from slam.metrics import associate, nees, pose_residuals, relative_errors
-from slam.se3 import Array, inverse, rotation_angle
-from slam.sequences import Sequence
-from slam.trajectory import Trajectory
-
-_TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
-_RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
-_SECONDS = 1.0  # of RPE by time
-
-SERIES_COLUMNS = (
-    "frame", "stamp", "error_x", "error_y", "error_z", "sd_x", "sd_y", "sd_z", "error_rotation",
-    "nees", "nis", "nis_dof", "map_size",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,11 +37,18 @@ class Metric:
 
     def show(self, value: float) -> str:
         """A value for people."""
-        value *= self.scale
-        if not np.isfinite(value):
-            return "–"
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+        return number(self.scale * value)
 
+
+def number(value: float) -> str:
+    """Three digits, with a minus sign that is one; a dash where there is no number."""
+    if not np.isfinite(value):
+        return "–"
+    return (f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}").replace("-", "−")
+
+
+#: Share of the runs that came to their end: known of every run, also of those that have no other figure.
+COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
 
 #: In the order of the tables. Times are apart: they differ from run to run.
 METRICS = (
@@ -78,223 +66,49 @@ METRICS = (
     Metric("tracked", "frames tracked", "higher", False, "%", 100),
     Metric("map_size", "landmarks in the map, mean"),
     Metric("lifetime_frames", "lifetime of a landmark, median", "", False, "frames"),
+    Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, "frames"),
     Metric("used_per_frame", "observations used per frame"),
 )
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 
+_OBJECT = "object"
+_NEES = "NEES / degree of freedom"
+_SHARES = ("precision", "recall", "F1", "coverage", "counted right")
+_UNITS = {"m": ("mm", 1e3), "deg": ("deg", 1.0), "frames": ("frames", 1.0)}
+
 
 def object_metric(key: str) -> Metric:
-    """A figure of moving objects by its key, as `slam.objects.metrics` names them."""
-    if key.endswith(("precision", "recall", "F1", "coverage", "counted right")):
-        return Metric(key, key, "higher")
-    return Metric(key, key, "lower" if "[m" in key or "[deg" in key or "false" in key else "")
+    """A figure of moving objects by the key that `object_figures` gives it."""
+    text = re.sub(r"^bodies (\d+) ", r"body \1: ", key.removeprefix(f"{_OBJECT} "))
+    label = text if text.startswith("body") else f"objects: {text}"
+    if key.endswith(_SHARES):
+        return Metric(key, label, "higher", False, "%", 100)
+    if key.endswith(_NEES):
+        return Metric(key, label, "one")
+    found = re.fullmatch(r"(.*) \[(\w+)\]", label)
+    lower = "lower" if found or "false" in key else ""
+    if found is None or found[2] not in _UNITS:
+        return Metric(key, label, lower)
+    return Metric(key, found[1], lower, False, *_UNITS[found[2]])
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A finished run in numbers.
+def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Plain numbers that a run's summary has on moving objects, where something detects them.
 
-    Attributes:
-        metrics: by key of `METRICS`, and ``object …`` figures; what cannot be said of this sequence is left out.
-        milliseconds: median per stage and ``total`` over all frames but the first.
-        series: a row per frame of `SERIES_COLUMNS`; NaN where there is no truth.
+    What is found of the moving features has no value where no body has moved.
     """
-
-    metrics: dict[str, float]
-    milliseconds: dict[str, float]
-    series: Array
-
-
-@dataclass
-class Collector:
-    """Takes in the results of a run frame by frame.
-
-    Args:
-        sequence: what is run.
-        start: number of the first frame.
-        score: check associations against the truth, where there is one. (Replayed ones are the same for all.)
-    """
-
-    sequence: Sequence
-    start: int = 0
-    score: bool = True
-
-    def __post_init__(self) -> None:
-        world = self.sequence if self.sequence.format == "synthetic" else None
-        self._truth = None if world is None else SurfacePoints(cast(TrueWorld, world))
-        self._frames: list[_Frame] = []
-        self._lifetimes = Lifetimes()
-        self._right = self._wrong = 0
-
-    def add(self, result: FrameResult) -> None:
-        """One more frame."""
-        number, features, report = self.start + result.index, result.features, result.report
-        if self._truth is not None:
-            if self.score:
-                errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
-                self._right += int((errors < _RIGHT).sum())
-                self._wrong += int((errors >= _RIGHT).sum())
-            self._truth.add(number, result.added, features.uv_left[result.added_features])
-        self._lifetimes.add(result)
-        e = result.estimate
-        self._frames.append(
-            _Frame(
-                number,
-                e.stamp,
-                e.T_world_left,
-                e.covariance,
-                result.status,
-                report.nis,
-                report.dof,
-                len(report.used),
-                result.map_size,
-                dict(result.milliseconds),
-            )
-        )
-
-    def finish(self, final: Trajectory, ids: IdArray, positions: Array, summary: Mapping[str, Any]) -> Measured:
-        """All figures.
-
-        Args:
-            final: the last word on the path.
-            ids: landmarks in the map at the end (N,).
-            positions: where they are (N, 3) [m].
-            summary: of the run, for what it says of objects; may be empty.
-        """
-        frames = self._frames
-        if not frames:
-            return Measured({}, {}, np.zeros((0, len(SERIES_COLUMNS))))
-        online = Trajectory(np.array([f.stamp for f in frames]), np.array([f.pose for f in frames]))
-        covariances = np.array([f.covariance for f in frames])
-        metrics = {
-            **_accuracy(online, final, self.sequence),
-            **_consistency(online, covariances, self.sequence, frames),
-            **self._landmark_errors(final, ids, positions),
-            **self._map_figures(),
-            **_object_figures(summary),
-        }
-        metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
-        return Measured(metrics, _milliseconds(frames), _series(online, covariances, self.sequence, frames))
-
-    def _landmark_errors(self, final: Trajectory, ids: IdArray, positions: Array) -> dict[str, float]:
-        """Distances of the map's landmarks from the surface points they are, after the alignment of the path."""
-        pairs = _common(final, self.sequence)
-        if self._truth is None or pairs is None or not len(ids):
-            return {}
-        errors = np.linalg.norm(align(*pairs).apply(positions) - self._truth.positions(ids), axis=1)
-        errors = errors[np.isfinite(errors)]
-        if not len(errors):
-            return {}
-        return {
-            "landmark_error_m": float(np.median(errors)),
-            "landmark_error_90_m": float(np.quantile(errors, 0.9)),
-        }
-
-    def _map_figures(self) -> dict[str, float]:
-        """Size of the map and lifetimes."""
-        frames = self._frames
-        scored = self._right + self._wrong
-        tracked = sum(f.status in (FrameStatus.TRACKED, FrameStatus.STARTED) for f in frames)
-        return {
-            "association_precision": self._right / scored if scored else float("nan"),
-            "tracked": tracked / len(frames),
-            "map_size": float(np.mean([f.map_size for f in frames])),
-            "lifetime_frames": self._lifetimes.median,
-            "used_per_frame": float(np.mean([f.used for f in frames])),
-        }
-
-
-class Lifetimes:
-    """How long landmarks stay in the map; those still in it have lived until the last frame."""
-
-    def __init__(self) -> None:
-        self._first: dict[int, int] = {}
-        self._ended: list[int] = []
-        self._last = 0
-
-    def add(self, result: FrameResult) -> None:
-        """One more frame."""
-        self._last = result.index
-        for i in result.added.tolist():
-            self._first[i] = result.index
-        for i in result.erased.tolist():
-            self._ended.append(result.index - self._first.pop(i))
-
-    @property
-    def median(self) -> float:
-        """In frames; NaN where there was no landmark."""
-        lived = [*self._ended, *(self._last - first for first in self._first.values())]
-        return float(np.median(lived)) if lived else float("nan")
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What is kept of one frame."""
-
-    number: int
-    stamp: float
-    pose: Array
-    covariance: Array
-    status: FrameStatus
-    nis: float
-    dof: int
-    used: int
-    map_size: int
-    milliseconds: dict[str, float] = field(default_factory=dict)
-
-
-def _common(path: Trajectory, sequence: Sequence) -> tuple[Trajectory, Trajectory] | None:
-    """Estimated and true path at common stamps; None where fewer than 3 poses have truth."""
-    if sequence.ground_truth is None or not len(path):
-        return None
-    try:
-        own, true = associate(path, sequence.ground_truth, _TOLERANCE, interpolated=True)
-    except TrajectoryError:  # nothing overlaps: no figure, which is no fault of the run
-        return None
-    return (own, true) if len(own) >= 3 else None
-
-
-def _accuracy(online: Trajectory, final: Trajectory, sequence: Sequence) -> dict[str, float]:
-    """ATE, RPE by distance and by time, and the distance from a GPS track."""
-    first, last = evaluate(online, sequence), evaluate(final, sequence)
-    names = {
-        "ate_online_m": first.get("ATE RMSE [m]"),
-        "ate_final_m": last.get("ATE RMSE [m]"),
-        "segment_percent": first.get("segment error [%]"),
-        "gps_m": first.get("GPS distance RMSE [m]"),
-    }
-    figures = {key: value for key, value in names.items() if value is not None}
-    pairs = _common(online, sequence)
-    if pairs is not None:
-        figures.update(_over_a_second(*pairs))
-    return figures
-
-
-def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    """RPE over as many frames as come nearest to a second; nothing for a shorter path."""
-    delta = max(1, round(_SECONDS / float(np.median(np.diff(own.stamps)))))
-    if len(own) <= delta:
-        return {}
-    errors = relative_errors(own, true, delta)
-    return {"rpe_1s_m": errors.translation_statistics.rmse, "rpe_1s_deg": errors.rotation_statistics.rmse}
-
-
-def _consistency(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> dict[str, float]:
-    figures = {}
-    honesty = consistency(online, covariances, sequence)
-    if "mean NEES" in honesty:
-        figures["nees_per_dof"] = honesty["mean NEES"] / 6
-    dof = sum(f.dof for f in frames)
-    if dof:
-        figures["nis_per_dof"] = sum(f.nis for f in frames if f.dof) / dof
-    return figures
-
-
-def _object_figures(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Plain numbers that the summary has on moving objects, where something detects them."""
     objects = summary.get("objects")
-    return dict(_leaves("object", objects)) if isinstance(objects, Mapping) else {}
+    if not isinstance(objects, Mapping):
+        return {}
+    figures = dict(_leaves(_OBJECT, objects))
+    for key in [key for key in figures if key.endswith(" mean NEES")]:
+        name = key.removesuffix("mean NEES")
+        figures[name + _NEES] = figures.pop(key) / figures.pop(name + "dof", 6.0)
+    bodies = [figures[key] for key in figures if key.endswith(" frames in view")]
+    if not any(bodies):
+        figures = {key: value for key, value in figures.items() if not key.endswith(("precision", "recall", "F1"))}
+    return figures
 
 
 def _leaves(name: str, tree: Any) -> list[tuple[str, float]]:
@@ -303,33 +117,3 @@ def _leaves(name: str, tree: Any) -> list[tuple[str, float]]:
     if isinstance(tree, (int, float)) and not isinstance(tree, bool):
         return [(name, float(tree))]
     return []
-
-
-def _milliseconds(frames: list[_Frame]) -> dict[str, float]:
-    """Median per stage, and of their sum, over all frames but the first, which may wait for compilers."""
-    later = [f.milliseconds for f in frames[1:]] or [frames[0].milliseconds]
-    stages = list(dict.fromkeys(stage for m in later for stage in m))
-    medians = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in stages}
-    return {**medians, "total": float(np.median([sum(m.values()) for m in later]))}
-
-
-def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> Array:
-    """Error, claimed deviations, NEES and NIS of every frame, relative to the first pose: rows of `SERIES_COLUMNS`."""
-    rows = np.full((len(frames), len(SERIES_COLUMNS)), np.nan)
-    rows[:, 0] = [f.number for f in frames]
-    rows[:, 1] = online.stamps
-    R, P = online.poses[:, :3, :3], covariances[:, 3:, 3:]
-    rows[:, 5:8] = np.sqrt(np.maximum(np.diagonal(R @ P @ np.swapaxes(R, 1, 2), axis1=1, axis2=2), 0))
-    rows[:, 10:13] = [(f.nis, f.dof, f.map_size) for f in frames]
-    pairs = _common(online, sequence)
-    if pairs is None:
-        return rows
-    own, true = pairs
-    at = np.searchsorted(online.stamps, own.stamps)
-    expected = own.poses[0] @ inverse(true.poses[0]) @ true.poses
-    rows[at, 2:5] = own.positions - expected[:, :3, 3]
-    rows[at, 8] = rotation_angle(np.swapaxes(expected[:, :3, :3], 1, 2) @ own.poses[:, :3, :3])
-    if len(at) > 1 and at[0] == 0:
-        with suppress(TrajectoryError):  # a covariance that is none stays not a number
-            rows[at[1:], 9] = nees(pose_residuals(own.poses, expected)[1:], covariances[at[1:]])
-    return rows

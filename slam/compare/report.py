@@ -5,17 +5,19 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slam.compare import figures
-from slam.compare.measure import Metric
+from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
-from slam.compare.statistics import Difference, Verdict, caution, sentence
+from slam.compare.statistics import Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, groups
+from slam.compare.wording import caution, failures, headline, sentence, shown_interval, shown_mean, worth_saying
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -52,8 +54,8 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         runs=runs,
         failed=sum(not run.completed for run in runs),
         short=conclusions(every),
-        caution=caution(plan.trials),
-        comparisons=sum(len(g.metrics) * (len(plan.backends) - 1) for g in every),
+        caution=caution(most_trials(every)),
+        comparisons=(len(plan.backends) - 1) * sum(bool(m.better) for g in every for m in g.metrics),
         sections=_sections(plan, every),
         workers=workers,
         **_times(every),
@@ -71,22 +73,40 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
     return path
 
 
-def conclusions(every: Sequence[Group]) -> list[tuple[str, list[str]]]:
-    """What can be said of each group in its main figures, and which runs failed, under the group's name."""
-    return [(_name(group), _conclusions(group)) for group in every]
+@dataclass(frozen=True)
+class Conclusions:
+    """What can be said of a group in its main figures.
+
+    Attributes:
+        name: of the group.
+        short: which runs failed, and a line on every other back end against the first.
+        full: a sentence per figure.
+    """
+
+    name: str
+    short: list[str]
+    full: list[str]
 
 
-def _conclusions(group: Group) -> list[str]:
-    first = next(iter(group.runs))
-    failures = ", ".join(f"{n} of {group.trials} of {b}" for b in group.runs if (n := group.failures(b)))
-    lines = []
-    if failures:
-        lines = [
-            f"Runs failed, {failures}: a trial in which either failed has no difference; look at the failures first."
-        ]
-    for metric in [m for m in group.metrics if m.main]:
-        lines += [sentence(d, first, b) for b, d in group.differences(metric).items()]
-    return lines
+def conclusions(every: Sequence[Group]) -> list[Conclusions]:
+    """What can be said, group by group."""
+    return [_conclusions(group) for group in every]
+
+
+def most_trials(every: Sequence[Group]) -> int:
+    """Trials of the group that has most: recorded sequences have one."""
+    return max(group.trials for group in every)
+
+
+def _conclusions(group: Group) -> Conclusions:
+    first, *others = group.runs
+    compared = [group.differences(metric) for metric in group.metrics]
+    short, full = [failures({b: group.failures(b) for b in group.runs}, group.trials)], []
+    for other in others:
+        own = [differences[other] for differences in compared if worth_saying(differences[other])]
+        short.append(headline(own, first, other))
+        full += [sentence(d, first, other) for d in own]
+    return Conclusions(_name(group), [line for line in short if line], full)
 
 
 def _name(group: Group) -> str:
@@ -119,8 +139,6 @@ def _table(group: Group) -> dict[str, Any]:
     reasons = {f"{b}, seed {r.trial.seed}: {r.outcome}" for b, rs in group.runs.items() for r in rs if not r.completed}
     return {
         "title": f"{group.mode.capitalize()}: {words.get(group.mode, '')}",
-        "trials": group.trials,
-        "failures": [group.failures(b) for b in group.runs],
         "rows": [_row(group, metric, compared[metric]) for metric in group.metrics],
         "sentences": [
             sentence(d, first, b) for metric in group.metrics if metric.better for b, d in compared[metric].items()
@@ -130,21 +148,24 @@ def _table(group: Group) -> dict[str, Any]:
 
 
 def _row(group: Group, metric: Metric, differences: dict[str, Difference]) -> dict[str, Any]:
-    means = []
-    for backend in group.runs:
-        values = group.values(backend, metric.key)
-        means.append(metric.show(float(np.nanmean(values))) if np.isfinite(values).any() else "–")
-    return {"label": metric.title, "means": means, "differences": [_cells(d) for d in differences.values()]}
+    cells = [_cells(d) for d in differences.values()]
+    if metric is COMPLETED:
+        means = [f"{group.trials - group.failures(b)} of {group.trials}" for b in group.runs]
+        return {"label": metric.label, "means": means, "failed": list(map(group.failures, group.runs)), "cells": cells}
+    values = [group.values(backend, metric.key) for backend in group.runs]
+    means = [metric.show(float(np.nanmean(v))) if np.isfinite(v).any() else "–" for v in values]
+    return {"label": metric.title, "means": means, "failed": [0] * len(means), "cells": cells}
 
 
 def _cells(d: Difference) -> dict[str, str]:
     """A difference's three cells; the verdict names the better one where there is one."""
-    show = (lambda x: f"{x:.3g}") if d.metric.better == "one" else d.metric.show
-    interval = f"{show(d.low)} … {show(d.high)}" if np.isfinite(d.low) else "–"
+    shown = {"mean": shown_mean(d), "interval": shown_interval(d)}
     words = _WORDS[d.verdict]
     if d.better is not None and d.verdict in (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT):
         words = f"{'better' if d.better else 'worse'}: {words}"
-    return {"mean": show(d.mean), "interval": interval, "verdict": d.verdict.value, "words": words}
+    if not d.metric.better and d.verdict is not Verdict.EQUAL:
+        return {**shown, "verdict": "none", "words": ""}
+    return {**shown, "verdict": d.verdict.value, "words": words}
 
 
 def _pictures(group: Group) -> list[dict[str, str]]:
@@ -159,7 +180,7 @@ def _pictures(group: Group) -> list[dict[str, str]]:
         text = f"{main.label} of every trial; lines join the back ends' runs on the same recording."
         pictures.insert(0, (figures.draw_pairs(group, main), main.label, text))
     if "nees_per_dof" in known:
-        text = f"Error of the position, seed {seed}, inside the ±3σ that each back end claims."
+        text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims."
         pictures.append((figures.draw_errors(group), "Error over time", text))
         text = "NEES over time, mean of the trials, with the 95 % band in which an honest one lies."
         pictures.append((figures.draw_nees(group), "NEES over time", text))
@@ -189,7 +210,7 @@ def _run_keys(runs: Sequence[Run]) -> list[str]:
 def _run_row(run: Run, keys: Sequence[str]) -> tuple[str, ...]:
     t = run.trial
     head = (t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome)
-    return (*head, *(_figure(run.metrics.get(key, float("nan"))) for key in keys))
+    return (*head, *(number(run.metrics.get(key, float("nan"))) for key in keys))
 
 
 def _settings(every: Sequence[Group]) -> str:
@@ -216,9 +237,3 @@ def _script() -> Any:
     from markupsafe import Markup
 
     return Markup((_TEMPLATES / "map3d.js").read_text(encoding="utf-8"))
-
-
-def _figure(value: float) -> str:
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -52,7 +52,7 @@ class Difference:
         mean: of the differences, other less reference.
         low, high: bounds of its confidence interval; NaN with fewer than two pairs.
         p: of the sign-flip test, two-sided; NaN with fewer than two pairs.
-        lower: pairs in which the other is lower.
+        lower, higher: pairs in which the other is lower, and higher.
         verdict: what may be concluded.
     """
 
@@ -66,6 +66,7 @@ class Difference:
     high: float
     p: float
     lower: int
+    higher: int
     verdict: Verdict
 
     @property
@@ -74,6 +75,11 @@ class Difference:
         if not self.metric.better or not np.isfinite(self.mean) or self.mean == 0:
             return None
         return bool(self.mean > 0) if self.metric.better == "higher" else bool(self.mean < 0)
+
+    @property
+    def wins(self) -> int:
+        """Pairs in which the one that is better on average is better."""
+        return self.lower if self.mean < 0 else self.higher
 
 
 def difference(metric: Metric, reference: Array, other: Array) -> Difference:
@@ -93,7 +99,8 @@ def difference(metric: Metric, reference: Array, other: Array) -> Difference:
     low, high, p = interval_and_test(d)
     mean = float(d.mean()) if len(d) else float("nan")
     verdict = _verdict(d, low, high, p)
-    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, int((d < 0).sum()), verdict)
+    signs = int((d < 0).sum()), int((d > 0).sum())
+    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, *signs, verdict)
 
 
 def interval_and_test(d: Array) -> tuple[float, float, float]:
@@ -149,63 +156,3 @@ def _verdict(d: Array, low: float, high: float, p: float) -> Verdict:
 def _dishonesty(values: Array) -> Array:
     """Distance from one, the same for half and double."""
     return np.abs(np.log10(np.maximum(values, 1e-12)))
-
-
-def sentence(d: Difference, reference: str, other: str) -> str:
-    """What may be said of a difference, in plain words, in the unit in which the figure is shown."""
-    label, unit = d.metric.label, d.metric.unit and f" {d.metric.unit}"
-    if d.verdict is Verdict.NONE:
-        return f"{label}: nothing to compare, no trial in which both {reference} and {other} have it."
-    trials = "one trial" if d.pairs == 1 else f"{d.pairs} trials"
-    first, second = (other, reference) if d.better else (reference, other)
-    values = {reference: d.metric.show(d.reference), other: d.metric.show(d.other)}
-    against = f"{values[first]} against {values[second]}{unit}"
-    if d.verdict is Verdict.EQUAL:
-        return f"{label}: equal in {trials}, {values[reference]}{unit}."
-    if d.better is None:
-        return f"{label}: {reference} {values[reference]}, {other} {values[other]}{unit}, mean of {trials}."
-    if d.verdict is Verdict.SINGLE:
-        return f"{label}: {first} is better, {against}, in {trials}, which cannot say whether that is chance."
-    if d.verdict is Verdict.OPEN:
-        return (
-            f"{label}: no difference can be concluded, {first} {against}, mean of {trials}; {_interval(d)} holds zero."
-        )
-    wins = d.lower if (d.metric.better == "higher") != d.better else d.pairs - d.lower
-    verb = "is" if d.verdict is Verdict.CERTAIN else "seems"
-    how = f"{against}{_share(d)}, in {wins} of {trials}; {_interval(d)}, p = {d.p:.2g}"
-    return f"{label}: {first} {verb} better than {second}, {how}: {_STRENGTH[d.verdict]}."
-
-
-def caution(trials: int) -> str:
-    """What so many trials can show at best; empty where they are enough to be certain of something."""
-    if trials >= FEWEST:
-        return ""
-    if trials == 1:
-        return f"One trial cannot tell a difference from chance: give {FEWEST} or more (--trials)."
-    return (
-        f"With {trials} trials nothing can be certain: even where all agree, chance alone does as much in "
-        f"{100 * 2 / 2**trials:.2g} % of such comparisons. It takes {FEWEST} or more (--trials)."
-    )
-
-
-_STRENGTH = {
-    Verdict.CERTAIN: f"certain at the level of {round(100 * LEVEL)} %",
-    Verdict.LIKELY: "likely, not certain",
-    Verdict.HINT: "a hint, no more",
-}
-
-
-def _interval(d: Difference) -> str:
-    if d.metric.better == "one":
-        return f"{_percent()} interval of the distance from 1 in powers of ten {d.low:+.2g} to {d.high:+.2g}"
-    low, high = (f"{d.metric.scale * x:+.3g}" for x in (d.low, d.high))
-    return f"{_percent()} interval {low} to {high}{d.metric.unit and f' {d.metric.unit}'}"
-
-
-def _share(d: Difference) -> str:
-    """By how much of the worse one the better one is lower."""
-    return f" ({100 * abs(d.mean) / max(d.reference, d.other):.2g} % less)" if d.metric.better == "lower" else ""
-
-
-def _percent() -> str:
-    return f"{round(100 * LEVEL)} %"

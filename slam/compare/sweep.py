@@ -15,6 +15,7 @@ from typing import Any
 
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Trial
+from slam.compare.revision import running_code
 from slam.compare.scheduler import Job, Scheduler
 from slam.compare.trial import (
     COMPLETED,
@@ -30,7 +31,6 @@ from slam.compare.trial import (
 )
 from slam.errors import SlamError
 from slam.outputs import write_json
-from slam.runner import versions
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"
@@ -175,7 +175,7 @@ def _prepare(plan: Plan, out: Path) -> None:
         _require_same_versions(path)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_json(path, {"plan": plan.to_json(), "command": plan.command(), "versions": versions()})
+        write_json(path, {"plan": plan.to_json(), "command": plan.command(), "versions": running_code()})
     except OSError as error:
         raise SlamError(f"cannot write to {out}: {error.strerror or error}") from error
 
@@ -185,10 +185,10 @@ def _require_same_versions(path: Path) -> None:
         before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["versions"]
     except (OSError, ValueError, KeyError) as error:
         raise SlamError(f"{path}: cannot be read as that of a comparison: {error}") from error
-    changed = [name for name, version in versions().items() if before.get(name) != version]
+    now = running_code()
+    changed = [name for name, version in now.items() if before.get(name) != version]
     if changed:
-        now = versions()[changed[0]]
         raise SlamError(
-            f"{path.parent}: begun with {changed[0]} {before.get(changed[0])}, now {now}: runs cannot be compared; "
-            "give another --out"
+            f"{path.parent}: begun with {changed[0]} {before.get(changed[0])}, now {now[changed[0]]}: runs cannot be "
+            "compared; give another --out"
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.compare.measure import BY_KEY, METRICS, Metric, object_metric
+from slam.compare.measure import BY_KEY, COMPLETED, METRICS, Metric, object_metric
 from slam.compare.plan import Plan, Variant
 from slam.compare.statistics import Difference, difference
 from slam.compare.sweep import Run
@@ -37,13 +37,15 @@ class Group:
 
     @property
     def metrics(self) -> list[Metric]:
-        """Figures that at least one run has, those of moving objects last."""
+        """Share of the runs completed, then the figures that at least one run has, those of moving objects last."""
         keys = {key for runs in self.runs.values() for run in runs for key in run.metrics}
         others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
-        return [m for m in METRICS if m.key in keys] + others
+        return [COMPLETED, *(m for m in METRICS if m.key in keys), *others]
 
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
+        if key == COMPLETED.key:
+            return np.array([run.completed for run in self.runs[backend]], float)
         return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
 
     def failures(self, backend: str) -> int:
@@ -73,7 +75,7 @@ def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
-    "difference", "low", "high", "p", "other_lower", "verdict",
+    "difference", "low", "high", "p", "other_lower", "other_higher", "verdict",
 )  # fmt: skip
 MEAN_COLUMNS = ("sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "min", "max")
 RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
@@ -117,7 +119,7 @@ def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
         for other, d in group.differences(metric).items():
             head = (group.sequence, group.variant.name, group.mode, metric.key, first, other, d.pairs, d.missing)
             figures = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p))
-            yield (*head, *figures, d.lower, d.verdict.value)
+            yield (*head, *figures, d.lower, d.higher, d.verdict.value)
 
 
 def _sd(values: Array) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare.measure import SERIES_COLUMNS, Collector, Measured
+from slam.compare.collect import SERIES_COLUMNS, Collector, Measured
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Trial
 from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.config import SystemConfig
@@ -78,10 +78,11 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     Raises:
         ConfigurationError: a setting is unknown or out of range.
     """
-    name, settings = trial.variant.frontend, list(trial.variant.settings)
-    return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings(
-        [*_ONE_THREAD.get(name, []), *settings]
-    )
+    name = trial.variant.frontend
+    first = _ONE_THREAD.get(name, [])
+    if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
+        first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
+    return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings([*first, *trial.variant.settings])
 
 
 def frontend_of(trial: Trial, sequence: Sequence) -> Frontend | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from slam.data import BoolArray
 from slam.objects.data import ObjectEstimate
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
-from slam.se3 import Array, so3_exp, so3_log
+from slam.se3 import Array, adjoint, inverse, so3_exp, so3_log
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
@@ -28,15 +30,17 @@ class Body:
         velocity: [ω, v] (6,) in world axes.
         covariance: of the pose (6, 6), body axes.
         history: poses at the window's slots (W, 4, 4).
-        known: at which slots there is one (W,).
-        T_first: pose at the begin of the window when it was found, and
-        T_before: at the previous frame.
+        known: at which slots there is a measured one (W,).
+        T_before: pose at the previous frame.
+        found_at: when the back end began to estimate it [s].
         T_found, T_reported: the back end's poses when it was found, and at the previous frame.
+        T_body_estimate: takes coordinates of the back end's body frame to those of this one (4, 4).
         lower, upper: extent of its points (3,), body coordinates.
         size: what it measures across at least [m].
         reach: its points lie no farther from its origin [m].
         seen_at: when it was last measured [s].
         seen: number of frames in which it was measured.
+        missed: number of frames since it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
         proved: whether it has moved for certain.
@@ -50,16 +54,18 @@ class Body:
     covariance: Array
     history: Array
     known: BoolArray
-    T_first: Array
     T_before: Array
+    found_at: float
     T_found: Array
     T_reported: Array
+    T_body_estimate: Array
     lower: Array
     upper: Array
     size: float
     reach: float
     seen_at: float
     seen: int = 1
+    missed: int = 0
     measured: bool = True
     moving: bool = True
     proved: bool = False
@@ -69,13 +75,13 @@ class Body:
     @property
     def across(self) -> float:
         """Diagonal of its extent, but no less than its least size [m]."""
-        return max(float(np.linalg.norm(self.upper - self.lower)), self.size)
+        return max(math.dist(self.upper, self.lower), self.size)
 
-    def placed(self, T: Array, slot: int) -> Body:
-        """The body with its pose at the present frame, whose slot is `slot`."""
+    def placed(self, T: Array, slot: int, measured: bool, **changes: Any) -> Body:
+        """The body with its pose at the present frame, whose slot is `slot`, and other changes."""
         history, known = self.history.copy(), self.known.copy()
-        history[slot], known[slot] = T, True
-        return replace(self, T=T, history=history, known=known)
+        history[slot], known[slot] = T, measured
+        return replace(self, T=T, history=history, known=known, measured=measured, **changes)
 
 
 def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float) -> Body:
@@ -96,8 +102,8 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
     T[:3, 3] = centre
     none = np.zeros(3)
     return Body(
-        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, T, none, none, size,
-        np.inf, stamp,
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, stamp, T, T, np.eye(4), none, none,
+        size, np.inf, stamp,
     )  # fmt: skip
 
 
@@ -107,12 +113,15 @@ def advanced(body: Body, dt: float, slot: int, acceleration: float) -> Body:
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
     covariance = body.covariance + (acceleration * dt) ** 2 * dt * np.eye(6)
-    moved = replace(body, T_before=body.T, covariance=covariance, measured=False)
-    return moved.placed(T, slot)
+    return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1)
 
 
-def from_estimate(body: Body, estimate: ObjectEstimate, slot: int, min_speed: float) -> Body:
-    """The body with the back end's belief taken over."""
+def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:
+    """The body with the back end's belief taken over.
+
+    A measured body stays where its points were located: the back end has a frame of its own for it, and points of its
+    own. One that was not measured goes where the back end's goes.
+    """
     before = estimate if body.estimate is None else body.estimate
     found = estimate.T_world_object if body.estimate is None else body.T_found
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
@@ -120,13 +129,20 @@ def from_estimate(body: Body, estimate: ObjectEstimate, slot: int, min_speed: fl
     v, P = estimate.velocity, estimate.velocity_covariance
     settled = body.seen > _SETTLED
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
+    T_estimate = estimate.T_world_object
+    T_body_estimate = inverse(body.T) @ T_estimate if body.measured else body.T_body_estimate
+    T = body.T if body.measured else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
+    change = adjoint(T_body_estimate)
+    at_origin = np.concatenate([v[:3], v[3:] + np.cross(v[:3], T[:3, 3] - T_estimate[:3, 3])])
     return replace(
         body,
-        T=estimate.T_world_object,
-        velocity=v if settled else body.velocity,
-        covariance=estimate.covariance,
+        T=T,
+        T_body_estimate=T_body_estimate,
+        velocity=at_origin if settled else body.velocity,
+        covariance=change @ estimate.covariance @ change.T,
         moving=not settled or (certain and speed > min_speed),
         estimate=estimate,
+        found_at=estimate.stamp if body.estimate is None else body.found_at,
         T_found=found,
         T_reported=before.T_world_object,
     )
@@ -137,20 +153,20 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
     turn = so3_log(T[:3, :3] @ body.T_before[:3, :3].T) / dt
     shift = (T[:3, 3] - body.T_before[:3, 3]) / dt
     velocity = 0.5 * body.velocity + 0.5 * np.concatenate([turn, shift])
-    return replace(body.placed(T, slot), velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
+    return body.placed(T, slot, True, velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
 
 
 def with_extent(body: Body, local: Array) -> Body:
     """The body with the extent of its points (K, 3)."""
     if len(local) < 3:
         return body
-    lower, upper = _outermost(local)
+    lower, upper = outermost(local)
     body = replace(body, lower=lower, upper=upper)
-    return body if np.isfinite(body.reach) else replace(body, reach=_REACH * body.across)
+    return body if math.isfinite(body.reach) else replace(body, reach=_REACH * body.across)
 
 
-def _outermost(points: Array) -> tuple[Array, Array]:
-    """The 5th and 95th percentiles (3,) of points (K, 3): as NumPy's, without their cost for a few points."""
+def outermost(points: Array) -> tuple[Array, Array]:
+    """The 5th and 95th percentiles (3,) of points (K, 3), at least two: as NumPy's, without their cost for a few."""
     ordered = np.sort(points, axis=0)
     place = 0.05 * (len(points) - 1)
     k = int(place)

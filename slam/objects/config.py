@@ -8,6 +8,7 @@ from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
 
 MODES = ("detect", "procedure1", "off")
+_LONGEST = 200  # window [frames]: every track keeps so many measurements
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class ObjectsConfig:
             camera no more, and
         group_test: from which it moves; of small clusters more is asked for.
         min_support: features that must move alike before a body is made of them, and
-        confirm: for so many frames.
+        confirm: for so many frames, less those in which they did not; one of them may be newer.
         max_points: most points kept of a body.
         forget_after: a body not seen for so long is forgotten [s].
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
@@ -74,8 +75,11 @@ class ObjectsConfig:
             raise ConfigurationError(f"objects: mode must be one of {MODES}, got {self.mode!r}")
         if self.mode == "procedure1" and not self.database:
             raise ConfigurationError("objects: mode procedure1 needs a database of the object's features")
-        if not 3 <= self.min_frames <= self.window:
-            raise ConfigurationError("objects: 3 <= min_frames <= window is required")
+        if not 3 <= self.min_frames <= self.window <= _LONGEST:
+            raise ConfigurationError(f"objects: 3 <= min_frames <= window <= {_LONGEST} is required")
+        for name in ("max_speed", "d_match", "wide_d_match", "doubtful", "suspect", "confirm", "forget_after"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"objects: {name} must be positive, got {getattr(self, name)}")
         if self.min_support < 3 or self.max_points < self.min_support:
             raise ConfigurationError("objects: 3 <= min_support <= max_points is required")
         if self.suspect > self.group_test:

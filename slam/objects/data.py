@@ -109,8 +109,10 @@ class MovingObject:
         estimate: pose, velocity and their covariances.
         motion: motion (4, 4) since the previous frame, in world coordinates.
         motion_since_found: motion (4, 4) since the body was found, in world coordinates.
-        extent: least and largest corner (2, 3) [m] of the box around its points, in body coordinates.
+        extent: least and largest corner (2, 3) [m] of the box around its points, in body coordinates; 5th and 95th
+            percentiles, of the points that have moved with it for certain.
         moving: whether it moves now; a body that stops stays an object.
+        found_at: when it was found [s]; NaN where that was before the run.
     """
 
     id: int
@@ -120,6 +122,7 @@ class MovingObject:
     motion_since_found: Array
     extent: Array
     moving: bool
+    found_at: float = float("nan")
 
 
 @dataclass(frozen=True)

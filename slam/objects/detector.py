@@ -15,7 +15,7 @@ from slam.data import Estimate, IdArray, StereoFeatures
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
 from slam.objects import membership
-from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, with_extent
+from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, outermost, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.data import Judgement, MovingObject, ObjectObservations
 from slam.objects.displacements import displacements
@@ -70,20 +70,18 @@ class MovingObjectDetector:
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
+        local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
-        follow(tracks, self.bodies, T_world_left, features, self._dt(times), self.rig, self.sigma, self.config)
-        self._measure(tracks, features, T_world_left)
-        seen = np.flatnonzero(tracks.seen)
-        known = seen[landmark[tracks.row[seen]] >= 0]
-        tracks.landmark[np.isin(tracks.landmark, landmark[tracks.row[known]])] = -1
-        tracks.landmark[known] = landmark[tracks.row[known]]
+        follow(tracks, self.bodies, T_world_left, features, local, self._dt(times), self.rig, self.sigma, self.config)
+        self._measure(tracks, features, local, T_world_left)
+        tracks.recognised_as(landmark)
         self._fit(tracks, times)
         self._change_members()
         self._find_bodies(times, T_world_left)
-        self._begin_tracks(features, T_world_left, landmark)
+        self._begin_tracks(features, local, T_world_left, landmark)
         return self._judgement(features)
 
     def _begin(self, features: StereoFeatures) -> Array:
@@ -111,8 +109,8 @@ class MovingObjectDetector:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = self._stamps[self.slot], self._dt(times)
         for body in list(self.bodies.values()):
-            remembered = (_PATIENCE + body.seen) * dt if body.seen < _SETTLED else np.inf
-            if now - body.seen_at > min(self.config.forget_after, remembered):
+            fresh = body.seen < _SETTLED
+            if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
                 self.bodies[body.id] = advanced(body, dt, self.slot, self.acceleration)
@@ -125,14 +123,14 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- measuring
 
-    def _measure(self, tracks: Tracks, features: StereoFeatures, T_world_left: Array) -> None:
+    def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, T_world_left: Array) -> None:
         """Find the bodies by their members, and enter this frame's pixels into the tracks, in world coordinates."""
         c = self.config
         for body in list(self.bodies.values()):
-            located = locate(body, tracks, features, T_world_left, self.rig, self.sigma, c, self._frame)
+            located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
             if located is not None:
-                body = replace(body.placed(located, self.slot), measured=True, seen_at=features.stamp,
-                               seen=body.seen + 1)  # fmt: skip
+                times_seen = body.seen + 1
+                body = body.placed(located, self.slot, True, seen_at=features.stamp, seen=times_seen, missed=0)
                 self.bodies[body.id] = body
             mine = tracks.body == body.id
             tracks.position[mine] = transform(body.T, tracks.local[mine])
@@ -144,7 +142,7 @@ class MovingObjectDetector:
     def _fit(self, tracks: Tracks, times: Array) -> None:
         """Positions of free tracks, and velocities of those that may move."""
         free = np.flatnonzero((tracks.body < 0) & tracks.seen)
-        count = tracks.count[free]
+        count = tracks.count(free)
         unsure = (count < self.config.min_frames) | tracks.doubtful[free] | tracks.velocity[free].any(axis=1)
         fit_positions(tracks, free)
         fit_velocities(tracks, free[unsure & (count > 1)], times, self.config.max_speed)
@@ -156,7 +154,7 @@ class MovingObjectDetector:
         c, tracks = self.config, self.tracks
         assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
-        rows = rows[tracks.count[rows] >= c.min_frames]
+        rows = rows[tracks.count(rows) >= c.min_frames]
         local = transform(inverse(T_world_left), tracks.position[rows])
         deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
         rows, local = rows[local[:, 2] > _FARTHEST * deviation], local[local[:, 2] > _FARTHEST * deviation]
@@ -180,7 +178,8 @@ class MovingObjectDetector:
             members = rows[group.members]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
                 self._perhaps_found(members[tracks.streak[members] > 0], times)
-        self.suspects = np.concatenate(suspects)
+        suspected = np.concatenate(suspects)
+        self.suspects = suspected[suspected >= 0]
 
     def _perhaps_found(self, members: NDArray[np.intp], times: Array) -> None:
         """Make a body of tracks that have moved alike for long enough, if they lie together."""
@@ -193,7 +192,7 @@ class MovingObjectDetector:
         centre = motion.position.mean(axis=0)
         twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
-        body = membership.fitted(body, tracks, members, times, self.slot)
+        body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body)
         if known is None:
             self.bodies[body.id] = body
@@ -230,22 +229,21 @@ class MovingObjectDetector:
                 older = {id: other for id, other in self.bodies.items() if id < body.id}
                 whole = membership.overlapped(older, tracks, mine, body)
                 alike = body.alike + 1 if whole is not None else 0
-                self.bodies[body.id] = replace(body, alike=alike)
+                if alike != body.alike:
+                    self.bodies[body.id] = replace(body, alike=alike)
                 if whole is not None and (body.seen < _YOUNG or alike > _YOUNG):
                     membership.enter(whole, tracks, mine, sure=True)
                     self._forget(body.id)
 
-    def _begin_tracks(self, features: StereoFeatures, T_world_left: Array, landmark: IdArray) -> None:
+    def _begin_tracks(self, features: StereoFeatures, local: Array, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""
         tracks = self.tracks
         assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.missed > self.config.patience) & (tracks.body < 0)))
         taken = np.zeros(len(features), bool)
         taken[tracks.row[tracks.seen]] = True
-        rows = np.flatnonzero(~taken & features.has_stereo)
-        local = self.rig.triangulate(features.uv_left[rows], features.uv_right[rows])
-        rows, local = rows[np.isfinite(local[:, 0])], local[np.isfinite(local[:, 0])]
-        points = transform(T_world_left, local)
+        rows = np.flatnonzero(~taken & np.isfinite(local[:, 0]))
+        points = transform(T_world_left, local[rows])
         ids = np.arange(self._next_track, self._next_track + len(rows), dtype=np.int64)
         self._next_track += len(rows)
         new = tracks.begin(ids, features, rows, points)
@@ -273,7 +271,7 @@ class MovingObjectDetector:
         dt = self._dt(self._times(features))
         if not isinstance(backend, ObjectBackend):
             for body in list(self.bodies.values()):
-                if body.measured and body.estimate is None and dt > 0:
+                if body.measured and body.seen > 1 and dt > 0:
                     self.bodies[body.id] = from_fit(body, body.T, dt, self.slot)
             self._forgotten.clear()
             return ()
@@ -290,10 +288,11 @@ class MovingObjectDetector:
         reported = []
         for estimate in estimates:
             body = self.bodies[estimate.id]
-            body = from_estimate(body, estimate, self.slot, self.config.min_speed)
+            body = from_estimate(body, estimate, self.config.min_speed)
             self.bodies[body.id] = body
             membership.reject(self.tracks, estimate.rejected)
-            reported.append(self._report(body))
+            if body.proved:
+                reported.append(self._report(body))
         return tuple(reported)
 
     def _observations(self, body: Body, features: StereoFeatures) -> ObjectObservations:
@@ -302,14 +301,18 @@ class MovingObjectDetector:
         mine = np.flatnonzero((tracks.body == body.id) & tracks.seen & (tracks.misfit == 0))
         mine = mine[np.argsort(tracks.ids[mine])]
         rows = tracks.row[mine]
-        return ObjectObservations(body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], body.T)
+        guess = body.T @ body.T_body_estimate
+        return ObjectObservations(body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], guess)
 
     def _report(self, body: Body) -> MovingObject:
         tracks, estimate = self.tracks, body.estimate
         assert tracks is not None and estimate is not None
-        rows = tracks.row[(tracks.body == body.id) & tracks.seen]
+        mine = tracks.body == body.id
+        rows = tracks.row[mine & tracks.seen]
         T = estimate.T_world_object
+        points = transform(inverse(body.T_body_estimate), tracks.local[mine & tracks.sure])
+        extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
         return MovingObject(
             body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
-            np.stack([body.lower, body.upper]), body.moving,
+            extent, body.moving, body.found_at,
         )  # fmt: skip

@@ -28,6 +28,7 @@ def follow(
     bodies: Mapping[int, Body],
     T_world_left: Array,
     features: StereoFeatures,
+    measured: Array,
     dt: float,
     rig: StereoRig,
     sigma: float,
@@ -35,19 +36,23 @@ def follow(
 ) -> None:
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
+    Members of bodies take on the looks of their feature also where `slam.objects.recovery.locate` does not confirm it
+    afterwards: it is the body's pose that is wrong more often than the match.
+
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
     is left, and was not known for long enough to have a velocity, is looked for as far as `max_speed` allows.
+    `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     tracks.row[:] = -1
     alive = np.flatnonzero(tracks.ids >= 0)
+    _advance(tracks, bodies, alive, dt)
     if len(alive) and len(features):
-        _advance(tracks, bodies, alive, dt)
         local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
         z, J = rig.project_stereo(local)
         spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
         _near(tracks, alive, features, z, spread, config)
         _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
-        _far(tracks, T_world_left, features, dt, config, rig, sigma)
+        _far(tracks, T_world_left, features, measured, dt, config, rig, sigma)
     seen = tracks.seen
     tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
     tracks.missed[:] = np.where(seen, 0, tracks.missed + 1)
@@ -86,25 +91,24 @@ def _check_right(
     rows = alive[seen]
     away = np.abs(features.uv_right[tracks.row[rows], 0] - expected[seen])
     allowance = _UNEVEN * config.max_speed * dt * rig.left.fu / np.maximum(depth[seen], 1e-3)
-    allowance *= np.where(tracks.count[rows] < config.min_frames, 1.0 / _UNEVEN, 1.0)
+    allowance *= np.where(tracks.count(rows) < config.min_frames, 1.0 / _UNEVEN, 1.0)
     tracks.row[rows[away > _RIGHT_SIGMAS * spread[seen] + allowance]] = -1  # NaN compares false
 
 
 def _far(
-    tracks: Tracks, T_world_left: Array, features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig,
-    sigma: float,
+    tracks: Tracks, T_world_left: Array, features: StereoFeatures, measured: Array, dt: float, config: ObjectsConfig,
+    rig: StereoRig, sigma: float,
 ) -> None:  # fmt: skip
     """Look for tracks without a velocity yet anywhere that `max_speed` allows."""
     lost = (tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0)
     left = np.flatnonzero(lost)
-    left = left[tracks.count[left] <= config.min_frames]
+    left = left[tracks.count(left) <= config.min_frames]
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen]] = True
-    free = np.flatnonzero(~taken & features.has_stereo)
+    free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if not len(left) or not len(free):
         return
-    local = rig.triangulate(features.uv_left[free], features.uv_right[free])
-    free, local = free[np.isfinite(local[:, 0])], local[np.isfinite(local[:, 0])]
+    local = measured[free]
     found = transform(T_world_left, local)
     deviation = local[:, 2] ** 2 * np.sqrt(2.0) * sigma / (rig.left.fu * rig.baseline)
     own = np.trace(tracks.covariance[left], axis1=1, axis2=2)

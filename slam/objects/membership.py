@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,9 +73,15 @@ def verdict(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Verdict:
     """How tracks go with a body and with the still world, over the window."""
     t = tracks
     fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
-    limit = chi_square_limits(np.maximum(numbers - 3, 1), 0.99)
+    limit = _limits(3 * t.dof.shape[1])[np.maximum(numbers - 3, 1)]
     fits = (fixed < limit) | ((fixed < _EXPLAINED * still) & (fixed < _LOOSE * limit))
     return Verdict(still - fixed, fits, count)
+
+
+@cache
+def _limits(most: int) -> Array:
+    """99 % limits of χ² for 0 to `most` degrees of freedom."""
+    return chi_square_limits(np.arange(most + 1), 0.99)
 
 
 def compact(points: Array) -> BoolArray:
@@ -83,7 +90,7 @@ def compact(points: Array) -> BoolArray:
     return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
-def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], times: Array, slot: int) -> Body:
+def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
     """A new body with its poses over the window and its extent fitted to what tracks measured.
 
     An even motion is but the first guess of a body that starts to move: poses and points are improved in turn.
@@ -96,9 +103,8 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], times: Array, slo
         normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)
         body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
-    now, first = body.history[slot], body.history[int(np.argmin(times))]
     points, A, _ = in_body_axes(body, tracks, rows)
-    return with_extent(replace(body, T=now, T_first=first), _means(points, A))
+    return with_extent(replace(body, T=body.history[slot]), _means(points, A))
 
 
 def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
@@ -130,10 +136,13 @@ def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: Objec
     for body in bodies.values():
         _improve(body, tracks, slot)
         gains[body.id] = _expel(body, tracks, config)
-    free = np.flatnonzero((tracks.body < 0) & tracks.seen & (tracks.count >= 2))
+    free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+    free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
         near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
+        if not len(near):
+            continue
         gain = _gain_of_joining(body, tracks, free[near])
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
@@ -162,12 +171,14 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     """
     mine = np.flatnonzero(tracks.body == body.id)
     v, seen = verdict(body, tracks, mine), tracks.seen[mine]
-    unfit = ~v.fits & (v.count >= _ENOUGH) & (v.fits[seen].mean() > _MOST if seen.any() else False)
+    most_fit = v.fits[seen].sum() > _MOST * seen.sum()
+    unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
     wrong = (tracks.misfit[mine] >= _MISFITS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
-    leave(tracks, mine[wrong], body)
-    tracks.expelled[mine[wrong]] = True
-    mine = mine[~wrong]
+    if wrong.any():
+        leave(tracks, mine[wrong], body)
+        tracks.expelled[mine[wrong]] = True
+        mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
         order = np.lexsort((worth, -tracks.missed[mine]))
@@ -185,18 +196,21 @@ def reject(tracks: Tracks | None, ids: IdArray) -> None:
 def on_bodies(bodies: Mapping[int, Body], tracks: Tracks, margin: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
 
-    What lies inside a body's extent lies on it, unless it is known to stand still.
+    What lies inside a body's extent lies on it, unless it is known to stand still. All that lies on a body which is not
+    proved yet only may.
     """
-    on, near = tracks.seen & (tracks.body >= 0), np.zeros(len(tracks), bool)
+    certain = np.isin(tracks.body, [body.id for body in bodies.values() if body.proved])
+    on, near = tracks.seen & certain, tracks.seen & (tracks.body >= 0) & ~certain
+    free = np.flatnonzero(tracks.seen & (tracks.body < 0))
     for body in bodies.values():
         if not body.measured:
             continue
-        free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         close = free[_distances(body, tracks, free, margin) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
-        asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
-        on[inside[verdict(body, tracks, inside).gain > asked]] = True
+        if len(inside) and body.proved:
+            asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
+            on[inside[verdict(body, tracks, inside).gain > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
@@ -209,17 +223,16 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         rows: which of them.
         own: a body made of them alone.
     """
-    alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
     for body in bodies.values():
-        if not body.measured:
+        if not body.measured or 2 * (_distances(body, tracks, rows, _MERGED) < _NEAR).sum() <= len(rows):
             continue
-        near = _distances(body, tracks, rows, _MERGED) < _NEAR
+        alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
         points, A, known = in_body_axes(body, tracks, rows)
         fixed = float(_squares(points, A).sum())
         still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
         by_chance = float(chi_square_limits(np.array([6 * int(known.any(axis=0).sum())]), 0.99)[0])
         apart = body.seen > _YOUNG and fixed - alone > _APART * by_chance and fixed > 2 * _APART * alone
-        if 2 * near.sum() > len(rows) and fixed < 2 * _EXPLAINED * still and not apart:
+        if fixed < 2 * _EXPLAINED * still and not apart:
             return body
     return None
 
@@ -227,12 +240,16 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
 def proved(body: Body, gain: Array) -> Body | None:
     """The body, known to have moved once its members say so; None where they say that it stands still and always did.
 
+    A young one may lose what it seemed to be.
+
     Args:
         body: the body.
         gain: by how much χ² it explains its members better than the still world (K,).
     """
+    if body.proved and body.seen >= _PROBATION:
+        return body
     typical = median(gain) if len(gain) else 0.0
-    if body.proved or typical > _PROOF:
+    if typical > _PROOF:
         return replace(body, proved=True)
     return body if typical > 0 and body.seen < _PROBATION else None
 

@@ -107,6 +107,8 @@ class _Life:
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
+    found_at: float = float("nan")
+    T_found: Array = field(default_factory=lambda: np.eye(4))
     votes: dict[int, int] = field(default_factory=dict)
 
     @property
@@ -129,6 +131,7 @@ class ObjectScore:
     def __init__(self, bodies: Array, stamps: Array, cameras: Array, focal: float, pixel: float = 1.0) -> None:
         self.bodies = bodies
         self.cameras = cameras
+        self.stamps = stamps
         self.moves_from = [_first_motion(poses, cameras, focal, pixel) for poses in bodies]
         self.lives: dict[int, _Life] = {}
         self.right = self.wrong = self.missed = self.still = 0
@@ -167,6 +170,10 @@ class ObjectScore:
             for label in labels[thing.features]:
                 if label >= 0:
                     life.votes[int(label)] = life.votes.get(int(label), 0) + 1
+            life.found_at, life.T_found = (
+                thing.found_at,
+                inverse(thing.motion_since_found) @ thing.estimate.T_world_object,
+            )
             life.frames.append(frame)
             life.poses.append(thing.estimate.T_world_object)
             life.covariances.append(thing.estimate.covariance)
@@ -222,13 +229,39 @@ class ObjectScore:
         both = rows[1:][(np.diff(rows) == 1) & (np.diff(frames[rows]) == 1)]
         me = [motion_errors(own[[k - 1, k]], true[[k - 1, k]]) for k in both]
         errors = PoseErrors(np.array([e.rotation[0] for e in me]), np.array([e.translation[0] for e in me]))
-        values = object_nees(own[rows], np.array(life.covariances)[rows], true[rows])
+        values = self._nees(body, life, rows)
         figures["ME"] = errors.summary()
         figures["relative, 10 frames"] = motion_errors(own, true, 10).summary() if len(own) > 10 else {}
         figures["absolute"] = absolute_pose_errors(own[rows], true[rows]).summary()
         figures["mean NEES"] = float(np.mean(values)) if len(values) else None
         figures["dof"] = 6.0
         return figures
+
+    def poses_of(self, body: int) -> tuple[NDArray[np.intp], Array, Array] | None:
+        """Where the longest-lived object of a body was measured.
+
+        Returns:
+            frames (M,), its poses and the true ones (M, 4, 4) in the same world frame; None where there is no object.
+        """
+        lives = [life for life in self.lives.values() if life.truth == body]
+        if not lives or self._world is None:
+            return None
+        life = max(lives, key=lambda one: len(one.frames))
+        frames = np.array(life.frames)[life.measured]
+        return frames, np.array(life.poses)[life.measured], self._world @ self.bodies[body - 1][frames]
+
+    def _nees(self, body: int, life: _Life, rows: NDArray[np.intp]) -> Array:
+        """NEES of an object's motion since it was found, which may have been before it was first reported."""
+        assert self._world is not None
+        found = (
+            int(np.searchsorted(self.stamps, life.found_at - 1e-6)) if np.isfinite(life.found_at) else life.frames[0]
+        )
+        first = life.T_found if np.isfinite(life.found_at) else life.poses[0]
+        frames = np.array([found, *np.array(life.frames)[rows]])
+        own = np.stack([first, *np.array(life.poses)[rows]])
+        covariances = np.concatenate([np.zeros((1, 6, 6)), np.array(life.covariances)[rows]])
+        later = np.concatenate([[True], frames[1:] > found])
+        return object_nees(own[later], covariances[later], (self._world @ self.bodies[body - 1][frames])[later])
 
 
 def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -74,5 +74,5 @@ def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels)
     from slam.compilation import announce_compilation  # brings Numba, as the detector does
     from slam.objects.detector import MovingObjectDetector
 
-    announce_compilation("slam.objects", "the kernels for moving objects: some ten seconds")
+    announce_compilation("slam.", "the kernels for cameras and moving objects: some twenty seconds")
     return MovingObjectDetector(rig, config, models)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,10 +79,19 @@ class ObjectDatabase:
             ConfigurationError: there is no such file, or it is none of a database.
         """
         try:
-            with np.load(path) as file:
-                return cls(*(file[name] for name in ("points", "descriptors", "laplacian", "origin")))
-        except (OSError, KeyError, ValueError) as error:
-            raise ConfigurationError(f"object database {path}: {error}") from None
+            with path.open("rb") as stream, np.load(stream) as file:
+                database = cls(*(file[name] for name in ("points", "descriptors", "laplacian", "origin")))
+        except OSError as error:
+            raise ConfigurationError(f"object database {path}: {error.strerror or error}") from None
+        except (KeyError, ValueError, EOFError, BadZipFile):
+            raise ConfigurationError(f"object database {path}: damaged, or no database of an object") from None
+        n = len(database.points)
+        if not (
+            database.points.shape == (n, 3) and database.origin.shape == (3,) and database.laplacian.shape == (n,)
+            and database.descriptors.ndim == 2 and len(database.descriptors) == n
+        ):  # fmt: skip
+            raise ConfigurationError(f"object database {path}: its arrays do not belong together")
+        return database
 
 
 @dataclass(frozen=True)
@@ -237,6 +247,11 @@ class Procedure1Detector:
     def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
         """Recognise the object's features and find its motion; no other feature is judged."""
         c, d = self.config, self.database
+        if d.descriptors.shape[1] != features.descriptors.shape[1]:
+            raise ConfigurationError(
+                f"objects: the database has descriptors of {d.descriptors.shape[1]} dimensions, the front end's have "
+                f"{features.descriptors.shape[1]}"
+            )
         free = np.flatnonzero(features.has_stereo)
         allowed = np.ones((len(d.points), len(free)), bool)
         known, rows = match_far(d.descriptors, d.laplacian, features, free, allowed, c.wide_d_match, c.wide_ratio)

@@ -21,21 +21,22 @@ _LEAST_ANEW = 4  # points that must agree where a body is found again
 
 
 def locate(
-    body: Body, tracks: Tracks, features: StereoFeatures, T_world_left: Array, rig: StereoRig, sigma: float,
-    config: ObjectsConfig, seed: int,
+    body: Body, tracks: Tracks, features: StereoFeatures, measured: Array, T_world_left: Array, rig: StereoRig,
+    sigma: float, config: ObjectsConfig, seed: int,
 ) -> Array | None:  # fmt: skip
     """The body's pose T_world_object (4, 4) by a fit to its tracks that are seen, or found again.
 
     Tracks that disagree are counted as misfits, in place.
 
-    Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree.
+    Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree. `measured`
+    are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     members = np.flatnonzero(tracks.body == body.id)
     mine = members[tracks.seen[members]]
     rows = tracks.row[mine]
     found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
     if found is None or 2 * found[1].sum() < len(mine):
-        wide, wide_rows = _by_looks(body, tracks, members, features, T_world_left, rig, config)
+        wide, wide_rows = _by_looks(body, tracks, members, features, measured, T_world_left, config)
         again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
         if again is not None and (found is None or again[1].sum() > found[1].sum()):
             found, mine, rows = again, wide, wide_rows
@@ -60,21 +61,21 @@ def _fit(
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     guess = inverse(body.T) @ T_world_left
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
-    stereo = features.has_stereo[rows[fit.inliers]]
+    stereo = np.isfinite(z[fit.inliers, 2])
     return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
 
 
 def _by_looks(
-    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, T_world_left: Array, rig: StereoRig,
-    config: ObjectsConfig,
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, measured: Array,
+    T_world_left: Array, config: ObjectsConfig,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
     """Members whose looks are seen, and the features' rows, no farther off than the body can have gone."""
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen & (tracks.body != body.id)]] = True
-    free = np.flatnonzero(~taken & features.has_stereo)
+    free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if len(mine) < _LEAST_ANEW or len(free) < _LEAST_ANEW:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    local = rig.triangulate(features.uv_left[free], features.uv_right[free])
+    local = measured[free]
     points = transform(T_world_left, local)
     reach = config.max_speed * max(features.stamp - body.seen_at, 0.1) + np.linalg.norm(body.upper - body.lower)
     near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + 0.2 * np.abs(local[:, 2])

@@ -98,12 +98,12 @@ def _turn_back(R, M, out):
 
 
 @kernel
-def measurements(dof):
-    """In how many slots (N,) tracks were measured."""
-    out = np.zeros(len(dof), np.int64)
-    for n in range(len(dof)):
+def measurements(dof, rows):
+    """In how many slots (M,) tracks were measured."""
+    out = np.zeros(len(rows), np.int64)
+    for m in range(len(rows)):
         for w in range(dof.shape[1]):
-            out[n] += dof[n, w] > 0
+            out[m] += dof[rows[m], w] > 0
     return out
 
 

@@ -31,7 +31,7 @@ class Tracks:
         row: row of the feature in this frame (N,), −1 where not seen.
         landmark: id of the landmark that it is (N,), −1 for none.
         body: id of the body that it belongs to (N,), −1 for none.
-        missed: frames since it was last seen (N,).
+        missed: frames since a feature was last found that looks like it (N,).
         anchor: origin of the track's own coordinates, in world axes (N, 3).
         A: information (N, W, 3, 3), zero where there is no measurement; slot ``frame % W``.
         p: the point that the pixels say (N, W, 3), relative to the anchor.
@@ -42,7 +42,7 @@ class Tracks:
         covariance: of the position (N, 3, 3).
         velocity: of those that a fixed point does not explain (N, 3) [m/s]; zero for the others.
         velocity_covariance: (N, 3, 3), of those that have one.
-        streak: frames in a row in which it was part of a group that moves alike (N,).
+        streak: frames in which it was part of a group that moves alike, less those since in which it was not (N,).
         doubtful: not still for certain (N,).
         local: point in the body's coordinates (N, 3), and
         local_information: its information (N, 3, 3).
@@ -99,10 +99,9 @@ class Tracks:
         """Which are seen in this frame (N,)."""
         return self.row >= 0
 
-    @property
-    def count(self) -> IdArray:
-        """Number of measurements in the window (N,)."""
-        return np.asarray(measurements(self.dof))
+    def count(self, rows: NDArray[np.intp]) -> IdArray:
+        """Number of measurements of tracks in the window (M,)."""
+        return np.asarray(measurements(self.dof, rows))
 
     def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
         """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""
@@ -119,6 +118,19 @@ class Tracks:
         self.landmark[new], self.expelled[new] = -1, False
         self.forget_past(new)
         return new
+
+    def recognised_as(self, landmark: IdArray) -> None:
+        """Note which landmark every feature of the frame was recognised as (N,), −1 for none; no other track is it."""
+        seen = np.flatnonzero(self.seen)
+        known = seen[landmark[self.row[seen]] >= 0]
+        ids = landmark[self.row[known]]
+        if len(ids):
+            ordered = np.sort(ids)
+            named = np.flatnonzero(self.landmark >= 0)
+            place = np.searchsorted(ordered, self.landmark[named])
+            again = ordered[np.minimum(place, len(ids) - 1)] == self.landmark[named]
+            self.landmark[named[again]] = -1
+            self.landmark[known] = ids
 
     def give_up(self, rows: NDArray[np.intp]) -> None:
         """Make rows unused."""

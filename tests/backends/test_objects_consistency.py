@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import backends
-from backends.ekf.objects_body import RIGID, _by_frame, _with_free_frame, advanced, found
+from backends.ekf.objects_body import RIGID, _learnt, advanced, found
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
 from backends.smoother.objects_factors import System, add_measurements, add_motion, velocities
 from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
@@ -140,14 +140,16 @@ def test_the_filter_never_learns_where_in_a_body_its_frame_lies():
     h = box_points(5, np.full(3, 0.3), np.array([0.05, 0, 1.2]), rng)
     body = found(1, se3.pose(np.eye(3), [0, 0, 1.2]), ObjectModels(), 2)
     points = BodyPoints.at(se3.inverse(body.T), h)
-    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), _by_frame(points)])
+    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), points.by_frame()])
     none = np.zeros(5, np.int64)
     before = replace(
         body, ids=np.arange(5), points=points, covariance=1e-4 * frame @ frame.T, cross=frame @ np.ones((6, 2)),
         failures=none, seen=none, sights=none,
     )  # fmt: skip
-    after = _with_free_frame(before, replace(before, points=points.plus(0.02 * rng.standard_normal((5, 3)))))
-    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), _by_frame(after.points)])
+    change = np.concatenate([np.zeros(RIGID), 0.02 * rng.standard_normal(15)])
+    nothing = np.zeros((len(change), 1))
+    after = _learnt(before, change, nothing, nothing, np.zeros((1, 2)))
+    frame = np.concatenate([np.eye(6), np.zeros((6, 6)), after.points.by_frame()])
     np.testing.assert_allclose(after.covariance, 1e-4 * frame @ frame.T, atol=1e-12)
     np.testing.assert_allclose(after.cross, frame @ np.ones((6, 2)), atol=1e-9)
 

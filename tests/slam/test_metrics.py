@@ -452,3 +452,15 @@ def test_real_euroc_truth_at_the_frames(slam_data: Path) -> None:
     between = associate(estimate, truth, interpolated=True)[1]
     assert len(nearest) == len(between) == 20
     assert np.abs(nearest.positions - between.positions).max() < 0.005
+
+
+def test_the_ends_of_a_path_that_was_written_and_read_again_keep_their_truth() -> None:
+    truth = wander(8, 0)
+    stamps = truth.stamps.copy()
+    stamps[[0, -1]] += (-1e-9, 1e-9)  # as nine decimals round them
+    own, true = associate(Trajectory(stamps, truth.poses), truth, 0.02, interpolated=True)
+    assert len(own) == 8
+    np.testing.assert_array_equal(true.stamps, stamps)
+    np.testing.assert_allclose(true.poses, truth.poses, atol=1e-12)
+    stamps[-1] += 1e-3
+    assert len(associate(Trajectory(stamps, truth.poses), truth, 0.02, interpolated=True)[0]) == 7

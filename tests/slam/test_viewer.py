@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -20,6 +21,28 @@ def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
 def test_not_a_run(tmp_path):
     with pytest.raises(SlamError, match="finished run"):
         view_run(tmp_path, str(tmp_path / "a.rrd"))
+
+
+class Unreachable:
+    """A recording whose viewer has gone."""
+
+    def log(self, *_, **__):
+        pass
+
+    def flush(self):
+        raise RuntimeError("\nno connection\nsee the manual")
+
+
+def test_a_window_that_was_closed_takes_nothing_from_the_run(monkeypatch, caplog):
+    monkeypatch.setattr("slam.viewer._rerun", lambda: SimpleNamespace(ViewCoordinates=SimpleNamespace(RDF=None)))
+    monkeypatch.setattr("slam.viewer._open", lambda rr, target: Unreachable())
+    with Viewer("live"):
+        pass
+    assert caplog.messages == ["viewer live: not all was shown: no connection"]
+    with pytest.raises(SlamError, match=r"a\.rrd: no connection$"), Viewer("a.rrd"):
+        pass
+    with pytest.raises(ZeroDivisionError), Viewer("a.rrd"):  # what went wrong first is what is said
+        1 / 0  # noqa: B018
 
 
 @pytest.mark.filterwarnings("default")  # Rerun's own

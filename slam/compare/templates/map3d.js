@@ -5,15 +5,28 @@ document.querySelectorAll(".map3d").forEach(function (figure) {
   const canvas = figure.querySelector("canvas"), tools = figure.querySelector(".tools"), g = canvas.getContext("2d");
   const shown = data.layers.map(function () { return true; });
   const all = data.layers.flatMap(function (l) { return l.path.concat(l.points); }).concat(data.truth);
-  const low = [0, 1, 2].map(function (c) { return all.reduce(function (m, p) { return Math.min(m, p[c]); }, Infinity); });
-  const high = [0, 1, 2].map(function (c) { return all.reduce(function (m, p) { return Math.max(m, p[c]); }, -Infinity); });
-  const middle = low.map(function (x, c) { return all.length ? (x + high[c]) / 2 : 0; });
-  const radius = all.length ? Math.max(0.1, Math.hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]) / 2) : 1;
-  let yaw, pitch, zoom, asked = false;
+  const ranges = [0, 1, 2].map(function (c) { return range(all.map(function (p) { return p[c]; })); });
+  const middle = ranges.map(function (r) { return (r[0] + r[1]) / 2; });
+  let yaw, pitch, zoom, view, asked = false;
   const circle = Array.from({ length: 17 }, function (_, i) { return [Math.cos(i * Math.PI / 8), Math.sin(i * Math.PI / 8)]; });
   const fingers = new Map();
 
-  function reset(y, p) { yaw = y; pitch = p; zoom = 1; redraw(); }
+  // All but the outermost hundredth on either side: a few landmarks far off shall not make the rest small.
+  function range(values) {
+    const sorted = values.sort(function (a, b) { return a - b; }), n = sorted.length - 1;
+    return n < 0 ? [0, 0] : [sorted[Math.floor(0.01 * n)], sorted[Math.ceil(0.99 * n)]];
+  }
+  // Camera axes: x right, y down, z forward. Seen from behind and above; [m] in the plane of the picture.
+  function turned(p) {
+    const cy = Math.cos(yaw), sy = Math.sin(yaw), x = p[0] - middle[0], z = p[2] - middle[2];
+    return [cy * x + sy * z, Math.cos(pitch) * (p[1] - middle[1]) - Math.sin(pitch) * (-sy * x + cy * z)];
+  }
+  function reset(y, p) {
+    yaw = y; pitch = p; zoom = 1;
+    const seen = all.map(turned);
+    view = [0, 1].map(function (c) { return range(seen.map(function (q) { return q[c]; })); });
+    redraw();
+  }
   function redraw() { if (!asked) { asked = true; requestAnimationFrame(draw); } }
 
   function draw() {
@@ -24,13 +37,11 @@ document.querySelectorAll(".map3d").forEach(function (figure) {
     }
     g.setTransform(scale, 0, 0, scale, 0, 0);
     g.clearRect(0, 0, w, h);
-    const s = zoom * 0.48 * Math.min(w, h) / radius * 1.25;
-    const cy = Math.cos(yaw), sy = Math.sin(yaw), cp = Math.cos(pitch), sp = Math.sin(pitch);
-    // Camera axes: x right, y down, z forward. Seen from behind and above.
+    const s = zoom * 0.85 * Math.min(w / Math.max(0.1, view[0][1] - view[0][0]), h / Math.max(0.1, view[1][1] - view[1][0]));
+    const left = (view[0][0] + view[0][1]) / 2, top = (view[1][0] + view[1][1]) / 2;
     function at(p) {
-      const x = p[0] - middle[0], y = p[1] - middle[1], z = p[2] - middle[2];
-      const a = cy * x + sy * z, b = -sy * x + cy * z;
-      return [w / 2 + s * a, h / 2 + s * (cp * y - sp * b)];
+      const q = turned(p);
+      return [w / 2 + s * (q[0] - left), h / 2 + s * (q[1] - top)];
     }
     function line(points, colour, width, dash) {
       g.beginPath(); g.strokeStyle = colour; g.lineWidth = width; g.setLineDash(dash || []);

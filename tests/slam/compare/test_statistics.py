@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.compare.measure import BY_KEY, object_metric
-from slam.compare.statistics import FEWEST, Verdict, caution, difference, sentence
+from slam.compare.measure import BY_KEY, COMPLETED, object_figures, object_metric
+from slam.compare.statistics import FEWEST, Verdict, difference
+from slam.compare.wording import caution, headline, sentence, worth_saying
 
 ATE, NEES, PRECISION = BY_KEY["ate_online_m"], BY_KEY["nees_per_dof"], BY_KEY["association_precision"]
 
@@ -102,5 +103,43 @@ def test_figures_of_objects_know_what_is_better():
         "object false movers per frame": "lower",
         "object bodies 1 absolute translation RMSE [m]": "lower",
         "object bodies 1 frames in view": "",
+        "object bodies 1 NEES / degree of freedom": "one",
     }
     assert {key: object_metric(key).better for key in better} == better
+    metric = object_metric("object bodies 2 ME translation median [m]")
+    assert metric.title == "body 2: ME translation median [mm]"
+    assert metric.show(0.0021) == "2.1"
+
+
+def test_figures_of_objects_from_a_summary():
+    body = {"frames in view": 30, "coverage": 0.9, "ids": [1], "mean NEES": 9.0, "dof": 6.0}
+    found = object_figures({"objects": {"features": {"F1": 0.8}, "bodies": {"1": body}, "false objects": []}})
+    assert found["object features F1"] == 0.8
+    assert found["object bodies 1 NEES / degree of freedom"] == 1.5
+    still = {"frames in view": 0, "coverage": None, "ids": []}
+    nothing = object_figures({"objects": {"features": {"F1": 0.0}, "bodies": {"1": still}}})
+    assert nothing == {"object bodies 1 frames in view": 0.0}
+    assert object_figures({}) == {}
+
+
+def test_a_headline_says_who_is_better_in_what_and_what_is_open():
+    same = np.full(6, 0.5)
+    differences = [
+        difference(ATE, *pairs(6)),
+        difference(PRECISION, same, same),
+        difference(BY_KEY["landmark_error_m"], same, same + np.array([0.1, -0.1, 0.11, -0.12, 0.09, -0.08])),
+    ]
+    text = headline(differences, "ekf", "smoother")
+    assert text.startswith("smoother is better in ATE RMSE online (")
+    assert "% less): certain at the level of 95 %." in text
+    assert "No difference can be concluded in association precision and landmark error median." in text
+
+
+def test_runs_that_failed_are_a_difference_of_their_own():
+    """Five of six fail: what completes more often is certain only where every pair says so."""
+    all_failed = difference(COMPLETED, np.ones(6), np.zeros(6))
+    assert (all_failed.verdict, all_failed.better, all_failed.wins) == (Verdict.CERTAIN, False, 6)
+    some = difference(COMPLETED, np.array([0.0, 0, 0, 1, 1, 1]), np.ones(6))
+    assert (some.verdict, some.better, some.wins) == (Verdict.HINT, True, 3)
+    assert "in 3 of 6 trials" in sentence(some, "a", "b")
+    assert not worth_saying(difference(COMPLETED, np.ones(6), np.ones(6)))

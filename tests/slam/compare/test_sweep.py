@@ -13,7 +13,8 @@ import pytest
 from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Variant
 from slam.compare.report import write_report
-from slam.compare.scheduler import LocalScheduler
+from slam.compare.revision import running_code
+from slam.compare.scheduler import DaskScheduler, LocalScheduler
 from slam.compare.sweep import RUNS, SWEEP, check, sweep
 from slam.compare.tables import groups, write_tables
 from slam.compare.trial import failure, result_files, run_trial
@@ -84,6 +85,14 @@ def test_two_workers_one_killed_half_way_leave_the_same_tables(done, tmp_path):
     assert tables(tmp_path) == tables(done[0])
 
 
+@pytest.mark.filterwarnings("default")  # Dask's own
+def test_a_cluster_leaves_the_same_tables(done, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        write_tables(PLAN, sweep(PLAN, tmp_path, DaskScheduler(cluster.scheduler_address)), tmp_path)
+    assert tables(tmp_path) == tables(done[0])
+
+
 def test_what_is_done_is_not_done_again_and_what_is_not_is(done, tmp_path):
     out = tmp_path / "again"
     shutil.copytree(done[0], out)
@@ -151,6 +160,9 @@ def test_a_folder_with_other_runs_is_left_alone(done, tmp_path):
     tree["versions"]["numpy"] = "0.1"
     (out / SWEEP).write_text(json.dumps(tree))
     with pytest.raises(SlamError, match=r"numpy 0\.1"):
+        sweep(PLAN, out, LocalScheduler(1))
+    (out / SWEEP).write_text(json.dumps({**tree, "versions": {**tree["versions"], **running_code(), "code": "other"}}))
+    with pytest.raises(SlamError, match="code other"):
         sweep(PLAN, out, LocalScheduler(1))
 
 

@@ -9,7 +9,10 @@ from slam.se3 import so3_log
 
 
 class FitBackend:
-    """Delegates to a back end; `update_objects` takes the guess as the estimate and its change as the velocity."""
+    """Delegates to a back end; `update_objects` takes the guess as the estimate and its change as the velocity.
+
+    As the real ones do, it has a frame of its own for every body: at the first sight the axes are the world's.
+    """
 
     def __init__(self, backend):
         self.backend = backend
@@ -33,8 +36,11 @@ class FitBackend:
                 T, velocity = last.T_world_object.copy(), last.velocity
                 T[:3, 3] += dt * velocity[3:]
             else:
-                T, velocity = seen[id].T_world_object, np.zeros(6)
-                if last is not None:
+                T, velocity = seen[id].T_world_object.copy(), np.zeros(6)
+                if last is None:
+                    T[:3, :3] = np.eye(3)
+                    T[:3, 3] += 0.05
+                else:
                     turn = so3_log(T[:3, :3] @ last.T_world_object[:3, :3].T)
                     shift = T[:3, 3] - last.T_world_object[:3, 3]
                     velocity = 0.7 * last.velocity + 0.3 * np.concatenate([turn, shift]) / dt

@@ -52,7 +52,7 @@ def seen_from(poses: Array, local: Array, seed: int) -> Array:
 def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
     """A settled body with these poses whose members are these rows."""
     body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    body = replace(body, T=poses[SLOT], T_first=poses[0], history=poses, seen=50, proved=True)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, proved=True)
     membership.enter(body, tracks, members, sure=True)
     return with_extent(body, tracks.local[members])
 
@@ -96,7 +96,7 @@ def test_a_group_is_part_of_a_body_only_where_it_has_no_motion_of_its_own(veloci
     whole = body_along(poses, np.arange(10), tracks)
     group = np.arange(10, 16)
     own = new_body(2, path(velocity)[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    own = membership.fitted(replace(own, history=path(velocity)), tracks, group, TIMES, SLOT)
+    own = membership.fitted(replace(own, history=path(velocity)), tracks, group, SLOT)
     assert (membership.overlapped({1: whole}, tracks, group, own) is whole) == same
 
 
@@ -106,7 +106,7 @@ def test_poses_fitted_to_still_points_prove_nothing() -> None:
     for seed in range(20):
         tracks = table(seen_from(STILL, corners(6, seed) + AHEAD, 100 + seed))
         body = new_body(1, AHEAD, np.zeros(6), TIMES, 0.0, 0.0)
-        body = membership.fitted(body, tracks, np.arange(6), TIMES, SLOT)
+        body = membership.fitted(body, tracks, np.arange(6), SLOT)
         membership.enter(body, tracks, np.arange(6), sure=True)
         gain = membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1]
         kept = membership.proved(body, gain)
@@ -117,7 +117,7 @@ def test_poses_fitted_to_still_points_prove_nothing() -> None:
 def test_poses_fitted_to_moving_points_prove_a_body() -> None:
     tracks = table(seen_from(path(MOVING), corners(6, 7), 8))
     body = new_body(1, AHEAD, MOVING, TIMES, 0.0, 0.0)
-    body = membership.fitted(body, tracks, np.arange(6), TIMES, SLOT)
+    body = membership.fitted(body, tracks, np.arange(6), SLOT)
     membership.enter(body, tracks, np.arange(6), sure=True)
     kept = membership.proved(body, membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1])
     assert kept is not None and kept.proved

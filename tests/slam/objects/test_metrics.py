@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from slam.objects.metrics import absolute_pose_errors, body_alignment, motion_errors, object_nees
-from slam.se3 import exp
+from slam.objects.data import MovingObject, ObjectEstimate
+from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, motion_errors, object_nees
+from slam.se3 import exp, inverse
 
 RNG = np.random.default_rng(0)
 TRUE = np.array([exp(np.array([0.02 * k, 0.01 * k, 0, 0.05 * k, 0, 1 + 0.01 * k])) for k in range(20)])
@@ -52,3 +55,24 @@ def test_nees_leaves_out_what_is_numerically_singular():
     covariances = np.array([np.zeros((6, 6)), small, certain, one, np.eye(6)])
     values = object_nees(np.repeat(TRUE[:1], 5, axis=0), covariances, np.repeat(TRUE[:1], 5, axis=0))
     np.testing.assert_allclose(values, np.zeros(2), atol=1e-3)
+
+
+def test_nees_counts_from_where_a_body_was_found_though_it_is_reported_later():
+    """An error that was there at the first report already is an error of the motion since the body was found."""
+    stamps, sigma = np.arange(20) / 30.0, 0.01
+    score = ObjectScore(TRUE[None], stamps, np.tile(np.eye(4), (20, 1, 1)), 300.0)
+    found = TRUE[3] @ CHANGE
+    for k in range(6, 20):
+        T = TRUE[k] @ CHANGE @ exp(sigma * np.ones(6))
+        estimate = ObjectEstimate(
+            1, stamps[k], T, sigma**2 * np.eye(6), np.zeros(6), np.eye(6), True, np.arange(4), np.zeros(0, np.int64)
+        )
+        thing = MovingObject(
+            1, np.arange(4), estimate, np.eye(4), T @ inverse(found), np.zeros((2, 3)), True, stamps[3]
+        )
+        result = SimpleNamespace(
+            estimate=SimpleNamespace(T_world_left=np.eye(4)), objects=(thing,), moving_features=np.arange(4),
+            features=SimpleNamespace(has_stereo=np.ones(4, bool)),
+        )  # fmt: skip
+        score.add(k, result, np.ones(4, np.int64))
+    np.testing.assert_allclose(score.body(1)["mean NEES"], 6.0, rtol=1e-6)

@@ -1,0 +1,250 @@
+"""Compiled loops of a body's window: its normal equations, factor by factor.
+
+See `backends.smoother.objects_factors` for the unknowns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.compilation import helper, kernel
+
+_FRAME = 12
+_NEAREST = 1e-6  # no depth below this [m] is projected
+_SMALL = 1e-6  # sine of an angle below which series are exact
+
+
+@helper
+def _turn(R, w, inverse_J):
+    """Rotation vector w (3,) of a rotation by less than a half turn, and its inverse left Jacobian (3, 3)."""
+    a, b, c = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    sine = np.sqrt(a * a + b * b + c * c)
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1))
+    scale, bend = 1.0, 1 / 12
+    if not sine < _SMALL:
+        scale, half = angle / sine, 0.5 * angle
+        bend = (1 - half / np.tan(half)) / (4 * half * half)
+    x, y, z = scale * a, scale * b, scale * c
+    w[0], w[1], w[2] = x, y, z
+    square = x * x + y * y + z * z
+    for i in range(3):
+        for j in range(3):
+            inverse_J[i, j] = bend * w[i] * w[j]
+        inverse_J[i, i] += 1 - bend * square
+    inverse_J[0, 1] += 0.5 * z
+    inverse_J[0, 2] -= 0.5 * y
+    inverse_J[1, 0] -= 0.5 * z
+    inverse_J[1, 2] += 0.5 * x
+    inverse_J[2, 0] += 0.5 * y
+    inverse_J[2, 1] -= 0.5 * x
+
+
+@helper
+def _between(A, B, out):
+    """``A⁻¹ B`` of poses (4, 4)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
+        out[i, 3] = A[0, i] * (B[0, 3] - A[0, 3]) + A[1, i] * (B[1, 3] - A[1, 3]) + A[2, i] * (B[2, 3] - A[2, 3])
+
+
+# ---------------------------------------------------------------------------------------------- measurements
+
+
+@kernel
+def add_measurements(H, g, camera, R_left, sigma, z, Y, points, first_point):
+    """Add measurements to the information H and the vector g.
+
+    Args:
+        H: (U, U), changed in place.
+        g: (U,), changed in place.
+        camera: f, u0, v0, baseline (4,) of the rectified rig.
+        R_left: rotation (3, 3) from left-camera to rectified coordinates.
+        sigma: pixel noise [px].
+        z: (n, p, 3), NaN where there is none.
+        Y: poses (n, 4, 4) of the body in the camera.
+        points: in body coordinates (p, 3).
+        first_point: where the points' unknowns begin.
+    """
+    f, u0, v0, baseline = camera
+    h, q, r = np.empty(3), np.empty(3), np.empty(3)
+    J, G = np.empty((3, 3)), np.empty((3, _FRAME))
+    for i in range(len(z)):
+        R, start = Y[i], _FRAME * i
+        for j in range(len(points)):
+            if np.isnan(z[i, j, 0]) and np.isnan(z[i, j, 1]) and np.isnan(z[i, j, 2]):
+                continue
+            for k in range(3):
+                h[k] = R[k, 0] * points[j, 0] + R[k, 1] * points[j, 1] + R[k, 2] * points[j, 2] + R[k, 3]
+            for k in range(3):
+                q[k] = R_left[k, 0] * h[0] + R_left[k, 1] * h[1] + R_left[k, 2] * h[2]
+            if not q[2] >= _NEAREST:
+                continue
+            w = 1 / q[2]
+            scale = f * w
+            left, row = scale * q[0], scale * q[1]
+            right = left - scale * baseline
+            r[0], r[1], r[2] = z[i, j, 0] - u0 - left, z[i, j, 1] - v0 - row, z[i, j, 2] - u0 - right
+            for k in range(3):
+                J[0, k] = (scale * R_left[0, k] - left * w * R_left[2, k]) / sigma
+                J[1, k] = (scale * R_left[1, k] - row * w * R_left[2, k]) / sigma
+                J[2, k] = (scale * R_left[0, k] - right * w * R_left[2, k]) / sigma
+                r[k] /= sigma
+            for k in range(3):
+                if not np.isfinite(r[k]):
+                    r[k] = 0.0
+                    J[k] = 0.0
+                _derivatives(J[k], R, points[j], h, G[k])
+            _add(H, g, G, r, start, first_point + 3 * j)
+
+
+@helper
+def _derivatives(J, R, point, h, out):
+    """Derivatives (12,) by body pose and camera pose of what has the derivatives J (3,) by the point h in the camera.
+
+    Those by the point in the body stand at 3 to 5.
+    """
+    for k in range(3):
+        out[3 + k] = J[0] * R[0, k] + J[1] * R[1, k] + J[2] * R[2, k]
+        out[9 + k] = -J[k]
+    out[0] = out[5] * point[1] - out[4] * point[2]
+    out[1] = out[3] * point[2] - out[5] * point[0]
+    out[2] = out[4] * point[0] - out[3] * point[1]
+    out[6] = J[1] * h[2] - J[2] * h[1]
+    out[7] = J[2] * h[0] - J[0] * h[2]
+    out[8] = J[0] * h[1] - J[1] * h[0]
+
+
+@helper
+def _add(H, g, G, r, start, own):
+    """Three residuals r with derivatives G (3, 12) by a frame's unknowns at `start`, and by a point's at `own`."""
+    for a in range(_FRAME):
+        g[start + a] += G[0, a] * r[0] + G[1, a] * r[1] + G[2, a] * r[2]
+        for b in range(_FRAME):
+            H[start + a, start + b] += G[0, a] * G[0, b] + G[1, a] * G[1, b] + G[2, a] * G[2, b]
+        for b in range(3):
+            cross = G[0, a] * G[0, 3 + b] + G[1, a] * G[1, 3 + b] + G[2, a] * G[2, 3 + b]
+            H[start + a, own + b] += cross
+            H[own + b, start + a] += cross
+    for a in range(3):
+        g[own + a] += G[0, 3 + a] * r[0] + G[1, 3 + a] * r[1] + G[2, 3 + a] * r[2]
+        for b in range(3):
+            H[own + a, own + b] += G[0, 3 + a] * G[0, 3 + b] + G[1, 3 + a] * G[1, 3 + b] + G[2, 3 + a] * G[2, 3 + b]
+
+
+# ---------------------------------------------------------------------------------------------- motion
+
+
+@kernel
+def velocities(T, stamps):
+    """Velocities [ω, v] (n − 1, 6) between successive poses, with their derivatives (n − 1, 6, 6) by both poses."""
+    n = len(T) - 1
+    velocity, before, after = np.empty((n, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    turn, w, inverse_J = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for m in range(n):
+        A, B, per_second = T[m], T[m + 1], 1 / (stamps[m + 1] - stamps[m])
+        for i in range(3):
+            for j in range(3):
+                turn[i, j] = B[i, 0] * A[j, 0] + B[i, 1] * A[j, 1] + B[i, 2] * A[j, 2]
+        _turn(turn, w, inverse_J)
+        for i in range(3):
+            velocity[m, i] = w[i] * per_second
+            velocity[m, 3 + i] = (B[i, 3] - A[i, 3]) * per_second
+            for j in range(3):
+                for k in range(3):  # the right Jacobian is the transposed left one
+                    before[m, i, j] -= inverse_J[k, i] * A[k, j] * per_second
+                    after[m, i, j] += inverse_J[i, k] * B[k, j] * per_second
+                before[m, 3 + i, 3 + j] = -A[i, j] * per_second
+                after[m, 3 + i, 3 + j] = B[i, j] * per_second
+    return velocity, before, after
+
+
+@kernel
+def add_motion(H, g, velocity, before, after, sigmas, first, last):
+    """Add the steps from `first` up to `last` to the information H and the vector g: the velocity is that before.
+
+    Before step 0 it is zero.
+
+    Args:
+        H: (U, U), changed in place.
+        g: (U,), changed in place.
+        velocity: of each step (n − 1, 6).
+        before: derivatives (n − 1, 6, 6) by the earlier pose.
+        after: the same by the later one.
+        sigmas: standard deviations (n − 1, 6) of the change of velocity.
+        first: step.
+        last: the step after the last.
+    """
+    J = np.empty(18)
+    for m in range(first, last):
+        for k in range(6):
+            weight, change = 1 / sigmas[m, k], velocity[m, k]
+            for j in range(6):
+                J[6 + j], J[12 + j] = before[m, k, j], after[m, k, j]
+            if m > 0:
+                change -= velocity[m - 1, k]
+                for j in range(6):
+                    J[j] = -before[m - 1, k, j]
+                    J[6 + j] -= after[m - 1, k, j]
+            for a in range(0 if m > 0 else 6, 18):
+                J[a] *= weight
+            for a in range(0 if m > 0 else 6, 18):
+                row = _FRAME * (m - 1 + a // 6) + a % 6
+                g[row] -= J[a] * weight * change
+                for b in range(0 if m > 0 else 6, 18):
+                    H[row, _FRAME * (m - 1 + b // 6) + b % 6] += J[a] * J[b]
+
+
+# ---------------------------------------------------------------------------------------------- prior
+
+
+@kernel
+def relinearised(H, g, T0, X0, points0, T, X, points):
+    """A prior, linearised at T0, X0 (n, 4, 4), points0 (p, 3), for changes of T, X and points.
+
+    The points' part is one on where they are beside the oldest pose.
+
+    Returns the information (U, U) and the vector (U,).
+    """
+    n, first = len(T), _FRAME * len(T)
+    delta = np.empty(len(g))
+    D, w, inverse_J = np.empty((3, 4)), np.empty(3), np.empty((3, 3))
+    for m in range(n):
+        for at, (A, B) in enumerate(((T0[m], T[m]), (X0[m], X[m]))):
+            _between(A, B, D)
+            _turn(D, w, inverse_J)
+            start = _FRAME * m + 6 * at
+            for i in range(3):
+                delta[start + i] = w[i]
+                delta[start + 3 + i] = inverse_J[i, 0] * D[0, 3] + inverse_J[i, 1] * D[1, 3] + inverse_J[i, 2] * D[2, 3]
+    _between(T0[0], T[0], D)
+    for j in range(len(points)):
+        old, now, at = points0[j], points[j], first + 3 * j
+        for i in range(3):
+            delta[at + i] = D[i, 0] * now[0] + D[i, 1] * now[1] + D[i, 2] * now[2] + D[i, 3] - old[i] - delta[3 + i]
+        delta[at] += old[1] * delta[2] - old[2] * delta[1]
+        delta[at + 1] += old[2] * delta[0] - old[0] * delta[2]
+        delta[at + 2] += old[0] * delta[1] - old[1] * delta[0]
+    out, vector = H.copy(), g - H @ delta
+    # A turn of the frame moves a point by the cross product with where it is: only that has changed.
+    for j in range(len(points)):
+        at = first + 3 * j
+        x, y, z = points[j, 0] - points0[j, 0], points[j, 1] - points0[j, 1], points[j, 2] - points0[j, 2]
+        for i in range(len(out)):
+            a, b, c = out[i, at], out[i, at + 1], out[i, at + 2]
+            out[i, 0] -= b * z - c * y
+            out[i, 1] -= c * x - a * z
+            out[i, 2] -= a * y - b * x
+        a, b, c = vector[at], vector[at + 1], vector[at + 2]
+        vector[0] -= b * z - c * y
+        vector[1] -= c * x - a * z
+        vector[2] -= a * y - b * x
+    for j in range(len(points)):
+        at = first + 3 * j
+        x, y, z = points[j, 0] - points0[j, 0], points[j, 1] - points0[j, 1], points[j, 2] - points0[j, 2]
+        for i in range(len(out)):
+            a, b, c = out[at, i], out[at + 1, i], out[at + 2, i]
+            out[0, i] -= b * z - c * y
+            out[1, i] -= c * x - a * z
+            out[2, i] -= a * y - b * x
+    return out, vector

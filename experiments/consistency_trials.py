@@ -1,0 +1,205 @@
+"""Trials of the consistency experiment: one seed of a world, run through every back end, and the bound of its path.
+
+The world's own observations are given to all back ends, with true association, and each starts at a pose drawn from the
+prior about the true one.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+import backends
+from experiments.cramer_rao import pose_bounds
+from slam import se3
+from slam.data import Observations, Prediction
+from slam.metrics import nees, pose_residuals
+from slam.models import EstimatorModels, MotionModel, models_for
+from slam.replay import Recording
+from slam.se3 import Array
+from slam.worlds import open_world
+from slam.worlds.recording import true_recording, with_mismatches
+from slam.worlds.sequence import WorldSequence
+
+CASES = ("desk", "aisle", "drawn")
+BACKENDS = ("ekf", "smoother")
+DRAWN = MotionModel(acceleration=0.15, angular_acceleration=0.15)
+WRONG = 0.1  # share of wrong matches
+_BOUNDS = 4  # frames at which the online bound is computed
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one back end made of one recording of F frames.
+
+    Attributes:
+        online: errors of the newest pose (F, 6), [rotation, translation].
+        final: errors of the whole path at the end (F, 6).
+        nees: of the newest pose (F,).
+        nis, dof: of the updates (F,), 0 where there was none.
+        pixel: squared distance of one landmark's left pixel from its prediction (F,), two degrees of freedom.
+        landmark: mean NEES of the landmarks at the end, three degrees of freedom.
+        rejected: share of the observations that were rejected.
+    """
+
+    online: Array
+    final: Array
+    nees: Array
+    nis: Array
+    dof: Array
+    pixel: Array
+    landmark: float
+    rejected: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One seed of a case: the runs by back end, without and with wrong matches, and the bounds.
+
+    Attributes:
+        runs, spoilt: by the back end's name.
+        checked: frames (B,) of the online bound.
+        online_bound: least covariances (B, 6, 6) of the newest pose.
+        final_bound: least covariances (F, 6, 6) of the whole path.
+    """
+
+    runs: dict[str, Run]
+    spoilt: dict[str, Run]
+    checked: np.ndarray
+    online_bound: Array
+    final_bound: Array
+
+
+def simulated(case: str, seed: int, frames: int) -> tuple[Recording, WorldSequence]:
+    """A recording of a case, in the world's own coordinates, and the world."""
+    world = "desk" if case == "drawn" else case
+    sequence = open_world(f"{world}?frames={frames}&seed={seed}&outliers=0")
+    models = replace(models_for(sequence.kind), pixel_sigma=sequence.values["sigma"])
+    rng = np.random.default_rng([seed, 77])
+    if case == "drawn":
+        models = replace(models, motion=DRAWN, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.1)
+        path = drawn_path(sequence.world.T_world_left[0], sequence.world.stamps, models, rng)
+        sequence = WorldSequence(sequence.name, replace(sequence.world, T_world_left=path, seen={}), sequence.values)
+    sigma = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
+    start = sequence.ground_truth.poses[0] @ se3.exp(sigma * rng.standard_normal(6))
+    return true_recording(sequence, models=replace(models, T_world_left=start)), sequence
+
+
+def drawn_path(T: Array, stamps: Array, models: EstimatorModels, rng: np.random.Generator) -> Array:
+    """Poses (F, 4, 4) from T on whose velocities walk randomly as the models say."""
+    v = models.initial_velocity_sigma * rng.standard_normal(3)
+    w = models.initial_angular_velocity_sigma * rng.standard_normal(3)
+    poses = [T]
+    for dt in np.diff(stamps):
+        sigma_v, sigma_w = np.sqrt(models.motion.velocity_variance(dt))
+        v, w = v + sigma_v * rng.standard_normal(3), w + sigma_w * rng.standard_normal(3)
+        T = se3.pose(T[:3, :3] @ se3.so3_exp(w * dt), T[:3, 3] + v * dt)
+        poses.append(T)
+    return np.array(poses)
+
+
+def run(recording: Recording, points: Array, name: str, seed: int) -> Run:
+    """One back end on one recording; `points` (N, 3) are the true landmarks."""
+    backend = backends.create(name, recording.rig, models=recording.models)
+    rng, truth = np.random.default_rng([seed, 78]), recording.ground_truth
+    assert truth is not None
+    poses, covariances, nis, dof, pixel = [], [], [], [], []
+    rejected = given = 0
+    for frame in recording:
+        prediction = backend.predict(frame.stamp)
+        pixel.append(_pixel_distance(prediction, frame.observed, rng))
+        report = backend.update(frame.observed)
+        backend.add(frame.added)
+        estimate = backend.estimate(landmarks=False)
+        poses.append(estimate.T_world_left)
+        covariances.append(estimate.covariance)
+        nis.append(report.nis if report.dof else 0.0)
+        dof.append(report.dof)
+        rejected, given = rejected + len(report.rejected), given + len(frame.observed)
+    online = pose_residuals(np.array(poses), truth.poses)
+    last = backend.estimate()
+    landmark = nees(last.positions - points[last.ids], last.covariances).mean()
+    return Run(
+        online, pose_residuals(backend.trajectory().poses, truth.poses), nees(online, np.array(covariances)),
+        np.array(nis), np.array(dof), np.array(pixel), float(landmark), rejected / max(1, given),
+    )  # fmt: skip
+
+
+def _pixel_distance(prediction: Prediction, seen: Observations, rng: np.random.Generator) -> float:
+    """Squared distance of one landmark's left pixel from its prediction, NaN where none was in view."""
+    _, ours, theirs = np.intersect1d(prediction.ids, seen.ids, return_indices=True)
+    if not len(ours):
+        return np.nan
+    k = rng.integers(len(ours))
+    nu = seen.uv_left[theirs[k]] - prediction.uv_left[ours[k]]
+    return float(nu @ np.linalg.solve(prediction.innovation[ours[k]], nu))
+
+
+def trial(case: str, seed: int, frames: int, wrong: bool) -> Trial:
+    """All of one seed."""
+    recording, sequence = simulated(case, seed, frames)
+    points = sequence.landmarks.positions
+    runs = {name: run(recording, points, name, seed) for name in BACKENDS}
+    spoilt = with_mismatches(recording, WRONG, seed) if wrong else None
+    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name, seed) for name in BACKENDS}
+    seen = [_all_seen(f.observed, f.added) for f in recording]
+    truth = sequence.ground_truth
+
+    def bounds(count: int) -> Array:
+        return pose_bounds(recording.rig, recording.models, truth.stamps, truth.poses, points, seen[:count])
+
+    checked = np.unique(np.linspace(min(5, frames - 1), frames - 1, _BOUNDS).astype(int))
+    final = bounds(frames)
+    online = np.array([bounds(k + 1)[-1] for k in checked[:-1].tolist()] + [final[-1]])
+    return Trial(runs, runs_spoilt, checked, online, final)
+
+
+def _all_seen(observed: Observations, added: Observations) -> Observations:
+    parts = [np.concatenate([getattr(o, name) for o in (observed, added)]) for name in ("ids", "uv_left", "uv_right")]
+    return Observations(*parts)
+
+
+def trials(case: str, seeds: int, frames: int, wrong: int, kept: Path, resume: bool) -> list[Trial]:
+    """All seeds of a case, two at a time; the first `wrong` of them with wrong matches, too.
+
+    Each is written to the folder `kept` as soon as it is done; to `resume` is to take those that are there.
+    """
+    kept.mkdir(parents=True, exist_ok=True)
+    paths = [kept / f"{case}_{frames}_{seed}{'_wrong' if seed < wrong else ''}.npz" for seed in range(seeds)]
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        jobs = {
+            seed: pool.submit(kept_trial, path, case, seed, frames, seed < wrong)
+            for seed, path in enumerate(paths)
+            if not (resume and path.exists())
+        }
+        for job in jobs.values():
+            job.result()
+    return [read_trial(path) for path in paths]
+
+
+def kept_trial(path: Path, case: str, seed: int, frames: int, wrong: bool) -> None:
+    """`trial`, written to a file: whole or not at all."""
+    done, arrays = trial(case, seed, frames, wrong), {}
+    for kind, runs in (("runs", done.runs), ("spoilt", done.spoilt)):
+        for name, found in runs.items():
+            arrays.update({f"{kind}/{name}/{f.name}": getattr(found, f.name) for f in fields(Run)})
+    bounds = {"checked": done.checked, "online_bound": done.online_bound, "final_bound": done.final_bound}
+    partly = path.with_suffix(".part.npz")
+    np.savez(partly, **arrays, **bounds)
+    partly.replace(path)
+
+
+def read_trial(path: Path) -> Trial:
+    """What `kept_trial` has written."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    runs: dict[str, dict[str, dict[str, np.ndarray]]] = {"runs": {}, "spoilt": {}}
+    for key in [key for key in arrays if "/" in key]:
+        kind, name, what = key.split("/")
+        runs[kind].setdefault(name, {})[what] = arrays.pop(key)
+    made = {kind: {name: Run(**values) for name, values in found.items()} for kind, found in runs.items()}
+    return Trial(made["runs"], made["spoilt"], **arrays)

@@ -1,0 +1,112 @@
+"""Runs of worlds whose bodies are known: features and labels once a world, and what every back end makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+import slam
+from slam import registry
+from slam.config import SystemConfig
+from slam.data import FrameResult, StereoFeatures
+from slam.evaluation import consistency, evaluate
+from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.trajectory import Trajectory
+
+
+@lru_cache(maxsize=2)
+def seen_in(name: str, images: bool, frames: int) -> list[tuple[StereoFeatures, Any]]:
+    """Features of a synthetic world's first frames, from its images or simulated, and the body of each feature."""
+    sequence = slam.open_sequence(f"synthetic:{name}")
+    numbers = range(min(frames, len(sequence)))
+    if not images:
+        return [(s.features, s.objects) for s in map(sequence.simulate, numbers)]
+    options = SystemConfig.for_kind(sequence.kind, "surf", "ekf").frontend
+    frontend = registry.create("frontends", "surf", sequence.rig, **options)
+    found = [frontend.extract(sequence.frame(k)) for k in numbers]
+    return [(features, labels_in_images(sequence, k, features)) for k, features in enumerate(found)]
+
+
+def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:
+    frontend = "surf" if images else None
+    config = SystemConfig.for_kind(sequence.kind, frontend, backend).with_settings(settings)
+    return slam.StereoSlam(sequence.rig, frontend, backend, config=config)
+
+
+def steps(
+    name: str, system: slam.StereoSlam, images: bool, frames: int, without: bool = False
+) -> Iterator[tuple[int, FrameResult, Any]]:
+    """Every frame's number, result and labels; `without` leaves out the features on moving bodies."""
+    for k, (features, labels) in enumerate(seen_in(name, images, frames)):
+        if without:
+            keep = labels == 0 if images else labels <= 0  # features on its outline move with it
+            features, labels = features_where(features, keep), labels[keep]
+        yield k, system.process_features(features), labels
+
+
+def features_where(features: StereoFeatures, keep: Any) -> StereoFeatures:
+    """Those features (M) for which `keep` (N,) is true."""
+    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+    return replace(features, **{name: getattr(features, name)[keep] for name in names})
+
+
+def path_of(results: list[FrameResult]) -> Trajectory:
+    return Trajectory(
+        np.array([r.estimate.stamp for r in results]), np.array([r.estimate.T_world_left for r in results])
+    )
+
+
+def camera_figures(sequence: Any, results: list[FrameResult]) -> dict[str, float]:
+    path = path_of(results)
+    truth = consistency(path, np.array([r.estimate.covariance for r in results]), sequence)
+    return {"ATE [mm]": 1e3 * evaluate(path, sequence)["ATE RMSE [m]"], "camera NEES": truth["mean NEES"]}
+
+
+def scored_run(
+    name: str, backend: str, images: bool, frames: int, *settings: str
+) -> tuple[dict[str, Any], ObjectScore]:
+    """One run of a world: the score's figures, the camera's, and the detector's time; and the score."""
+    sequence = slam.open_sequence(f"synthetic:{name}")
+    score = score_for(sequence) or ObjectScore(
+        np.zeros((0, len(sequence), 4, 4)), sequence.stamps, sequence.ground_truth.poses, sequence.rig.left.fu
+    )
+    system = system_for(sequence, backend, images, list(settings))
+    results = []
+    for k, result, labels in steps(name, system, images, frames):
+        score.add(k, result, labels)
+        results.append(result)
+    summary = score.summary()
+    figures = {
+        "world": name,
+        "back end": backend,
+        **camera_figures(sequence, results),
+        **summary["features"],
+        "counted right": summary["counted right"],
+        "false objects [frames]": summary["false objects"],
+        "objects [ms]": float(np.median([r.milliseconds["objects"] for r in results])),
+        "bodies": summary["bodies"],
+    }
+    return figures, score
+
+
+def body_row(world: str, backend: str, number: str, body: dict[str, Any]) -> dict[str, Any]:
+    """A table's row of one body's figures."""
+    found = {"rotation median [deg]": None, "translation median [m]": None}
+    me, absolute = body.get("ME") or found, body.get("absolute") or found
+    return {
+        "world": world, "back end": backend, "body": number,
+        "frames in view": body["frames in view"], "coverage": body["coverage"],
+        "ids": len(body["ids"]), "delay [frames]": body.get("delay [frames]"),
+        "ME [deg]": me["rotation median [deg]"], "ME [mm]": millimetres(me["translation median [m]"]),
+        "absolute [deg]": absolute["rotation median [deg]"],
+        "absolute [mm]": millimetres(absolute["translation median [m]"]),
+        "NEES": body.get("mean NEES"),
+    }  # fmt: skip
+
+
+def millimetres(metres: float | None) -> float | None:
+    return None if metres is None else 1e3 * metres

@@ -1,0 +1,272 @@
+"""What a run is worth in numbers: gathered frame by frame, summed up at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+
+from slam.alignment import Alignment
+from slam.association_truth import SurfacePoints, TrueWorld
+from slam.compare.measure import object_figures
+from slam.data import FrameResult, FrameStatus, IdArray
+from slam.errors import TrajectoryError
+from slam.evaluation import consistency, evaluate
+from slam.metrics import associate, nees, pose_residuals, relative_errors
+from slam.se3 import Array, inverse, nearest_rotation, rotation_angle
+from slam.sequences import Sequence
+from slam.trajectory import Trajectory
+
+_TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
+_RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
+_SECONDS = 1.0  # of RPE by time
+
+SERIES_COLUMNS = (
+    "frame", "stamp", "error_x", "error_y", "error_z", "sd_x", "sd_y", "sd_z", "error_rotation",
+    "nees", "nis", "nis_dof", "map_size",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A finished run in numbers.
+
+    Attributes:
+        metrics: by key of `slam.compare.measure.METRICS`, and ``object …`` figures; what cannot be said of this
+            sequence is left out.
+        milliseconds: median per stage and ``total`` over all frames but the first.
+        series: a row per frame of `SERIES_COLUMNS`; NaN where there is no truth.
+    """
+
+    metrics: dict[str, float]
+    milliseconds: dict[str, float]
+    series: Array
+
+
+@dataclass
+class Collector:
+    """Takes in the results of a run frame by frame.
+
+    Args:
+        sequence: what is run.
+        start: number of the first frame.
+        score: check associations against the truth, where there is one. (Replayed ones are the same for all.)
+    """
+
+    sequence: Sequence
+    start: int = 0
+    score: bool = True
+
+    def __post_init__(self) -> None:
+        world = self.sequence if self.sequence.format == "synthetic" else None
+        self._truth = None if world is None else SurfacePoints(cast(TrueWorld, world))
+        self._frames: list[_Frame] = []
+        self._lifetimes = Lifetimes()
+        self._right = self._wrong = 0
+
+    def add(self, result: FrameResult) -> None:
+        """One more frame."""
+        number, features, report = self.start + result.index, result.features, result.report
+        if self._truth is not None:
+            if self.score:
+                errors = self._truth.errors(number, result.matched, features.uv_left[result.matched_features])
+                self._right += int((errors < _RIGHT).sum())
+                self._wrong += int((errors >= _RIGHT).sum())
+            self._truth.add(number, result.added, features.uv_left[result.added_features])
+        self._lifetimes.add(result)
+        e = result.estimate
+        self._frames.append(
+            _Frame(
+                number,
+                e.stamp,
+                e.T_world_left,
+                e.covariance,
+                result.status,
+                report.nis,
+                report.dof,
+                len(report.used),
+                result.map_size,
+                dict(result.milliseconds),
+            )
+        )
+
+    def finish(self, final: Trajectory, ids: IdArray, positions: Array, summary: Mapping[str, Any]) -> Measured:
+        """All figures.
+
+        Args:
+            final: the last word on the path.
+            ids: landmarks in the map at the end (N,).
+            positions: where they are (N, 3) [m].
+            summary: of the run, for what it says of objects; may be empty.
+        """
+        frames = self._frames
+        if not frames:
+            return Measured({}, {}, np.zeros((0, len(SERIES_COLUMNS))))
+        online = Trajectory(np.array([f.stamp for f in frames]), np.array([f.pose for f in frames]))
+        covariances = np.array([f.covariance for f in frames])
+        metrics = {
+            **_accuracy(online, final, self.sequence),
+            **_consistency(online, covariances, self.sequence, frames),
+            **self._landmark_errors(final, ids, positions),
+            **self._map_figures(),
+            **object_figures(summary),
+        }
+        metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
+        return Measured(metrics, _milliseconds(frames), _series(online, covariances, self.sequence, frames))
+
+    def _landmark_errors(self, final: Trajectory, ids: IdArray, positions: Array) -> dict[str, float]:
+        """Distances of the map's landmarks from the surface points they are, after the alignment of the poses."""
+        pairs = _common(final, self.sequence)
+        if self._truth is None or pairs is None or not len(ids):
+            return {}
+        errors = np.linalg.norm(_align_poses(*pairs).apply(positions) - self._truth.positions(ids), axis=1)
+        errors = errors[np.isfinite(errors)]
+        if not len(errors):
+            return {}
+        return {
+            "landmark_error_m": float(np.median(errors)),
+            "landmark_error_90_m": float(np.quantile(errors, 0.9)),
+        }
+
+    def _map_figures(self) -> dict[str, float]:
+        """Size of the map and lifetimes."""
+        frames = self._frames
+        scored = self._right + self._wrong
+        tracked = sum(f.status in (FrameStatus.TRACKED, FrameStatus.STARTED) for f in frames)
+        return {
+            "association_precision": self._right / scored if scored else float("nan"),
+            "tracked": tracked / len(frames),
+            "map_size": float(np.mean([f.map_size for f in frames])),
+            **self._lifetimes.figures(),
+            "used_per_frame": float(np.mean([f.used for f in frames])),
+        }
+
+
+class Lifetimes:
+    """How long landmarks stay in the map; those still in it have lived until the last frame."""
+
+    def __init__(self) -> None:
+        self._first: dict[int, int] = {}
+        self._ended: list[int] = []
+        self._last = 0
+
+    def add(self, result: FrameResult) -> None:
+        """One more frame."""
+        self._last = result.index
+        for i in result.added.tolist():
+            self._first[i] = result.index
+        for i in result.erased.tolist():
+            self._ended.append(result.index - self._first.pop(i))
+
+    def figures(self) -> dict[str, float]:
+        """Median and mean in frames; none where there was no landmark."""
+        lived = [*self._ended, *(self._last - first for first in self._first.values())]
+        if not lived:
+            return {}
+        return {"lifetime_frames": float(np.median(lived)), "lifetime_mean_frames": float(np.mean(lived))}
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What is kept of one frame."""
+
+    number: int
+    stamp: float
+    pose: Array
+    covariance: Array
+    status: FrameStatus
+    nis: float
+    dof: int
+    used: int
+    map_size: int
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+
+def _common(path: Trajectory, sequence: Sequence) -> tuple[Trajectory, Trajectory] | None:
+    """Estimated and true path at common stamps; None where fewer than 3 poses have truth."""
+    if sequence.ground_truth is None or not len(path):
+        return None
+    try:
+        own, true = associate(path, sequence.ground_truth, _TOLERANCE, interpolated=True)
+    except TrajectoryError:  # nothing overlaps: no figure, which is no fault of the run
+        return None
+    return (own, true) if len(own) >= 3 else None
+
+
+def _align_poses(own: Trajectory, true: Trajectory) -> Alignment:
+    """The rigid motion that takes an estimated path to the true one, turned by its orientations.
+
+    Positions alone would not do: those of a camera that hardly moves leave the turn open, which moves what is far away.
+    """
+    turns = true.poses[:, :3, :3] @ np.swapaxes(own.poses[:, :3, :3], 1, 2)
+    R = nearest_rotation(turns.mean(axis=0))
+    return Alignment(R, (true.positions - own.positions @ R.T).mean(axis=0), 1.0, 3)
+
+
+def _accuracy(online: Trajectory, final: Trajectory, sequence: Sequence) -> dict[str, float]:
+    """ATE, RPE by distance and by time, and the distance from a GPS track."""
+    first, last = evaluate(online, sequence), evaluate(final, sequence)
+    names = {
+        "ate_online_m": first.get("ATE RMSE [m]"),
+        "ate_final_m": last.get("ATE RMSE [m]"),
+        "segment_percent": first.get("segment error [%]"),
+        "gps_m": first.get("GPS distance RMSE [m]"),
+    }
+    figures = {key: value for key, value in names.items() if value is not None}
+    pairs = _common(online, sequence)
+    if pairs is not None:
+        figures.update(_over_a_second(*pairs))
+    return figures
+
+
+def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
+    """RPE over as many frames as come nearest to a second; nothing for a shorter path."""
+    delta = max(1, round(_SECONDS / float(np.median(np.diff(own.stamps)))))
+    if len(own) <= delta:
+        return {}
+    errors = relative_errors(own, true, delta)
+    return {"rpe_1s_m": errors.translation_statistics.rmse, "rpe_1s_deg": errors.rotation_statistics.rmse}
+
+
+def _consistency(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> dict[str, float]:
+    figures = {}
+    honesty = consistency(online, covariances, sequence)
+    if "mean NEES" in honesty:
+        figures["nees_per_dof"] = honesty["mean NEES"] / 6
+    dof = sum(f.dof for f in frames)
+    if dof:
+        figures["nis_per_dof"] = sum(f.nis for f in frames if f.dof) / dof
+    return figures
+
+
+def _milliseconds(frames: list[_Frame]) -> dict[str, float]:
+    """Median per stage, and of their sum, over all frames but the first, which may wait for compilers."""
+    later = [f.milliseconds for f in frames[1:]] or [frames[0].milliseconds]
+    stages = list(dict.fromkeys(stage for m in later for stage in m))
+    medians = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in stages}
+    return {**medians, "total": float(np.median([sum(m.values()) for m in later]))}
+
+
+def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> Array:
+    """Error, claimed deviations, NEES and NIS of every frame, relative to the first pose: rows of `SERIES_COLUMNS`."""
+    rows = np.full((len(frames), len(SERIES_COLUMNS)), np.nan)
+    rows[:, 0] = [f.number for f in frames]
+    rows[:, 1] = online.stamps
+    R, P = online.poses[:, :3, :3], covariances[:, 3:, 3:]
+    rows[:, 5:8] = np.sqrt(np.maximum(np.diagonal(R @ P @ np.swapaxes(R, 1, 2), axis1=1, axis2=2), 0))
+    rows[:, 10:13] = [(f.nis, f.dof, f.map_size) for f in frames]
+    pairs = _common(online, sequence)
+    if pairs is None:
+        return rows
+    own, true = pairs
+    at = np.searchsorted(online.stamps, own.stamps)
+    expected = own.poses[0] @ inverse(true.poses[0]) @ true.poses
+    rows[at, 2:5] = own.positions - expected[:, :3, 3]
+    rows[at, 8] = rotation_angle(np.swapaxes(expected[:, :3, :3], 1, 2) @ own.poses[:, :3, :3])
+    if len(at) > 1 and at[0] == 0:
+        with suppress(TrajectoryError):  # a covariance that is none stays not a number
+            rows[at[1:], 9] = nees(pose_residuals(own.poses, expected)[1:], covariances[at[1:]])
+    return rows
