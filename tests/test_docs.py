@@ -14,6 +14,8 @@ from slam.interfaces import Backend
 from slam.metrics import absolute_errors
 
 DOCS = Path(__file__).parent.parent / "docs"
+#: Sections of the results page that the README quotes.
+SECTIONS = ("The bookshelf aisle", "Do the back ends know", "Moving box")
 
 
 def pose_fit():
@@ -100,3 +102,29 @@ def test_the_figures_in_the_readme_are_those_of_the_results_page():
         for cell, value in zip(cells, own):
             digits = len(cell.partition(".")[2])
             assert cell == (f"{float(value):.{digits}f}" if digits else value), (name, backend, cell, value)
+
+
+def test_the_figures_of_worlds_in_the_readme_are_those_of_the_results_page():
+    page = (DOCS / "results.md").read_text(encoding="utf-8")
+    section = {text.split("\n")[0]: text for text in page.split("\n## ")}
+    of = {name: next(text for title, text in section.items() if title.startswith(name)) for name in SECTIONS}
+    aisle = {row[0]: row for row in table_rows(of["The bookshelf aisle"], 11)}
+    consistency = table_rows(of["Do the back ends know"], 10)
+    nees = table_rows(of["Do the back ends know"], 8)
+    bodies = {row[1]: row for row in table_rows(of["Moving box"], 12) if row[0].startswith("box?") and row[2] == "1"}
+    cars = [row for row in table_rows(of["Moving box"], 10) if row[2] in ("0", "1") and row[4] not in ("1", "–")]
+    worlds = ("desk", "aisle")
+    for column, backend in ((1, "ekf"), (2, "smoother")):
+        bound = [row[3] for world in worlds for row in consistency if row[:2] == [world, backend]]
+        honest = [f"{float(row[2].split()[0]):.1f}" for world in worlds for row in nees if row[:2] == [world, backend]]
+        body = bodies[backend]
+        speeds = [f"{float(row[7]):.1f} %" for row in cars if row[0] == backend]
+        expected = [
+            f"{aisle[backend][2]}, {aisle[backend][3]} cm",
+            ", ".join(bound),
+            ", ".join(honest),
+            f"{float(body[7]):.2f}°, {float(body[8]):.1f} mm",
+            ", ".join(speeds),
+        ]
+        readme = table_rows((DOCS.parent / "README.md").read_text(encoding="utf-8"), 3)
+        assert [row[column] for row in readme if row[1] != "ekf"] == expected

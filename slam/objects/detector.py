@@ -29,7 +29,7 @@ from slam.rig import StereoRig
 from slam.se3 import Array, inverse, transform
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
-_YOUNG = 24  # frames in which a body turns out to be a part of another at once; later after so many
+_MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
@@ -231,7 +231,7 @@ class MovingObjectDetector:
                 alike = body.alike + 1 if whole is not None else 0
                 if alike != body.alike:
                     self.bodies[body.id] = replace(body, alike=alike)
-                if whole is not None and (body.seen < _YOUNG or alike > _YOUNG):
+                if whole is not None and (body.seen < _MERGES or alike > _MERGES):
                     membership.enter(whole, tracks, mine, sure=True)
                     self._forget(body.id)
 

@@ -253,29 +253,25 @@ def window_tests(starts, tracks, L, eta, weight, brought, rest, asked, support, 
     gap, motion, left, right = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
     values, clear = np.full(len(starts) - 1, -np.inf), np.full(len(starts) - 1, -np.inf)
     for m in range(len(values)):
+        own_tracks = tracks[starts[m] : starts[m + 1]]
         size, most = 0, 0.0
-        for k in range(starts[m], starts[m + 1]):
-            if rest[tracks[k]]:
+        for n in own_tracks:
+            if rest[n]:
                 size += 1
-                most += brought[tracks[k]]
+                most += brought[n]
         if size < support or size > largest or most <= asked[size]:
             continue
         inside[:], told_inside[:] = 0.0, 0.0
-        for k in range(starts[m], starts[m + 1]):
-            n = tracks[k]
+        for n in own_tracks:
             if rest[n]:
                 _add_weighted(inside, L[n], weight[n])
                 _add_weighted(told_inside, eta[n], weight[n])
-        for k in range(21):
-            outside[k] = total[k] - inside[k]
-        for i in range(6):
-            told_outside[i] = told[i] - told_inside[i]
+        outside[:], told_outside[:] = total - inside, told - told_inside
         _factorise(inside, prior, own)
         _factorise(outside, prior, other)
         _solve(own, told_inside, gap)
         _solve(other, told_outside, motion)
-        for i in range(6):
-            gap[i] -= motion[i]
+        gap -= motion
         _times(inside, prior, gap, left)
         _times(outside, prior, gap, right)
         _solve(both, right, motion)
