@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from slam import registry
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
-from slam.rig import StereoRig
 
 
 def names() -> list[str]:

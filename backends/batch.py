@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backends.smoother import SmootherBackend
+from backends.smoother.measurement_log import IndexArray
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
-from backends.smoother.records import IndexArray
 from backends.smoother.solver import FAILURES, Change
 from backends.smoother.variables import landmark_key, pose_key
-from slam.blas import one_blas_thread
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.errors import ConfigurationError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, transform
+from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.rig import StereoRig
-from slam.se3 import Array, transform
-from slam.trajectory import Trajectory
+from slam.runtime.blas import one_blas_thread
 
 _ITERATIONS = 100
 
@@ -105,7 +105,7 @@ class BatchBackend:
         if not (landmarks or self.online or self._solution is not None):
             return rough
         solution = self._solved()
-        marks = self._smoother.records.landmarks
+        marks = self._smoother.measurement_log.landmarks
         slots = marks.slots(rough.ids)
         positions, covariances = rough.positions.copy(), rough.covariances.copy()
         for row, serial in enumerate(marks.serial[slots].tolist()):
@@ -142,26 +142,28 @@ class _Solution:
 
     def __init__(self, smoother: SmootherBackend) -> None:
         change = Change()
-        make, records = smoother.factor_maker, smoother.records
-        add_poses(change, make, records)
+        make, measurement_log = smoother.factor_maker, smoother.measurement_log
+        add_poses(change, make, measurement_log)
         self.landmarks: set[int] = set()
-        for serial, rows in _by_landmark(records.measurements.landmark, records.history.known):
-            known = records.history.known.get(serial)
+        for serial, rows in _by_landmark(measurement_log.measurements.landmark, measurement_log.history.known):
+            known = measurement_log.history.known.get(serial)
             if known is not None:
-                T = np.eye(4) if known.frame is None else records.path.poses[known.frame]
-                add_landmark(change, make, records, landmark_key(serial), rows, transform(T, known.position[None])[0])
+                T = np.eye(4) if known.frame is None else measurement_log.path.poses[known.frame]
+                add_landmark(
+                    change, make, measurement_log, landmark_key(serial), rows, transform(T, known.position[None])[0]
+                )
                 change.factors.add(make.known(landmark_key(serial), known))
                 self.landmarks.add(serial)
                 continue
-            z = records.measurements.z[rows]
+            z = measurement_log.measurements.z[rows]
             nearest = int(np.nanargmax(z[:, 0] - z[:, 2]))  # its depth is known best
             local = make.stereo.triangulate(z[nearest : nearest + 1])
-            T = records.path.poses[records.measurements.frame[rows[nearest]]]
-            add_landmark(change, make, records, landmark_key(serial), rows, transform(T, local)[0])
+            T = measurement_log.path.poses[measurement_log.measurements.frame[rows[nearest]]]
+            add_landmark(change, make, measurement_log, landmark_key(serial), rows, transform(T, local)[0])
             self.landmarks.add(serial)
         self._factors = change.factors
         self.values = optimise(change, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(records.path.count)])
+        self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)])
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:

@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.long_run import DT, MODELS, RIG, Corridor, measured, run
-from slam import se3
+from slam.geometry import se3
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.se3 import Array
 
 
 def seconds(call: Callable[[], object]) -> float:

@@ -27,9 +27,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import slam
 from benchmarks.plain_surf import plain_descriptors
 from frontends.surf import Keypoints, Surf, SurfFrontend
-from slam import se3
 from slam.config import SystemConfig
-from slam.rig import StereoRig
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 
 SIZES = ((320, 240), (752, 480), (1241, 376))
 DATA = Path(os.environ["SLAM_DATA"]) if os.environ.get("SLAM_DATA") else None
@@ -349,7 +349,7 @@ import time; wall, cpu = time.perf_counter(), time.process_time()
 import numpy as np
 import frontends
 from slam.data import StereoFrame
-from slam.rig import StereoRig
+from slam.geometry.rig import StereoRig
 image = np.random.default_rng(0).integers(0, 255, (120, 188), np.uint8).repeat(4, 0).repeat(4, 1)
 frontend = frontends.create("surf", StereoRig.rectified_pair(450.0, 376.0, 240.0, 0.11, 752, 480))
 count = len(frontend.extract(StereoFrame(0, 0.0, image, image)))

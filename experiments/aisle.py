@@ -22,14 +22,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.tables import markdown, write_json
 from frontends import create
-from slam.association_truth import AssociationScore, SurfacePoints
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.evaluation.association_truth import AssociationScore, SurfacePoints
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
-from slam.runner import RunOptions, run
+from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.runner import RunOptions, run
 from slam.sequences import Sequence, open_sequence
-from slam.trajectory import Trajectory
 
 BACKENDS = ("ekf", "smoother")
 HEADER = (

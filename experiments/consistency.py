@@ -2,7 +2,7 @@
 
     python experiments/consistency.py [--quick] [--seeds N] [--frames N] [--resume] [--out DIR]
 
-Every run simulates a world's observations, gives the same to every back end (`slam.replay`), and starts it at a pose
+Every run simulates a world's observations, gives the same to every back end (`slam.run.replay`), and starts it at a pose
 drawn from the prior about the true one. Reported, over the runs:
 
 - RMSE of the poses against the posterior Cramér-Rao bound, online (newest pose) and final (whole path);
@@ -30,8 +30,8 @@ from scipy.stats import chi2
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.consistency_trials import BACKENDS, CASES, Trial, trials
-from slam.metrics import chi_square_band
-from slam.se3 import Array
+from slam.evaluation.metrics import chi_square_band
+from slam.geometry.se3 import Array
 
 
 def rms(errors: Array) -> float:

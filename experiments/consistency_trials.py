@@ -15,14 +15,14 @@ import numpy as np
 
 import backends
 from experiments.cramer_rao import pose_bounds
-from slam import se3
 from slam.data import Observations, Prediction
-from slam.metrics import nees, pose_residuals
+from slam.evaluation.metrics import nees, pose_residuals
+from slam.geometry import se3
+from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.replay import Recording
-from slam.se3 import Array
+from slam.run.replay import Recording
+from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.worlds import open_world
-from slam.worlds.recording import true_recording, with_mismatches
 from slam.worlds.sequence import WorldSequence
 
 CASES = ("desk", "aisle", "drawn")

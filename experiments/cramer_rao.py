@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.rig import StereoRig
-from slam.se3 import Array
 
 
 def pose_bounds(

@@ -3,7 +3,7 @@
     python experiments/faults.py [--quick] [--out DIR]
 
 Each fault on the rendered world ``desk``, both back ends. Prints a Markdown table: the sequence of states, the position
-error before and after the fault, how long it took to recognise the map again, and the share of right associations.
+error before and after the fault, how long it took to localize the map again, and the share of right associations.
 Draws the error frame by frame.
 """
 
@@ -23,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.tables import markdown, write_json
 from frontends import create
-from slam.association_truth import SurfacePoints
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.se3 import inverse
+from slam.evaluation.association_truth import SurfacePoints
+from slam.geometry.se3 import inverse
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.data import StereoFeatures
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 _COLOUR_SHIFT = 44.9  # the labels' boxes are of a camera to the right of the left one: shift by so much / z [px m]
 _NEAR = 3.0  # an object within so far of a labelled car, in the ground plane, is that car [m]

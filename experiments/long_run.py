@@ -32,13 +32,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
-from slam import se3
 from slam.data import IdArray, Observations
+from slam.evaluation.metrics import nees, pose_residuals
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.metrics import nees, pose_residuals
 from slam.models import EstimatorModels, MotionModel
-from slam.rig import StereoRig
-from slam.se3 import Array
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
 MODELS = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5)

@@ -39,10 +39,10 @@ from slam.compare.measure import Metric
 from slam.compare.statistics import difference
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
-from slam.evaluation import evaluate
+from slam.evaluation.summary import evaluate
+from slam.geometry.se3 import inverse, rotation_angle
 from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
-from slam.se3 import inverse, rotation_angle
 
 BACKENDS = ("ekf", "smoother")
 PARTS = ("table1", "moving", "paired", "boxes", "still", "street", "kitti")

@@ -31,10 +31,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.tables import markdown, write_json
 from frontends import create
-from slam.association_truth import surface_points
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
-from slam.se3 import Array, inverse, transform
+from slam.evaluation.association_truth import surface_points
+from slam.geometry.se3 import Array, inverse, transform
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 

@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.tables import markdown, write_json
 from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
-from slam.metrics import align, associate
-from slam.runner import RunOptions, run
+from slam.evaluation.metrics import align, associate
+from slam.geometry.trajectory import Trajectory
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
-from slam.trajectory import Trajectory
 
 SEQUENCES = {
     "KITTI odometry 06": "kitti_odometry/sequences/06",

@@ -25,13 +25,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.tables import markdown
-from slam import se3
 from slam.data import Observations
-from slam.metrics import absolute_errors, nees, pose_residuals
+from slam.evaluation.metrics import absolute_errors, nees, pose_residuals
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels, MotionModel
-from slam.rig import StereoRig
-from slam.se3 import Array
-from slam.trajectory import Trajectory
 
 FILE = "starry_night/steps_0_950.npz"
 PARTS = [(0, 300), (130, 950), (300, 950), (500, 950)]

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from backends import create
-from slam import se3
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
+from slam.geometry import se3
+from slam.mapping.map_io import SavedMap
 from slam.models import MotionModel
-from slam.saved_map import SavedMap
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 from slam.worlds.sequence import WorldSequence

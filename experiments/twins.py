@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from slam.data import Estimate, FrameResult, IdArray, Observations, Prediction, UpdateReport
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
-from slam.objects.data import ObjectEstimate, ObjectObservations
-from slam.se3 import Array
-from slam.trajectory import Trajectory
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 
 class Twins:

@@ -20,7 +20,7 @@ from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler, available_cores
 from slam.compare.sweep import Run, sweep
-from slam.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
 from slam.sequences import open_sequence
 
 HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",

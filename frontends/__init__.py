@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from slam import registry
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
-from slam.rig import StereoRig
 
 __all__ = ["create", "names"]
 

@@ -10,13 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from slam.rig import StereoRig as StereoRig
-    from slam.saved_map import SavedMap as SavedMap
-    from slam.saved_map import load_map as load_map
-    from slam.saved_map import save_map as save_map
+    from slam.geometry.rig import StereoRig as StereoRig
+    from slam.geometry.trajectory import Trajectory as Trajectory
+    from slam.mapping.map_io import SavedMap as SavedMap
+    from slam.mapping.map_io import load_map as load_map
+    from slam.mapping.map_io import save_map as save_map
     from slam.sequences import open_sequence as open_sequence
     from slam.system import StereoSlam as StereoSlam
-    from slam.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"
 
@@ -25,17 +25,17 @@ _PUBLIC = {
     "Estimate": "slam.data",
     "FrameResult": "slam.data",
     "Observations": "slam.data",
-    "PinholeCamera": "slam.camera",
-    "SavedMap": "slam.saved_map",
+    "PinholeCamera": "slam.geometry.camera",
+    "SavedMap": "slam.mapping.map_io",
     "SlamError": "slam.errors",
     "StereoFeatures": "slam.data",
     "StereoFrame": "slam.data",
-    "StereoRig": "slam.rig",
+    "StereoRig": "slam.geometry.rig",
     "StereoSlam": "slam.system",
-    "Trajectory": "slam.trajectory",
-    "load_map": "slam.saved_map",
+    "Trajectory": "slam.geometry.trajectory",
+    "load_map": "slam.mapping.map_io",
     "open_sequence": "slam.sequences",
-    "save_map": "slam.saved_map",
+    "save_map": "slam.mapping.map_io",
 }
 
 __all__ = sorted(_PUBLIC)

@@ -1,5 +1,5 @@
 """``python -m slam``: the command ``slam``."""
 
-from slam.cli import main
+from slam.commands.cli import main
 
 main()

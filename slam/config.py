@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from slam.association import AssociationConfig
-from slam.map_management import MapConfig
+from slam.calibration.disparity_offset import SelfCalibrationConfig
+from slam.mapping.selection import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
 from slam.objects.config import ObjectsConfig
-from slam.selfcalibration import SelfCalibrationConfig
+from slam.tracking.association import AssociationConfig
 
 #: Map management of a kind of motion: a car does not come back soon to what lies behind it, and comes so much nearer to
 #: what lies ahead that the looks change.
 MAPS = {
     "handheld": MapConfig(),
-    "driving": MapConfig(target_in_view=150, max_landmarks=300, renewal=1.0, confirmed=1, restart_after=5, spacing=0.0),
+    "driving": MapConfig(
+        target_in_view=150, max_landmarks=300, descriptor_update=1.0, confirmed=1, restart_after=5, spacing=0.0
+    ),
 }
 
 #: Association by kind of motion: the looks of what a car comes nearer to are renewed: it may be seen from anywhere.

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import MeasurementError
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 if TYPE_CHECKING:
-    from slam.objects.data import MovingObject
+    from slam.object_data import MovingObject
 
 IdArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from slam.data import Estimate, IdArray, Observations, Prediction, StereoFeatures, StereoFrame, UpdateReport
-from slam.objects.data import ObjectEstimate, ObjectObservations
-from slam.se3 import Array
-from slam.trajectory import Trajectory
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class LandmarkRows:
         missed: number of such frames since it was last measured (N,).
         last_seen: frame index (N,).
         seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
-        away: number of frames in which it was outside of the image since it was last measured (N,).
+        out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
     """
 
     ids: IdArray
@@ -35,11 +35,11 @@ class LandmarkRows:
     missed: IdArray
     last_seen: IdArray
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
-    away: IdArray = field(default=None)  # type: ignore[arg-type]
+    out_of_view: IdArray = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
-        if self.away is None:
-            object.__setattr__(self, "away", np.zeros(len(self.ids), np.int64))
+        if self.out_of_view is None:
+            object.__setattr__(self, "out_of_view", np.zeros(len(self.ids), np.int64))
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((len(self.ids), 3), np.nan))
 
@@ -63,16 +63,16 @@ class LandmarkRows:
         measured: IdArray,
         features: StereoFeatures,
         feature_rows: NDArray[np.intp],
-        renewal: float = 1.0,
+        descriptor_update: float = 1.0,
         camera: Array | None = None,
         in_image: BoolArray | None = None,
-        again_after: int = 0,
+        rematch_after: int = 0,
     ) -> LandmarkRows:
         """Count what one frame showed: which ids were in view, which were measured, by which features.
 
-        `renewal` is the weight of the measured features' descriptors against the landmarks': 1 for the last look, 0 for
+        `descriptor_update` is the weight of the measured features' descriptors against the landmarks': 1 for the last look, 0 for
         the first. `in_image` says which landmarks (N,) lie inside the image. Where the place of the camera (3,) is
-        given, those that are seen again after `again_after` frames outside of it count as first seen now, from there.
+        given, those that are seen again after `rematch_after` frames outside of it count as first seen now, from there.
         """
         view, hit = self.rows(in_view), self.rows(measured)
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
@@ -83,20 +83,22 @@ class LandmarkRows:
         missed[hit] = 0
         last_seen[hit] = frame
         descriptors = self.descriptors.copy()
-        look = (1 - renewal) * descriptors[hit] + renewal * features.descriptors[feature_rows]
+        look = (1 - descriptor_update) * descriptors[hit] + descriptor_update * features.descriptors[feature_rows]
         descriptors[hit] = look / np.maximum(np.linalg.norm(look, axis=1, keepdims=True), 1e-6)
         seen_from = self.seen_from.copy()
         if camera is not None:
-            again = self.long_away(again_after)[hit]
+            again = self.long_out_of_view(rematch_after)[hit]
             seen_from[hit[again]] = camera
             descriptors[hit[again]] = features.descriptors[feature_rows[again]]
-        away = self.away + (0 if in_image is None else ~in_image)
-        away[hit] = 0
-        return LandmarkRows(self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, away)
+        out_of_view = self.out_of_view + (0 if in_image is None else ~in_image)
+        out_of_view[hit] = 0
+        return LandmarkRows(
+            self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, out_of_view
+        )
 
-    def long_away(self, after: int) -> BoolArray:
+    def long_out_of_view(self, after: int) -> BoolArray:
         """Which landmarks (N,) were outside of the image for `after` frames, or are of an earlier run."""
-        return np.asarray((self.last_seen < 0) | (self.away >= after))
+        return np.asarray((self.last_seen < 0) | (self.out_of_view >= after))
 
     def with_new(
         self,

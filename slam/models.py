@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from slam.errors import ConfigurationError
-from slam.objects.models import ObjectModels
-from slam.se3 import Array
+from slam.geometry.se3 import Array
+from slam.object_models import ObjectModels
 
 
 def _require_positive(config: object) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam import registry
+from slam.calibration.disparity_offset import SelfCalibration
 from slam.config import SystemConfig
 from slam.data import (
     Estimate,
@@ -21,19 +22,18 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import ConfigurationError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, MapBackend, RevisingBackend
-from slam.known_map import MapSearch, models_at
 from slam.landmarks import LandmarkRows
-from slam.map_keeping import MapKeeper, Step, observations_of
+from slam.mapping.map_io import FIRST_FRAME, SavedMap
+from slam.mapping.map_search import MapSearch, models_at
+from slam.mapping.mapper import Mapper, Step, observations_of
 from slam.objects.modes import ObjectDetector, detector_for
-from slam.recognition import Recogniser, Recognition, jump, median_deviation
-from slam.relocation import Sightings, hand_over
-from slam.rig import StereoRig
-from slam.saved_map import FIRST_FRAME, SavedMap
-from slam.se3 import Array
-from slam.selfcalibration import SelfCalibration
-from slam.tracking import Tracking
-from slam.trajectory import Trajectory
+from slam.tracking.localizer import LandmarkMatches, Localizer, jump, median_deviation
+from slam.tracking.relocalization import PoseHypotheses, transfer_landmarks
+from slam.tracking.state import Tracking
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
 _COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
@@ -90,17 +90,17 @@ class StereoSlam:
         self.landmarks: LandmarkRows | None = None
         self.calibration = SelfCalibration(rig, c.self_calibration)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
-        self._recogniser = Recogniser(rig, c.association, c.models.pixel_sigma)
+        self._localizer = Localizer(rig, c.association, c.models.pixel_sigma)
         self._index = -1
         self._tracking = Tracking()
         self.frontend_name = frontend if isinstance(frontend, str) else ""
         self.world_frame = FIRST_FRAME
-        self._keeper = MapKeeper(rig, c, self._recogniser, self.backend)
+        self._keeper = Mapper(rig, c, self._localizer, self.backend)
         self._backend_name = backend if isinstance(backend, str) else None
-        self._may_begin_anew = isinstance(backend, str) and isinstance(self.backend, MapBackend)
-        self._carried = Sightings()
+        self._can_restart = isinstance(backend, str) and isinstance(self.backend, MapBackend)
+        self._carried = PoseHypotheses()
         self._past: list[Trajectory] = []  # the paths of back ends before the camera was carried off
-        self.begun_anew: list[int] = []  # indices of the frames in which another back end went on
+        self.restarted: list[int] = []  # indices of the frames in which another back end went on
         self._search: MapSearch | None = None
         if known_map is not None:
             self._search_in(known_map, backend)
@@ -133,7 +133,7 @@ class StereoSlam:
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         clock.lap("predict")
         measured, features = features, self.calibration.correct(features)
-        prediction, found = self._recognise(prediction, landmarks, features)
+        prediction, found = self._localize(prediction, landmarks, features)
         found = found.without(self.objects.suspects)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
@@ -142,7 +142,7 @@ class StereoSlam:
         self._tracking = self._tracked(prediction, features, found, report)
         estimate = self.backend.estimate(landmarks=False)
         clock.lap("estimate")
-        judged = self.objects.judge(features, estimate, _landmark_ids(features, found))
+        judged = self.objects.classify(features, estimate, _landmark_ids(features, found))
         objects = self.objects.update(self.backend, features)
         clock.lap("objects")
         step = Step(self._index, features, estimate, found, report, judged, self._tracking)
@@ -201,7 +201,7 @@ class StereoSlam:
         if not isinstance(backend, str):
             raise ConfigurationError("a system that starts in a known map needs its back end by name")
         known_map.require_fits(self.frontend_name)
-        self._search = MapSearch(known_map, self.rig, self._recogniser, self.config.models.initial_pose)
+        self._search = MapSearch(known_map, self.rig, self._localizer, self.config.models.initial_pose)
         self._search.fill(self.backend)
         self.landmarks = known_map.rows
         self.world_frame = known_map.world_frame
@@ -223,36 +223,36 @@ class StereoSlam:
         models = models_at(self.config.models, T_world_left)
         return registry.create("backends", self._backend_name, self.rig, models=models, **self.config.backend)
 
-    def _recognise(
+    def _localize(
         self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures
-    ) -> tuple[Prediction, Recognition]:
+    ) -> tuple[Prediction, LandmarkMatches]:
         """Landmarks in this frame (paper A, III and IV); a new prediction where the camera was carried off."""
         positions = self.backend.positions(landmarks.ids)
-        doubtful = self._tracking.unrecognised > 0
-        found = self._recogniser.recognise(prediction, landmarks, positions, features, self._index, doubtful)
+        doubtful = self._tracking.unmatched > 0
+        found = self._localizer.localize(prediction, landmarks, positions, features, self._index, doubtful)
         T, a = found.T_world_left, self.config.association
         if T is None or jump(prediction, T) <= (a.lost_jump if doubtful else a.max_jump):
-            self._carried = Sightings()
+            self._carried = PoseHypotheses()
             return prediction, found
         self._carried = self._carried.after(T, features.stamp, self.config.models)
-        if self._carried.count < a.carried_after or not self._may_begin_anew:
-            return prediction, Recognition.nothing()
-        prediction = self._begin_anew(T, features.stamp)
-        return prediction, self._recogniser.recognise(prediction, landmarks, positions, features, self._index)
+        if self._carried.count < a.kidnapped_after or not self._can_restart:
+            return prediction, LandmarkMatches.nothing()
+        prediction = self._restart(T, features.stamp)
+        return prediction, self._localizer.localize(prediction, landmarks, positions, features, self._index)
 
-    def _begin_anew(self, T_world_left: Array, stamp: float) -> Prediction:
+    def _restart(self, T_world_left: Array, stamp: float) -> Prediction:
         """A new back end in the same map: a motion that a carried camera did not make would spoil the old one's."""
         new = self._new_backend(T_world_left)
-        self._past.append(hand_over(self.backend, new))
-        self.backend, self._carried = new, Sightings()
-        self.begun_anew.append(self._index)
-        self.objects.begin_anew()
+        self._past.append(transfer_landmarks(self.backend, new))
+        self.backend, self._carried = new, PoseHypotheses()
+        self.restarted.append(self._index)
+        self.objects.restart()
         return self.backend.predict(stamp)
 
     def _tracked(
-        self, prediction: Prediction, features: StereoFeatures, found: Recognition, report: UpdateReport
+        self, prediction: Prediction, features: StereoFeatures, found: LandmarkMatches, report: UpdateReport
     ) -> Tracking:
-        """Whether the pose was measured; a lost camera must recognise more than a tracked one.
+        """Whether the pose was measured; a lost camera must localize more than a tracked one.
 
         Where the back end uses only the smaller part of the landmarks that agree with each other, it does not agree.
         """
@@ -265,7 +265,7 @@ class StereoSlam:
     def _status(self, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
         if report.status is UpdateStatus.FAILED:
             return FrameStatus.FAILED, report.reason
-        if not self._tracking.unrecognised:
+        if not self._tracking.unmatched:
             return FrameStatus.TRACKED, ""
         if self._keeper.next_id == added:
             return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
@@ -273,7 +273,7 @@ class StereoSlam:
         return (FrameStatus.LOST if self._tracking.lost else FrameStatus.PREDICTED), reason
 
 
-def _landmark_ids(features: StereoFeatures, found: Recognition) -> IdArray:
+def _landmark_ids(features: StereoFeatures, found: LandmarkMatches) -> IdArray:
     """Id of the landmark that each feature was recognised as (N,), −1 for none."""
     ids = np.full(len(features), -1, np.int64)
     ids[found.rows] = found.ids

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import slam
+from slam.evaluation.metrics import absolute_errors
 from slam.interfaces import Backend
-from slam.metrics import absolute_errors
 
 DOCS = Path(__file__).parent.parent / "docs"
 #: Sections of the results page that the README quotes.

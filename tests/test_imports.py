@@ -72,7 +72,7 @@ def test_gtsam_and_numba_stay_in_their_place():
             if names & {"gtsam", "gtsam_unstable"}:
                 assert place.startswith(("backends/smoother", "backends/batch")), place
             if "numba" in names:
-                assert place == "slam/compilation.py", place
+                assert place == "slam/runtime/compilation.py", place
 
 
 def imported(file: Path) -> set[str]:

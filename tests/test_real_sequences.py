@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from slam.config import SystemConfig
-from slam.runner import RunOptions, run
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
 KITTI_06 = "kitti_odometry/sequences/06"

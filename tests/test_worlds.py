@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.evaluation import consistency, evaluate
-from slam.runner import RunOptions, run
+from slam.evaluation.summary import consistency, evaluate
+from slam.geometry.trajectory import Trajectory
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
-from slam.trajectory import Trajectory
 
 #: World, and about twice the online ATE [m] measured with either back end.
 OBSERVED = {

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 from scipy.linalg.lapack import dpstrf
 
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 CAMERA = 12  #: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: its part [r, φ] that measurements depend on

@@ -17,18 +17,18 @@ from backends.ekf.measurement import StereoMeasurement, chained, innovation_cova
 from backends.ekf.objects import ObjectFilter
 from backends.ekf.objects_body import CameraBelief
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
-from slam import se3
-from slam.blas import one_blas_thread
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.euler import angles, body_rate_matrix, rotation
-from slam.known_landmarks import require_known
+from slam.geometry import se3
+from slam.geometry.euler import angles, body_rate_matrix, rotation
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.known_landmarks import require_known
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
-from slam.rig import StereoRig
-from slam.se3 import Array
-from slam.trajectory import Trajectory
+from slam.runtime.blas import one_blas_thread
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
@@ -189,8 +189,8 @@ class EkfBackend:
         J = np.tile(np.eye(3, POSE), (len(h), 1, 1))
         J[:, :, 3:] = -R @ se3.hat(h) @ E  # turning by δθ = E δφ about the camera's axes moves h by δθ × h
         noise = R @ covariances @ R.T
-        charts = np.tile(self._pose()[:3], (len(h), 1, 1))
-        D = self._landmarks.append(ids, charts, self._camera[:3] + h @ R.T)
+        anchors = np.tile(self._pose()[:3], (len(h), 1, 1))
+        D = self._landmarks.append(ids, anchors, self._camera[:3] + h @ R.T)
         self._append(D @ J, D @ noise @ D.transpose(0, 2, 1))
 
     def _append(self, J: Array, noise: Array) -> None:
@@ -276,7 +276,7 @@ class EkfBackend:
             z[:, 2] = np.nan
         marks = self._landmarks
         prior = np.concatenate([self._camera[:POSE], marks.state[slots].reshape(-1)])
-        model = StereoMeasurement(self.rig, self._R_world_angles, marks.coordinates, marks.charts[slots])
+        model = StereoMeasurement(self.rig, self._R_world_angles, marks.coordinates, marks.anchors[slots])
         return Problem(
             prior, self._covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
@@ -286,8 +286,8 @@ class EkfBackend:
     def _change_to(self, T_world_left: Array) -> Array:
         """The change of [r, φ] (6,) that moves the pose to `T_world_left`."""
         phi, before = angles(self._R_world_angles.T @ T_world_left[:3, :3]), self._camera[3:6]
-        twin = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
-        changes = np.stack([phi, twin]) - before
+        rectified_rig = np.array([phi[0] + np.pi, np.pi - phi[1], phi[2] + np.pi])  # the same rotation
+        changes = np.stack([phi, rectified_rig]) - before
         changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
         nearest = changes[np.argmin(np.linalg.norm(changes, axis=1))]
         return np.concatenate([T_world_left[:3, 3] - self._camera[:3], nearest])
@@ -341,9 +341,9 @@ class EkfBackend:
         self._camera = self._camera + change[:CAMERA]
         self._landmarks.move(change[CAMERA:].reshape(-1, 3))
         if self._consistent and solution.at_prior:
-            self._refer(before)
+            self._transport(before)
         elif self._consistent:  # it refers to about the corrected state already
-            self._landmarks.refer(covariance.local)
+            self._landmarks.transport(covariance.local)
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
 
@@ -354,7 +354,7 @@ class EkfBackend:
         """Whether the covariance is referred to the corrected state. The bodies' correlation with it cannot follow."""
         return self.config.consistent and self.config.measurement == "stereo" and not self._has_objects
 
-    def _refer(self, before: Array) -> None:
+    def _transport(self, before: Array) -> None:
         """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
 
         Nothing measures a displacement of camera and landmarks together. What it changes in each coordinate depends on
@@ -389,7 +389,7 @@ class EkfBackend:
             return
         world, A = np.eye(6), self._turning(self._camera)
         world[:3, 3:], world[3:, 3:] = se3.hat(self._camera[:3]) @ A, A
-        K = self._landmarks.refer(slots) @ world
+        K = self._landmarks.transport(slots) @ world
         if K.any():
             self._covariance.transform_landmarks(K)
 

@@ -3,7 +3,7 @@
 The papers hold a landmark's position in the world. A stereo pair's noise is Gaussian in pixels, though, and the depth
 of a far point goes with one over the disparity: in metres that is no Gaussian at all, and a filter that takes it for
 one is biased and too sure of itself. `InverseDepth` describes the same point by what a camera at its first sight would
-measure, ``[x/z, y/z, 1/z]``; that camera (the landmark's chart) is a constant, wherever the true one was, so that the
+measure, ``[x/z, y/z, 1/z]``; that camera (the landmark's anchor) is a constant, wherever the true one was, so that the
 state has three numbers a landmark as before and everything else stays as it is. Simulated drives with points at 10 to
 60 m: NEES 6.3 instead of 9.8, position error 24 mm instead of 36.
 """
@@ -18,25 +18,25 @@ from numpy.typing import NDArray
 
 from slam.data import IdArray
 from slam.errors import MeasurementError
-from slam.se3 import Array, hat
+from slam.geometry.se3 import Array, hat
 
 SlotArray = NDArray[np.intp]
 
-_STAND_OFF = 100.0  # standard deviations of a known point between it and its chart
+_STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
 class Coordinates(Protocol):
-    """What three numbers of the state say of a landmark; `charts` (M, 3, 4) are poses ``[R | r]`` of its own."""
+    """What three numbers of the state say of a landmark; `anchors` (M, 3, 4) are poses ``[R | r]`` of its own."""
 
-    def points(self, charts: Array, c: Array) -> Array:
+    def points(self, anchors: Array, c: Array) -> Array:
         """Positions (M, 3) [m] in the world of landmarks with coordinates c (M, 3)."""
         ...
 
-    def of(self, charts: Array, points: Array) -> Array:
+    def of(self, anchors: Array, points: Array) -> Array:
         """Coordinates (M, 3) of positions (M, 3)."""
         ...
 
-    def jacobian(self, charts: Array, c: Array) -> Array:
+    def jacobian(self, anchors: Array, c: Array) -> Array:
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
         ...
 
@@ -44,41 +44,41 @@ class Coordinates(Protocol):
 class Euclidean:
     """The papers': the position in the world. Charts do not matter."""
 
-    def points(self, charts: Array, c: Array) -> Array:
+    def points(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.points`."""
         return c
 
-    def of(self, charts: Array, points: Array) -> Array:
+    def of(self, anchors: Array, points: Array) -> Array:
         """See `Coordinates.of`."""
         return points
 
-    def jacobian(self, charts: Array, c: Array) -> Array:
+    def jacobian(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.jacobian`."""
         return np.tile(np.eye(3), (len(c), 1, 1))
 
 
 class InverseDepth:
-    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the chart's axes."""
+    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes."""
 
-    def points(self, charts: Array, c: Array) -> Array:
+    def points(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.points`."""
         homogeneous = np.ones((len(c), 4))  # [x/z, y/z, 1, 1/z]
         homogeneous[:, :2], homogeneous[:, 3] = c[:, :2], c[:, 2]
-        return np.asarray(np.einsum("nij,nj->ni", charts, homogeneous) / c[:, 2:])
+        return np.asarray(np.einsum("nij,nj->ni", anchors, homogeneous) / c[:, 2:])
 
-    def of(self, charts: Array, points: Array) -> Array:
+    def of(self, anchors: Array, points: Array) -> Array:
         """See `Coordinates.of`."""
-        local = ((points - charts[:, :, 3])[:, None, :] @ charts[:, :, :3])[:, 0]
+        local = ((points - anchors[:, :, 3])[:, None, :] @ anchors[:, :, :3])[:, 0]
         return np.concatenate([local[:, :2], np.ones((len(local), 1))], axis=1) / local[:, 2:]
 
-    def jacobian(self, charts: Array, c: Array) -> Array:
+    def jacobian(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.jacobian`."""
         depth = 1 / c[:, 2]
         D = np.zeros((len(c), 3, 3))
         D[:, 0, 0] = D[:, 1, 1] = depth
         D[:, :2, 2] = -c[:, :2] * (depth * depth)[:, None]
         D[:, 2, 2] = -depth * depth
-        return np.asarray(charts[:, :, :3] @ D)
+        return np.asarray(anchors[:, :, :3] @ D)
 
 
 #: By the name of the option.
@@ -91,20 +91,20 @@ class Landmarks:
     Attributes:
         coordinates: what the state's numbers mean.
         ids: (N,).
-        charts: (N, 3, 4), constants.
+        anchors: (N, 3, 4), constants.
         state: coordinates (N, 3).
         points: positions (N, 3) [m] in the world, which follow from the two.
-        by_world: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by
+        gauge_jacobian: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by
             δ about the origin) where the covariance was last referred to.
     """
 
     def __init__(self, coordinates: Coordinates) -> None:
         self.coordinates = coordinates
         self.ids = np.zeros(0, np.int64)
-        self.charts: Array = np.zeros((0, 3, 4))
+        self.anchors: Array = np.zeros((0, 3, 4))
         self.state: Array = np.zeros((0, 3))
         self.points: Array = np.zeros((0, 3))
-        self.by_world: Array = np.zeros((0, 3, 6))
+        self.gauge_jacobian: Array = np.zeros((0, 3, 6))
         self._slots: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -123,16 +123,16 @@ class Landmarks:
             if i in self._slots:
                 raise MeasurementError(f"ekf: landmark {i} is in the map already")
 
-    def append(self, ids: IdArray, charts: Array, points: Array) -> Array:
+    def append(self, ids: IdArray, anchors: Array, points: Array) -> Array:
         """Add landmarks at positions (M, 3); returns the derivatives (M, 3, 3) of their coordinates by these."""
-        first, state = len(self), self.coordinates.of(charts, points)
-        inverse, by_world = self._derivatives(charts, state, points)
+        first, state = len(self), self.coordinates.of(anchors, points)
+        inverse, gauge_jacobian = self._derivatives(anchors, state, points)
         self._slots.update(zip(ids.tolist(), range(first, first + len(ids))))
         self.ids = np.concatenate([self.ids, ids])
-        self.charts = np.concatenate([self.charts, charts])
+        self.anchors = np.concatenate([self.anchors, anchors])
         self.state = np.concatenate([self.state, state])
         self.points = np.concatenate([self.points, points])
-        self.by_world = np.concatenate([self.by_world, by_world])
+        self.gauge_jacobian = np.concatenate([self.gauge_jacobian, gauge_jacobian])
         return inverse
 
     def remove(self, ids: IdArray, holes: SlotArray, movers: SlotArray) -> None:
@@ -140,33 +140,33 @@ class Landmarks:
         for i in ids.tolist():
             del self._slots[i]
         left = len(self) - len(ids)
-        for array in (self.ids, self.charts, self.state, self.points, self.by_world):
+        for array in (self.ids, self.anchors, self.state, self.points, self.gauge_jacobian):
             array[holes] = array[movers]
         self._slots.update(zip(self.ids[holes].tolist(), holes.tolist()))
-        self.ids, self.charts = self.ids[:left], self.charts[:left]
+        self.ids, self.anchors = self.ids[:left], self.anchors[:left]
         self.state, self.points = self.state[:left], self.points[:left]
-        self.by_world = self.by_world[:left]
+        self.gauge_jacobian = self.gauge_jacobian[:left]
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""
         self.state = self.state + change
-        self.points = self.coordinates.points(self.charts, self.state)
+        self.points = self.coordinates.points(self.anchors, self.state)
 
-    def refer(self, slots: SlotArray) -> Array:
-        """Let `by_world` be that of the present coordinates; returns the change (M, 3, 6)."""
-        now = self._derivatives(self.charts[slots], self.state[slots], self.points[slots])[1]
-        change = now - self.by_world[slots]
-        self.by_world[slots] = now
+    def transport(self, slots: SlotArray) -> Array:
+        """Let `gauge_jacobian` be that of the present coordinates; returns the change (M, 3, 6)."""
+        now = self._derivatives(self.anchors[slots], self.state[slots], self.points[slots])[1]
+        change = now - self.gauge_jacobian[slots]
+        self.gauge_jacobian[slots] = now
         return np.asarray(change)
 
-    def _derivatives(self, charts: Array, c: Array, points: Array) -> tuple[Array, Array]:
+    def _derivatives(self, anchors: Array, c: Array, points: Array) -> tuple[Array, Array]:
         """Derivatives of coordinates c by the positions (M, 3, 3), and by a displacement of the world (M, 3, 6)."""
-        inverse = np.linalg.inv(self.coordinates.jacobian(charts, c))
+        inverse = np.linalg.inv(self.coordinates.jacobian(anchors, c))
         return inverse, np.concatenate([inverse, -inverse @ hat(points)], axis=2)
 
     def jacobian(self, slots: SlotArray) -> Array:
         """Derivatives (M, 3, 3) of positions by coordinates."""
-        return self.coordinates.jacobian(self.charts[slots], self.state[slots])
+        return self.coordinates.jacobian(self.anchors[slots], self.state[slots])
 
 
 def far_charts(points: Array, covariances: Array) -> Array:
@@ -174,7 +174,7 @@ def far_charts(points: Array, covariances: Array) -> Array:
 
     They stand off by so many standard deviations that all coordinates are linear in the position: the Gaussian stays.
     """
-    charts = np.tile(np.eye(3, 4), (len(points), 1, 1))
-    charts[:, :, 3] = points
-    charts[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
-    return charts
+    anchors = np.tile(np.eye(3, 4), (len(points), 1, 1))
+    anchors[:, :, 3] = points
+    anchors[:, 2, 3] -= np.maximum(_STAND_OFF * np.sqrt(np.trace(covariances, axis1=1, axis2=2)), 1.0)
+    return anchors

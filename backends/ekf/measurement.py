@@ -10,9 +10,9 @@ import numpy as np
 from backends.ekf.angles import attitude
 from backends.ekf.landmarks import Coordinates
 from slam.data import BoolArray
-from slam.euler import body_rate_matrix
-from slam.rig import StereoRig
-from slam.se3 import Array, hat
+from slam.geometry.euler import body_rate_matrix
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, hat
 
 #: ``hat(h) = Σ h_k _HAT[k]``
 _HAT = hat(np.eye(3))
@@ -70,13 +70,13 @@ class StereoMeasurement:
         rig: the cameras.
         R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
         coordinates: what the landmarks' numbers mean.
-        charts: the landmarks' charts (M, 3, 4).
+        anchors: the landmarks' anchors (M, 3, 4).
     """
 
     rig: StereoRig
     R_world_angles: Array
     coordinates: Coordinates
-    charts: Array
+    anchors: Array
 
     def predict(self, x: Array) -> Array:
         """Predicted components (M, 3) [px]; NaN behind a camera."""
@@ -85,13 +85,13 @@ class StereoMeasurement:
     def linearise(self, x: Array) -> Linearisation:
         """The same with derivatives."""
         h, R = self._local(x)
-        D = self.coordinates.jacobian(self.charts, x[6:].reshape(-1, 3))
+        D = self.coordinates.jacobian(self.anchors, x[6:].reshape(-1, 3))
         return chained(*self.rig.project_stereo(h), h, R, x[3:6], D)
 
     def _local(self, x: Array) -> tuple[Array, Array]:
         """Landmarks ``h = Rᵀ (Y − r)`` (M, 3) in camera coordinates (paper B, Eqs. 3-5), and R (3, 3)."""
         R = attitude(self.R_world_angles, x[3:6])
-        return (self.coordinates.points(self.charts, x[6:].reshape(-1, 3)) - x[:3]) @ R, R
+        return (self.coordinates.points(self.anchors, x[6:].reshape(-1, 3)) - x[:3]) @ R, R
 
 
 def chained(z: Array, J: Array, h: Array, R: Array, phi: Array, D: Array) -> Linearisation:

@@ -27,11 +27,11 @@ from backends.ekf.objects_measurement import BodyMeasurement, change_between
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
+from slam.object_data import ObjectEstimate, ObjectObservations, Sight
 from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (0.0, 3.0, 10.0)

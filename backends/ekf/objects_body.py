@@ -18,8 +18,8 @@ from scipy.linalg.blas import dgemm
 
 from backends.ekf.objects_measurement import BodyPoints, moved
 from slam.data import BoolArray, IdArray
-from slam.objects.models import ObjectModels
-from slam.se3 import Array, adjoint, hat, inverse, pose, so3_exp, so3_left_jacobian
+from slam.geometry.se3 import Array, adjoint, hat, inverse, pose, so3_exp, so3_left_jacobian
+from slam.object_models import ObjectModels
 
 RIGID = 12  #: size of [θ, τ, δω, δv]
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backends.ekf.measurement import Linearisation
-from slam.rig import StereoRig
-from slam.se3 import Array, hat, pose, so3_exp, so3_left_jacobian, so3_log
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, hat, pose, so3_exp, so3_left_jacobian, so3_log
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.ekf.measurement import Linearisation, Measurement, stacked
 from slam.data import BoolArray
-from slam.gating import chi_square_limits
-from slam.se3 import Array
+from slam.geometry.se3 import Array
+from slam.tracking.gating import chi_square_limits
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: a landmark's Gaussian in world coordinates comes from pixels by a linearisation at its

@@ -12,8 +12,9 @@ import numpy as np
 from backends.smoother import pose_only
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import FactorMaker
+from backends.smoother.measurement_log import IndexArray, MeasurementLog
 from backends.smoother.objects import ObjectSmoother
-from backends.smoother.posegraph import PoseGraph
+from backends.smoother.pose_graph import PoseGraph
 from backends.smoother.prediction import (
     PredictedPoints,
     PredictedPose,
@@ -22,26 +23,25 @@ from backends.smoother.prediction import (
     predict_points,
     predict_pose,
 )
-from backends.smoother.records import IndexArray, Records
 from backends.smoother.stereo import RectifiedStereo
-from slam.blas import one_blas_thread
-from slam.compilation import announce_compilation
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
-from slam.known_landmarks import require_known
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.known_landmarks import require_known
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations
+from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse
-from slam.trajectory import Trajectory
+from slam.runtime.blas import one_blas_thread
+from slam.runtime.compilation import announce_compilation
 
 
 class SmootherBackend:
     """ISAM2 over smart stereo factors: all poses are estimated together and revised with every frame.
 
     The motion model is the papers' (see `backends.smoother.motion`). Which landmarks are eliminated and which are
-    variables: see `backends.smoother.posegraph`. Covariances: see `backends.smoother.uncertainty`.
+    variables: see `backends.smoother.pose_graph`. Covariances: see `backends.smoother.uncertainty`.
 
     Args:
         rig: the cameras; measurements of any rig are rectified first.
@@ -64,9 +64,9 @@ class SmootherBackend:
         self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
 
     @property
-    def records(self) -> Records:
+    def measurement_log(self) -> MeasurementLog:
         """Poses, measurements and landmarks as they are believed now; not to be changed."""
-        return self._graph.records
+        return self._graph.measurement_log
 
     @property
     def factor_maker(self) -> FactorMaker:
@@ -84,11 +84,11 @@ class SmootherBackend:
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
         self._commit()
-        stamps = self.records.path.stamps
+        stamps = self.measurement_log.path.stamps
         if not np.isfinite(stamp) or (len(stamps) and stamp <= stamps[-1]):
             last = f" after {stamps[-1]}" if len(stamps) else ""
             raise MeasurementError(f"smoother: stamp {stamp}{last}: time must be finite and increase")
-        if not len(stamps) and len(self.records.landmarks):
+        if not len(stamps) and len(self.measurement_log.landmarks):
             self._predicted = first_pose(self.models, float(stamp))
             return self._in_view(self._predicted)
         if not len(stamps):
@@ -96,14 +96,14 @@ class SmootherBackend:
             P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
             T = self.models.initial_pose
             return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
-        self._predicted = predict_pose(self.models, self.records.path, self._graph.window(), stamp)
+        self._predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
         return self._in_view(self._predicted)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
-        slots = self.records.landmarks.slots(observations.ids)
+        slots = self.measurement_log.landmarks.slots(observations.ids)
         predicted = self._predicted
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
@@ -140,35 +140,35 @@ class SmootherBackend:
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
-        self._graph.remove_landmarks(self.records.landmarks.slots(np.unique(np.asarray(ids, np.int64))))
+        self._graph.remove_landmarks(self.measurement_log.landmarks.slots(np.unique(np.asarray(ids, np.int64))))
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
         if landmarks and self._predicted is None:
-            self._graph.settle()
-        window, marks = self._graph.window(), self.records.landmarks
+            self._graph.converge()
+        window, marks = self._graph.window(), self.measurement_log.landmarks
         slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
         covariances = self._graph.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
         if self._predicted is not None:
             stamp, T, P = self._predicted.stamp, self._predicted.T.copy(), self._predicted.covariance
         else:
-            path = self.records.path
+            path = self.measurement_log.path
             stamp, T, P = float(path.stamps[-1]), path.poses[-1].copy(), window.covariance[-6:, -6:].copy()
         return Estimate(stamp, T, P, marks.ids[slots], marks.position[slots], covariances)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        marks = self.records.landmarks
+        marks = self.measurement_log.landmarks
         return marks.position[marks.slots(ids)]
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
         self._commit()
-        self._graph.settle()
-        return Trajectory(self.records.path.stamps.copy(), self.records.path.poses.copy())
+        self._graph.converge()
+        return Trajectory(self.measurement_log.path.stamps.copy(), self.measurement_log.path.poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -186,7 +186,7 @@ class SmootherBackend:
         require_known("smoother", ids, local, covariances)
         self._require_new(ids)
         self._commit()
-        self._graph.add_known(ids, local, covariances, self.records.path.count - 1)
+        self._graph.add_known(ids, local, covariances, self.measurement_log.path.count - 1)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -196,7 +196,7 @@ class SmootherBackend:
         if not np.isfinite(shift):
             raise MeasurementError(f"smoother: shift must be finite, got {shift}")
         self._commit()
-        if self.records.measurements.count:
+        if self.measurement_log.measurements.count:
             self._graph.shift_right(float(shift))
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
@@ -206,7 +206,7 @@ class SmootherBackend:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
         self._commit()
-        return self._objects.update(observations, self.records.path, self._graph.window)
+        return self._objects.update(observations, self.measurement_log.path, self._graph.window)
 
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
@@ -223,7 +223,7 @@ class SmootherBackend:
 
     def _in_view(self, predicted: PredictedPose) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
-        T, marks, rig = predicted.T, self.records.landmarks, self.rig
+        T, marks, rig = predicted.T, self.measurement_log.landmarks, self.rig
         slots = marks.used()
         slots = slots[rig.left.in_view((marks.position[slots] - T[:3, 3]) @ T[:3, :3])]
         points = self._points(predicted, slots)
@@ -233,7 +233,7 @@ class SmootherBackend:
         return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
 
     def _points(self, predicted: PredictedPose, slots: IndexArray) -> PredictedPoints:
-        marks, by_window = self.records.landmarks, self._graph.landmarks_by_window(slots)
+        marks, by_window = self.measurement_log.landmarks, self._graph.landmarks_by_window(slots)
         return predict_points(predicted, marks.position[slots], marks.covariance[slots], by_window)
 
     def _solve_pose(
@@ -242,24 +242,26 @@ class SmootherBackend:
         """First value of the newest pose, and which measurements agree with it."""
         _, J = self._stereo.project(points.local)
         noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
-        known = self.records.landmarks.prior[slots].any()  # what is known in the world does not move with the poses
+        known = self.measurement_log.landmarks.prior[
+            slots
+        ].any()  # what is known in the world does not move with the poses
         information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to(self._last_measured()))
         problem = pose_only.PoseProblem(
-            self._stereo, self.records.landmarks.position[slots], z, noise, predicted.T, information,
+            self._stereo, self.measurement_log.landmarks.position[slots], z, noise, predicted.T, information,
             self.models.gate_probability,
         )  # fmt: skip
         return pose_only.solve(problem, predicted.T if guess is None else guess)
 
     def _last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""
-        frames, measured = self._graph.window().frames, self.records.path.measured
+        frames, measured = self._graph.window().frames, self.measurement_log.path.measured
         return int(np.searchsorted(frames, measured[-1])) if measured else len(frames) - 1
 
     def _require_started(self, what: str) -> None:
-        if not self.records.path.count and self._predicted is None:
+        if not self.measurement_log.path.count and self._predicted is None:
             raise MeasurementError(f"smoother: {what} before the first predict")
 
     def _require_new(self, ids: IdArray) -> None:
         for i in ids.tolist():
-            if i in self.records.landmarks:
+            if i in self.measurement_log.landmarks:
                 raise MeasurementError(f"smoother: landmark {i} is in the map already")

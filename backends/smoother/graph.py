@@ -10,11 +10,11 @@ import gtsam_unstable
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.records import Known
+from backends.smoother.measurement_log import Known
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import pose_key
+from slam.geometry.se3 import Array, hat, nearest_rotation
 from slam.models import EstimatorModels
-from slam.se3 import Array, hat, nearest_rotation
 
 
 def to_pose3(T: Array) -> gtsam.Pose3:
@@ -33,7 +33,7 @@ class FactorMaker:
     """Makes factors for one rig and one set of models.
 
     Args:
-        stereo: the rectified twin's projection.
+        stereo: the rectified rectified_rig's projection.
         models: noise, priors and motion.
     """
 
@@ -44,8 +44,8 @@ class FactorMaker:
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         self._parameters = gtsam.SmartProjectionParams()
-        rectified = stereo.twin.original.is_rectified
-        self._sensor = () if rectified else (to_pose3(stereo.twin.T_left_rectified),)
+        rectified = stereo.rectified_rig.original.is_rectified
+        self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)
 
     @cached_property
     def _mono(self) -> tuple[gtsam.Cal3_S2, gtsam.noiseModel.Base]:

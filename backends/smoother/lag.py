@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from backends.smoother.records import Records
+from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.solver import Change
 from backends.smoother.variables import pose_key
 
@@ -20,7 +20,7 @@ class FixedLag:
     """Keeps track of the variables that are in the solver.
 
     Args:
-        records: what is on record.
+        measurement_log: what is on record.
         lag: so many of the newest poses stay.
         landmarks: so many landmark variables stay, as long as they are in the map; those last measured go last.
 
@@ -28,9 +28,9 @@ class FixedLag:
         first: frame of the oldest pose that is a variable.
     """
 
-    def __init__(self, records: Records, lag: int, landmarks: int) -> None:
+    def __init__(self, measurement_log: MeasurementLog, lag: int, landmarks: int) -> None:
         self.first = 0
-        self._records = records
+        self._measurement_log = measurement_log
         self._lag = lag
         self._most = landmarks
         self._landmarks: set[int] = set()
@@ -38,7 +38,7 @@ class FixedLag:
     def restart(self) -> None:
         """Note that everything on record is in the solver again."""
         self.first = 0
-        self._landmarks = set(self._records.history.explicit)
+        self._landmarks = set(self._measurement_log.history.explicit)
 
     def enter(self, landmark: int) -> None:
         """Note that a landmark has become a variable."""
@@ -46,28 +46,28 @@ class FixedLag:
 
     def advance(self, change: Change) -> None:
         """Put what leaves with the newest pose, and what stays, into the change; that pose is on record already."""
-        first = self._records.path.count - self._lag
+        first = self._measurement_log.path.count - self._lag
         if first < self.first + max(1, self._lag // _SHARE):
             return
         self._finish_tracks(first)
         gone = self._landmarks_before(first)
         change.leaving = [*map(pose_key, range(self.first, first)), *gone]
         self._landmarks.difference_update(gone)
-        newest = self._records.path.count - 1
+        newest = self._measurement_log.path.count - 1
         change.staying = [*map(pose_key, range(first, newest)), *sorted(self._landmarks)]
         self.first = first
 
     def _finish_tracks(self, first: int) -> None:
         """Finish the smart factors that hold poses before frame `first`."""
         oldest = pose_key(first)
-        for track in self._records.landmarks.tracks.values():
+        for track in self._measurement_log.landmarks.tracks.values():
             if track.keys and track.keys[0] < oldest:
-                self._records.finish(track)
+                self._measurement_log.finish(track)
 
     def _landmarks_before(self, first: int) -> list[int]:
         """Variables to leave, last measured before frame `first`: of landmarks not in the map any more, and surplus."""
-        frame, marks = self._records.measurements.frame, self._records.landmarks
-        explicit = self._records.history.explicit
+        frame, marks = self._measurement_log.measurements.frame, self._measurement_log.landmarks
+        explicit = self._measurement_log.history.explicit
         last = {key: int(frame[explicit[key][-1]]) for key in self._landmarks.intersection(explicit)}
         mapped = set(marks.variable[marks.variable >= 0].tolist())
         old = sorted((key for key, k in last.items() if k < first), key=lambda key: (key in mapped, last[key], key))

@@ -14,8 +14,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from slam.geometry.se3 import Array, pose
 from slam.models import EstimatorModels
-from slam.se3 import Array, pose
 
 _inverse_right = gtsam.Rot3.LogmapDerivative  # inverse of SO(3)'s right Jacobian
 

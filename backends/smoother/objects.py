@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from backends.smoother.measurement_log import IndexArray, Path
 from backends.smoother.objects_factors import FRAME, velocities
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
@@ -19,15 +20,14 @@ from backends.smoother.objects_window import (
     with_points,
     without_points,
 )
-from backends.smoother.records import IndexArray, Path
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.uncertainty import PoseSet
 from slam.data import BoolArray, IdArray, Observations
 from slam.errors import MeasurementError
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations, Sight
+from slam.object_data import ObjectEstimate, ObjectObservations, Sight
 from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
-from slam.se3 import Array, adjoint, inverse, transform
 
 _LAG = 4  # frames of a window at least
 _BATCH = 2  # so many frames leave it together: that costs hardly more than for one
@@ -45,7 +45,7 @@ class ObjectSmoother:
     uncertainty of its points; from then on the pose is that of the motion since.
 
     Args:
-        stereo: the rig's rectified twin.
+        stereo: the rig's rectified rectified_rig.
         sigma: pixel noise in it [px].
         models: gate and motion of bodies.
     """
@@ -227,7 +227,7 @@ class ObjectSmoother:
 
 @dataclass(frozen=True)
 class _Measured:
-    """Observations of a body in the rectified twin.
+    """Observations of a body in the rectified rectified_rig.
 
     Attributes:
         ids: of the points (M,).

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.records import IndexArray
+from backends.smoother.measurement_log import IndexArray
 from backends.smoother.stereo import RectifiedStereo
-from slam.objects.models import ObjectModels
-from slam.se3 import Array
+from slam.geometry.se3 import Array
+from slam.object_models import ObjectModels
 
 FRAME = 12  #: unknowns of a frame: body pose (6), camera pose (6)
 
@@ -56,7 +56,7 @@ def add_measurements(
         first_point: where the points' unknowns begin.
     """
     kernels.add_measurements(
-        system.information, system.vector, stereo.intrinsics, stereo.twin.R_left, sigma,
+        system.information, system.vector, stereo.intrinsics, stereo.rectified_rig.R_left, sigma,
         np.ascontiguousarray(z), Y, points, first_point,
     )  # fmt: skip
 

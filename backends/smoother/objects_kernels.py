@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.compilation import helper, kernel
+from slam.runtime.compilation import helper, kernel
 
 _FRAME = 12
 _NEAREST = 1e-6  # no depth below this [m] is projected

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import pose_only
+from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, first_sigmas, impulse_sigmas, velocities
 from backends.smoother.objects_window import CameraWindow, Window
-from backends.smoother.records import IndexArray
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
-from slam.gating import chi_square_limits
-from slam.objects.models import ObjectModels
-from slam.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
+from slam.geometry.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
+from slam.object_models import ObjectModels
+from slam.tracking.gating import chi_square_limits
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (0.0, 3.0, 10.0)

@@ -16,14 +16,14 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.smoother import objects_kernels as kernels
+from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, System, add_measurements, add_motion
 from backends.smoother.pose_kernels import moved
-from backends.smoother.records import IndexArray
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray
-from slam.objects.models import ObjectModels
+from slam.geometry.se3 import Array, hat, inverse, transform
+from slam.object_models import ObjectModels
 from slam.objects.points import Shape
-from slam.se3 import Array, hat, inverse, transform
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
@@ -71,7 +71,7 @@ class Window:
         stamps: their times (n,) [s].
         T: poses T_world_object (n, 4, 4).
         scales: factors (n,) on the impulse before each.
-        z: measurements (n, p, 3) of the rectified twin, NaN where there is none.
+        z: measurements (n, p, 3) of the rectified rectified_rig, NaN where there is none.
         ids: of the points (p,).
         points: in body coordinates (p, 3).
         failures: how often running each point's observation was rejected (p,).
@@ -204,7 +204,7 @@ class Solver:
 
     Args:
         stereo: the projection.
-        sigma: pixel noise in the rectified twin [px].
+        sigma: pixel noise in the rectified rectified_rig [px].
         models: how bodies move.
         iterations: most linearisations.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.compilation import helper, kernel
+from slam.runtime.compilation import helper, kernel
 
 _NEAREST = 1e-6  # no depth below this [m] is projected
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision

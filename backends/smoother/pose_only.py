@@ -14,8 +14,8 @@ import numpy as np
 from backends.smoother import pose_kernels as kernels
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
-from slam.gating import chi_square_gate
-from slam.se3 import Array, inverse
+from slam.geometry.se3 import Array, inverse
+from slam.tracking.gating import chi_square_gate
 
 _STEPS = 12
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
@@ -64,7 +64,7 @@ def solve(problem: PoseProblem, start: Array) -> tuple[Array, BoolArray]:
 def residuals(problem: PoseProblem, T: Array) -> tuple[Array, Array]:
     """Measured less predicted (M, 3), NaN where missing, and the prediction's Jacobians (M, 3, 6) by the pose."""
     stereo = problem.stereo
-    r, J = kernels.residuals(stereo.intrinsics, stereo.twin.R_left, problem.points, problem.z, T)
+    r, J = kernels.residuals(stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, T)
     return r, J
 
 
@@ -88,6 +88,6 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
     robust = used is None
     counted = np.ones(len(problem.points), bool) if used is None else used
     return np.asarray(kernels.gauss_newton(
-        stereo.intrinsics, stereo.twin.R_left, problem.points, problem.z, whitener, counted, problem.information,
+        stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted, problem.information,
         prior, start, _HUBER if robust else np.inf, _STEPS, _ROUGH if robust else _CONVERGED,
     ))  # fmt: skip

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.records import IndexArray, Path
+from backends.smoother.measurement_log import IndexArray, Path
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from backends.smoother.uncertainty import PoseSet, quadratic
 from slam.data import BoolArray
+from slam.geometry.se3 import Array, adjoint, hat, inverse
 from slam.models import EstimatorModels
-from slam.se3 import Array, adjoint, hat, inverse
 
 
 @dataclass(frozen=True)

@@ -6,44 +6,44 @@ import gtsam
 import numpy as np
 
 from backends.smoother.graph import FactorMaker, to_pose3
-from backends.smoother.records import IndexArray, Path, Records, Track
+from backends.smoother.measurement_log import IndexArray, MeasurementLog, Path, Track
 from backends.smoother.solver import FAILURES, Change, SolverError
 from backends.smoother.variables import pose_key
-from slam.se3 import Array, inverse
+from slam.geometry.se3 import Array, inverse
 
 _ITERATIONS = 30
 
 
-def whole_problem(make: FactorMaker, records: Records) -> tuple[Change, list[tuple[Track, int]]]:
+def whole_problem(make: FactorMaker, measurement_log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:
     """All factors and first values, and the tracks with the places of their smart factors."""
     change = Change()
-    add_poses(change, make, records, records.history.restarted)
-    for rows in records.history.finished:
-        points = [make.point(z) for z in records.measurements.z[rows].tolist()]
-        change.factors.add(make.smart(points, pose_keys(records, rows)))
-    for key, all_rows in records.history.explicit.items():
-        add_landmark(change, make, records, key, np.array(all_rows), records.history.places[key])
-        known = records.history.known.get(int(records.measurements.landmark[all_rows[0]]))
+    add_poses(change, make, measurement_log, measurement_log.history.restarted)
+    for rows in measurement_log.history.finished:
+        points = [make.point(z) for z in measurement_log.measurements.z[rows].tolist()]
+        change.factors.add(make.smart(points, pose_keys(measurement_log, rows)))
+    for key, all_rows in measurement_log.history.explicit.items():
+        add_landmark(change, make, measurement_log, key, np.array(all_rows), measurement_log.history.places[key])
+        known = measurement_log.history.known.get(int(measurement_log.measurements.landmark[all_rows[0]]))
         if known is not None:
             change.factors.add(make.known(key, known))
     places = []
-    for track in records.landmarks.tracks.values():
+    for track in measurement_log.landmarks.tracks.values():
         if track.informative:
             places.append((track, change.factors.size()))
             change.factors.add(make.smart(track.points, track.keys))
     return change, places
 
 
-def add_poses(change: Change, make: FactorMaker, records: Records, restarted: int = 0) -> None:
+def add_poses(change: Change, make: FactorMaker, measurement_log: MeasurementLog, restarted: int = 0) -> None:
     """All poses, with what ties them to each other and to the world; the first `restarted` as they stand."""
-    path = records.path
+    path = measurement_log.path
     for i in range(path.count):
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
         if 0 < i < restarted:
             relative = inverse(path.poses[i - 1]) @ path.poses[i]
             factor = make.step((pose_key(i - 1), pose_key(i)), relative, path.stamps[i] - path.stamps[i - 1])
         else:
-            factor = pose_factor(make, path, i, records.history.impulses[i])
+            factor = pose_factor(make, path, i, measurement_log.history.impulses[i])
         change.factors.add(factor)
 
 
@@ -77,13 +77,15 @@ def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:
     return values
 
 
-def pose_keys(records: Records, rows: IndexArray) -> list[int]:
+def pose_keys(measurement_log: MeasurementLog, rows: IndexArray) -> list[int]:
     """Pose variables of measurements."""
-    return [pose_key(i) for i in records.measurements.frame[rows].tolist()]
+    return [pose_key(i) for i in measurement_log.measurements.frame[rows].tolist()]
 
 
-def add_landmark(change: Change, make: FactorMaker, records: Records, key: int, rows: IndexArray, place: Array) -> None:
+def add_landmark(
+    change: Change, make: FactorMaker, measurement_log: MeasurementLog, key: int, rows: IndexArray, place: Array
+) -> None:
     """A landmark that is a variable, first placed at `place` (3,) in world coordinates."""
-    for z, pose in zip(records.measurements.z[rows].tolist(), pose_keys(records, rows)):
+    for z, pose in zip(measurement_log.measurements.z[rows].tolist(), pose_keys(measurement_log, rows)):
         change.factors.add(make.explicit(make.point(z), pose, key))
     change.values.insert(key, place)

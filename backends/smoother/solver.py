@@ -14,7 +14,7 @@ from scipy.linalg import solve_triangular
 
 from backends.smoother.variables import ballast_key, size_of
 from slam.errors import SlamError
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 _T = TypeVar("_T")
 
@@ -101,7 +101,7 @@ class Solver:
             self._guarded(lambda: self._isam.marginalizeLeaves(_key_list(change.leaving)))
         return result.getNewFactorsIndices()
 
-    def settle(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
+    def converge(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
         """Steps without anything new, at most so many, until no variable moves farther than by the thresholds.
 
         Raises:

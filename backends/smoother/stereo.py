@@ -1,7 +1,7 @@
-"""Stereo measurements in the rectified twin: what gtsam's stereo factors understand.
+"""Stereo measurements in the rectified rectified_rig: what gtsam's stereo factors understand.
 
 A measurement is (uL, vL, uR) in rectified pixels, uR shifted so that both cameras share one u0; uR is NaN where there
-is no right pixel. The body frame is the rig's own left camera, the sensor its rectified twin.
+is no right pixel. The body frame is the rig's own left camera, the sensor its rectified rectified_rig.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from slam.data import Observations
-from slam.rig import RectifiedTwin, StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import RectifiedTwin, StereoRig
+from slam.geometry.se3 import Array
 
 _NEAREST = 1e-6  # no depth below this [m] is projected
 
@@ -23,13 +23,13 @@ class RectifiedStereo:
     """Projection by a rectified rig, and the way from the original rig's pixels to its.
 
     Attributes:
-        twin: the rectified twin.
+        rectified_rig: the rectified rectified_rig.
         f, u0, v0, baseline: of the rectified rig [px], [m].
         doffs: u0 of the right camera less that of the left [px].
         scale: rectified pixels per original pixel, on average over the image.
     """
 
-    twin: RectifiedTwin
+    rectified_rig: RectifiedTwin
     f: float
     u0: float
     v0: float
@@ -45,18 +45,26 @@ class RectifiedStereo:
     @classmethod
     def of(cls, rig: StereoRig) -> RectifiedStereo:
         """For a rig as calibrated."""
-        twin = rig.rectified
-        left, right = twin.rig.left, twin.rig.right
-        return cls(twin, left.fu, left.u0, left.v0, twin.rig.baseline, right.u0 - left.u0, _scale(twin))
+        rectified_rig = rig.rectified
+        left, right = rectified_rig.rig.left, rectified_rig.rig.right
+        return cls(
+            rectified_rig,
+            left.fu,
+            left.u0,
+            left.v0,
+            rectified_rig.rig.baseline,
+            right.u0 - left.u0,
+            _scale(rectified_rig),
+        )
 
     def measure(self, observations: Observations) -> Array:
         """Measurements (M, 3) = (uL, vL, uR) of observations in the rig's own pixels."""
         z = np.empty((len(observations), 3))
-        if self.twin.original.is_rectified:
+        if self.rectified_rig.original.is_rectified:
             z[:, :2], z[:, 2] = observations.uv_left, observations.uv_right[:, 0]
         else:
-            z[:, :2] = self.twin.rectify_left(observations.uv_left)
-            z[:, 2] = self.twin.rectify_right(observations.uv_right)[:, 0]
+            z[:, :2] = self.rectified_rig.rectify_left(observations.uv_left)
+            z[:, 2] = self.rectified_rig.rectify_right(observations.uv_right)[:, 0]
         z[:, 2] -= self.doffs
         return z
 
@@ -65,7 +73,7 @@ class RectifiedStereo:
 
         Points that are not in front of the camera give NaN measurements and zero Jacobians.
         """
-        R = self.twin.R_left
+        R = self.rectified_rig.R_left
         p = local @ R.T
         behind = p[:, 2] < _NEAREST
         w = 1 / np.where(behind, np.nan, p[:, 2])
@@ -81,14 +89,14 @@ class RectifiedStereo:
         J[:, 2, 2] = (self.u0 - z[:, 2]) * w
         if behind.any():
             J[behind] = 0
-        return z, J if self.twin.original.is_rectified else J @ R
+        return z, J if self.rectified_rig.original.is_rectified else J @ R
 
     def triangulate(self, z: Array) -> Array:
         """Points (N, 3) in the left camera's coordinates; NaN where the disparity is not positive or missing."""
         disparity = z[:, 0] - z[:, 2]
         depth = self.f * self.baseline / np.where(disparity > 0, disparity, np.nan)
         p = np.stack([(z[:, 0] - self.u0) / self.f, (z[:, 1] - self.v0) / self.f, np.ones(len(z))], axis=1)
-        return (p * depth[:, None]) @ self.twin.R_left
+        return (p * depth[:, None]) @ self.rectified_rig.R_left
 
 
 def by_pose(J: Array, local: Array) -> Array:
@@ -101,14 +109,14 @@ def by_pose(J: Array, local: Array) -> Array:
     return out
 
 
-def _scale(twin: RectifiedTwin) -> float:
+def _scale(rectified_rig: RectifiedTwin) -> float:
     """Mean stretch of the left image by rectification."""
-    rig = twin.original
+    rig = rectified_rig.original
     if rig.is_rectified:
         return 1.0
     u, v = np.meshgrid(np.linspace(0.1, 0.9, 9) * rig.width, np.linspace(0.1, 0.9, 9) * rig.height)
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
     right, down = np.array([0.5, 0.0]), np.array([0.0, 0.5])
-    du = twin.rectify_left(uv + right) - twin.rectify_left(uv - right)
-    dv = twin.rectify_left(uv + down) - twin.rectify_left(uv - down)
+    du = rectified_rig.rectify_left(uv + right) - rectified_rig.rectify_left(uv - right)
+    dv = rectified_rig.rectify_left(uv + down) - rectified_rig.rectify_left(uv - down)
     return float(np.sqrt(np.nanmean(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]))))

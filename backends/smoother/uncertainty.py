@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backends.smoother.records import IndexArray, Landmarks, Measurements
+from backends.smoother.measurement_log import IndexArray, Landmarks, Measurements
 from backends.smoother.stereo import RectifiedStereo
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 
 def linearise(

@@ -4,10 +4,10 @@ import numpy as np
 
 from slam.data import Estimate, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
+from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.se3 import inverse, transform
+from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.pose_solver import find_consensus, measurement_rows
-from slam.se3 import inverse, transform
-from slam.trajectory import Trajectory
 
 
 class PoseFit:

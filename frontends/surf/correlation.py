@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import kernel, vector_helper
+from slam.runtime.compilation import kernel, vector_helper
 
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
 _ITERATIONS = 12

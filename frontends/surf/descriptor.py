@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import kernel, vector_helper
+from slam.runtime.compilation import kernel, vector_helper
 
 #: Boxes somewhat wider than cells match better; turned cells gain more by it.
 TURNED_BOX, UPRIGHT_BOX = 1.6, 1.3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from frontends.surf.filters import Filters
 from frontends.surf.integral import column_phases
-from slam.compilation import helper, kernel, vector_helper
+from slam.runtime.compilation import helper, kernel, vector_helper
 
 #: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
 COLUMNS = 6

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import helper, kernel, vector_helper
+from slam.runtime.compilation import helper, kernel, vector_helper
 
 _HALF = 4  # half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
 _SIDE = 2 * _HALF + 1

@@ -17,7 +17,7 @@ from frontends.surf.selection import adapted_threshold, spread
 from frontends.surf.surf import Keypoints, Surf
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SequenceError
-from slam.rig import StereoRig
+from slam.geometry.rig import StereoRig
 
 _SURPLUS = 1.35  # features detected for each one needed, to have a choice when spreading them
 _CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima
@@ -81,7 +81,7 @@ class SurfFrontend:
         return self._rectify(image, side)
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
-        """Image of the rectified twin's left (0) or right (1) camera."""
+        """Image of the rectified rectified_rig's left (0) or right (1) camera."""
         if self.rig.is_rectified:
             return image
         import cv2
@@ -153,9 +153,9 @@ class SurfFrontend:
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""
-        twin = self.rig.rectified.rig
-        shift = twin.left.u0 - twin.right.u0
-        product = twin.left.fu * twin.baseline
+        rectified_rig = self.rig.rectified.rig
+        shift = rectified_rig.left.u0 - rectified_rig.right.u0
+        product = rectified_rig.left.fu * rectified_rig.baseline
         return product / self.config.max_depth + shift, product / self.config.min_depth + shift
 
     def _features(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import kernel
+from slam.runtime.compilation import kernel
 
 
 def integral_image(image: NDArray) -> NDArray[np.int32]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import helper, kernel, vector_helper
+from slam.runtime.compilation import helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
 _SIZE_STEP = 0.3  # of those in size

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import kernel, vector_helper
 from slam.errors import MeasurementError
+from slam.runtime.compilation import kernel, vector_helper
 
 
 class Matches(NamedTuple):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.compilation import helper, kernel, vector_helper
+from slam.runtime.compilation import helper, kernel, vector_helper
 
 RADIUS = 6  # of the sampled disc, in units of the feature's scale s
 _SIGMA = 2.5  # of the Gaussian weight, in the same units

@@ -19,8 +19,8 @@ from frontends.surf.integral import integral_image
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
 from frontends.surf.workers import SHARES, Workers
-from slam.compilation import announce_compilation
 from slam.errors import ConfigurationError
+from slam.runtime.compilation import announce_compilation
 
 if TYPE_CHECKING:
     import cv2

@@ -9,16 +9,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from slam.alignment import Alignment
-from slam.association_truth import SurfacePoints, TrueWorld
 from slam.compare.measure import object_figures
 from slam.data import FrameResult, FrameStatus, IdArray
 from slam.errors import TrajectoryError
-from slam.evaluation import consistency, evaluate
-from slam.metrics import associate, nees, pose_residuals, relative_errors
-from slam.se3 import Array, inverse, nearest_rotation, rotation_angle
+from slam.evaluation.association_truth import SurfacePoints, TrueWorld
+from slam.evaluation.metrics import associate, nees, pose_residuals, relative_errors
+from slam.evaluation.summary import consistency, evaluate
+from slam.geometry.alignment import Alignment
+from slam.geometry.se3 import Array, inverse, nearest_rotation, rotation_angle
+from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
-from slam.trajectory import Trajectory
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]

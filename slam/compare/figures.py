@@ -14,10 +14,10 @@ from slam.compare.measure import Metric
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.compare.trial import SERIES
-from slam.metrics import align, associate, chi_square_band
-from slam.se3 import Array
+from slam.evaluation.metrics import align, associate, chi_square_band
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
-from slam.trajectory import Trajectory
 
 COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#ad1457", "#558b2f")
 _WIDTH = 5.2  # [inch] about that of a phone: text stays readable where the picture fills the screen

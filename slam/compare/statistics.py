@@ -15,7 +15,7 @@ from enum import Enum
 import numpy as np
 
 from slam.compare.measure import Metric
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 LEVEL = 0.95
 _RESAMPLES = 9999

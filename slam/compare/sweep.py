@@ -30,7 +30,7 @@ from slam.compare.trial import (
     run_trial,
 )
 from slam.errors import SlamError
-from slam.outputs import write_json
+from slam.run.outputs import write_json
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"

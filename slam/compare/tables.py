@@ -13,7 +13,7 @@ from slam.compare.measure import BY_KEY, COMPLETED, METRICS, Metric, object_metr
 from slam.compare.plan import Plan, Variant
 from slam.compare.statistics import Difference, difference
 from slam.compare.sweep import Run
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 
 @dataclass(frozen=True)

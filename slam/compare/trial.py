@@ -19,11 +19,11 @@ from slam.compare.plan import CLOSED_LOOP, SIMULATED, Trial
 from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.config import SystemConfig
 from slam.errors import SlamError
+from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
-from slam.recording_file import load_recording
-from slam.runner import RunOptions, run, run_recording
+from slam.run.recording import load_recording
+from slam.run.runner import RunOptions, run, run_recording
 from slam.sequences import Sequence, open_sequence
-from slam.trajectory import Trajectory
 from slam.worlds import WorldSequence
 
 #: Files of a run by name.

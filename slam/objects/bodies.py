@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
-from slam.objects.data import ObjectEstimate
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, so3_log
+from slam.object_data import ObjectEstimate
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
-from slam.se3 import Array, adjoint, inverse, so3_exp, so3_log
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found

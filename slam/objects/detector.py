@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
+from slam.object_data import MotionLabels, MovingObject, ObjectObservations
 from slam.objects import membership
 from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, outermost, with_extent
 from slam.objects.config import ObjectsConfig
-from slam.objects.data import Judgement, MovingObject, ObjectObservations
 from slam.objects.displacements import displacements
 from slam.objects.following import follow
 from slam.objects.measurement import measure
@@ -25,8 +27,6 @@ from slam.objects.recovery import locate
 from slam.objects.regions import judge_scene, limit
 from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, record
 from slam.objects.twists import fit_twist
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse, transform
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
@@ -59,7 +59,7 @@ class MovingObjectDetector:
         self._estimated: set[int] = set()  # bodies that the back end knows
         self.suspects = np.zeros(0, np.int64)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
@@ -67,7 +67,7 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
-    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
+    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
@@ -252,7 +252,7 @@ class MovingObjectDetector:
         record(tracks, new, self.slot, *measure(self.rig, T_world_left, points, z, self.sigma))
         fit_positions(tracks, new)
 
-    def _judgement(self, features: StereoFeatures) -> Judgement:
+    def _judgement(self, features: StereoFeatures) -> MotionLabels:
         tracks = self.tracks
         assert tracks is not None
         on, near = membership.on_bodies(self.bodies, tracks, self.config.margin)
@@ -262,7 +262,7 @@ class MovingObjectDetector:
         moving, undecided = np.zeros(len(features), bool), np.zeros(len(features), bool)
         moving[tracks.row[on]] = True
         undecided[tracks.row[near]] = undecided[tracks.row[doubtful]] = True
-        return Judgement(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
+        return MotionLabels(np.flatnonzero(moving), np.flatnonzero(undecided & ~moving), landmarks[landmarks >= 0])
 
     # ------------------------------------------------------------------------------------------- a step, second part
 

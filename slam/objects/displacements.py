@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import Array
 from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks
-from slam.se3 import Array
 
 _RECENT = 5  # frames
 

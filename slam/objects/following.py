@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far, match_near
 from slam.objects.pixel_kernels import pixel_deviations
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import Tracks
-from slam.rig import StereoRig
-from slam.se3 import Array, transform
 
 _SIGMAS = 3.0
 _RIGHT_SIGMAS = 4.0

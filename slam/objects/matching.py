@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.se3 import Array
 from slam.objects.pixel_kernels import best_in_windows, best_of_products
-from slam.se3 import Array
 
 _NEIGHBOURS = 8  # features looked at in a window: the nearest ones
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.objects.pixel_kernels import information_in_world, move_along_rays
-from slam.rig import StereoRig
-from slam.se3 import Array
 
 _FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
 _STEPS = 4

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.gating import chi_square_limits
+from slam.geometry.se3 import Array, exp, hat, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.track_kernels import (
@@ -25,7 +25,7 @@ from slam.objects.track_kernels import (
     weighted_means,
 )
 from slam.objects.tracks import Tracks, median, times_vectors
-from slam.se3 import Array, exp, hat, transform
+from slam.tracking.gating import chi_square_limits
 
 _MISFITS = 3  # times that a track may disagree with its body before it leaves
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body

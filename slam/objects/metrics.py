@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
-from slam.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
+from slam.geometry.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
 
 _SINGULAR = 1e-9  # smallest eigenvalue of a matrix of correlations that counts
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size

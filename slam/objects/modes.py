@@ -7,11 +7,11 @@ from typing import Protocol
 import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
+from slam.object_data import MotionLabels, MovingObject
 from slam.objects.config import ObjectsConfig
-from slam.objects.data import Judgement, MovingObject
-from slam.rig import StereoRig
 
 
 class ObjectDetector(Protocol):
@@ -22,11 +22,11 @@ class ObjectDetector(Protocol):
         """Ids of landmarks that may move: they do not measure the camera's next pose."""
         ...
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget the tracks and bodies, which do not go on where the camera was carried off; ids are not used again."""
         ...
 
-    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
+    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Say which features move, before any of them becomes a landmark.
 
         Args:
@@ -46,13 +46,13 @@ class NoDetector:
 
     suspects: IdArray = np.zeros(0, np.int64)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """There is nothing to forget."""
 
-    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
+    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
-        return Judgement(none, none, np.zeros(0, np.int64))
+        return MotionLabels(none, none, np.zeros(0, np.int64))
 
     def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
         """No objects."""
@@ -71,8 +71,8 @@ def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels)
         from slam.objects.procedure1 import Procedure1Detector
 
         return Procedure1Detector(rig, config, models)
-    from slam.compilation import announce_compilation  # brings Numba, as the detector does
     from slam.objects.detector import MovingObjectDetector
+    from slam.runtime.compilation import announce_compilation  # brings Numba, as the detector does
 
     announce_compilation("slam.", "the kernels for cameras and moving objects: some twenty seconds")
     return MovingObjectDetector(rig, config, models)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.compilation import helper, kernel
+from slam.runtime.compilation import helper, kernel
 
 
 @kernel

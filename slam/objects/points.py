@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
-from slam.se3 import Array, transform
+from slam.geometry.se3 import Array, transform
 
 Projection = Callable[[Array], tuple[Array, Array]]
 

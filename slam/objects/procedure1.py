@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.errors import ConfigurationError
-from slam.euler import angles
+from slam.geometry.euler import angles
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, log, pose, transform
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
+from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
-from slam.objects.data import Judgement, MovingObject, ObjectEstimate
 from slam.objects.matching import match_far
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse, log, pose, transform
 
 _STEP = 1e-5  # of the finite differences [m]
 _CANDIDATES = 12  # features with the largest determinants among which a triple is looked for
@@ -240,11 +240,11 @@ class Procedure1Detector:
         self._covariance: Array = np.eye(6)
         self._last: tuple[float, Array] | None = None
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """The database goes on; the last pose does not."""
         self._last = None
 
-    def judge(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> Judgement:
+    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Recognise the object's features and find its motion; no other feature is judged."""
         c, d = self.config, self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
@@ -265,7 +265,7 @@ class Procedure1Detector:
             noise = R @ self.rig.triangulation_covariance(local[at], self.sigma) @ R.T
             self._covariance = motion_covariance(points[at], d.points[self.motion.database], d.origin, noise)
         moved = np.unique(landmark[rows][landmark[rows] >= 0])
-        return Judgement(np.sort(rows), np.zeros(0, np.intp), moved)
+        return MotionLabels(np.sort(rows), np.zeros(0, np.intp), moved)
 
     def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
         """The object, where it was measured in this frame; the back end is not asked."""

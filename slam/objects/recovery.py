@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
 from slam.objects.tracks import Tracks
-from slam.pose_solver import find_consensus, measurement_rows
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse, transform
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60

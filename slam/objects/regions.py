@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
+from slam.geometry.se3 import Array
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
 from slam.objects.tracks import median, times_vectors
-from slam.se3 import Array
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
 _ROUNDS = (3, 2)  # of reweighting: Huber's first, which has one minimum, then a sharper one

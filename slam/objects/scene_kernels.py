@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.compilation import helper, kernel
+from slam.runtime.compilation import helper, kernel
 
 _CELLS = 2**12  # more than there are windows along an axis
 _TRACKS = 2**20  # more than there are tracks

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.compilation import helper, kernel
+from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # share of the trace, for information over a whole window, and
 _PART = 1e-6  # for a part of it

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.se3 import Array
 from slam.objects.track_kernels import even_motions, fit_fixed_points, leave_window, measurements
-from slam.se3 import Array
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 _MOVES = 12.0  # χ²(3) of the velocity from which it counts: 1 % of still points
@@ -165,7 +165,7 @@ def fit_positions(tracks: Tracks, rows: NDArray[np.intp]) -> None:
 
 
 @dataclass(frozen=True)
-class EvenMotion:
+class ConstantVelocity:
     """Points with an even velocity, a row each.
 
     Attributes:
@@ -183,7 +183,7 @@ class EvenMotion:
     test: Array
 
 
-def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> EvenMotion:
+def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> ConstantVelocity:
     """Points with an even velocity, fitted to the windows of tracks.
 
     Args:
@@ -193,7 +193,7 @@ def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed:
         max_speed: deviation of velocities before anything is known [m/s].
     """
     points, *rest = even_motions(tracks.A, tracks.p, rows, times, max_speed**-2)
-    return EvenMotion(tracks.anchor[rows] + points, *rest)
+    return ConstantVelocity(tracks.anchor[rows] + points, *rest)
 
 
 def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> None:

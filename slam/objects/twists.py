@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.se3 import Array, hat
+from slam.geometry.se3 import Array, hat
 
 _TURN_SIGMA = 1.0  # of the angular velocity, before anything is known [rad/s]
 

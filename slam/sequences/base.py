@@ -8,10 +8,10 @@ from typing import Protocol, runtime_checkable
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
-from slam.trajectory import Trajectory
 
 
 @runtime_checkable

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from slam.camera import PinholeCamera
 from slam.errors import CalibrationError
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse
 
 _MODELS = {
     "radial-tangential": "radtan",

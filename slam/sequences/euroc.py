@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
-from slam.se3 import Array, pose, rotation_from_quaternion
+from slam.geometry.se3 import Array, pose, rotation_from_quaternion
+from slam.geometry.stamps import increasing
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import ImuCamera, euroc_camera, kalibr_cameras, rig_from_cameras
 from slam.sequences.faults import FaultLog
-from slam.sequences.pairing import increasing
 from slam.sequences.source import (
     ImagePairs,
     Listing,
@@ -23,7 +24,6 @@ from slam.sequences.source import (
     require_size,
 )
 from slam.sequences.tables import read_rows, shorten, stamp_and_name
-from slam.trajectory import Trajectory
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")

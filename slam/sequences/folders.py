@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import kalibr_cameras, read_text, rig_from_cameras
 from slam.sequences.faults import FaultLog

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import SequenceError, TrajectoryError
-from slam.rig import StereoRig
-from slam.se3 import Array, pose
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, pose
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import (
     kitti_matrix,
@@ -20,7 +21,6 @@ from slam.sequences.calibration import (
 from slam.sequences.faults import FaultLog
 from slam.sequences.source import ImagePairs, Listing, Size, numbered, pair_listings, stamped
 from slam.sequences.tables import read_rows, seconds
-from slam.trajectory import Trajectory
 
 #: Frames per second where there is no times.txt.
 RATE = 10.0

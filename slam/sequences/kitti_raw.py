@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import CalibrationError, SequenceError
-from slam.rig import StereoRig
-from slam.se3 import Array, inverse, pose
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, pose
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import (
     kitti_matrix,
@@ -22,7 +23,6 @@ from slam.sequences.kitti import RATE, choose_pair
 from slam.sequences.oxts import read_oxts
 from slam.sequences.source import ImagePairs, Listing, Size, numbered, pair_listings, stamped
 from slam.sequences.tables import date_time, read_rows, shorten
-from slam.trajectory import Trajectory
 
 _PAIRS = (("00", "01"), ("02", "03"))  # grey first, colour where there is no grey
 

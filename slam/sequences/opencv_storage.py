@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from slam.camera import PinholeCamera
 from slam.errors import CalibrationError
-from slam.rig import StereoRig
-from slam.se3 import Array, pose, so3_exp
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, pose, so3_exp
 from slam.sequences.calibration import naming, read_text, read_yaml, rig_from_projections, rig_from_transform
 from slam.sequences.source import Size
 

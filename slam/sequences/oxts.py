@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import SequenceError
-from slam.se3 import Array, pose
+from slam.geometry.se3 import Array, pose
+from slam.geometry.stamps import increasing
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
-from slam.sequences.pairing import increasing
 from slam.sequences.tables import date_time, read_rows, shorten
-from slam.trajectory import Trajectory
 
 _EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.se3 import Array
+from slam.geometry.se3 import Array
+from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import IMAGE_SUFFIXES, read_image
-from slam.sequences.pairing import IntArray, increasing, pair, trim
 
 Size = tuple[int, int]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import quiet_opencv
 from slam.sequences.source import Size

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations, UpdateStatus
+from slam.geometry import se3
 from slam.models import MotionModel
 from slam.testing.scene import (
     DT,

@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations
 from slam.errors import MeasurementError
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
-from slam.objects.data import ObjectEstimate, ObjectObservations
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 Factory = Callable[..., Backend]
 

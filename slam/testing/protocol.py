@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry import se3
 from slam.testing.scene import (
     DT,
     MODELS,

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from slam import se3
-from slam.camera import PinholeCamera
 from slam.data import BoolArray, Observations, Prediction, UpdateReport
+from slam.geometry import se3
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
-from slam.rig import StereoRig
-from slam.se3 import Array
 
 Factory = Callable[..., Backend]
 

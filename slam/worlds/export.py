@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from slam.camera import PinholeCamera
 from slam.errors import SequenceError
-from slam.euler import angles
-from slam.se3 import Array, inverse, transform
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.euler import angles
+from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.trajectory import Trajectory
 from slam.sequences.base import frame_range
-from slam.trajectory import Trajectory
 from slam.worlds.sequence import WorldSequence
 
 #: Steps per metre of the depth images, by kind of motion: 16 bits then reach 32 m or 256 m.

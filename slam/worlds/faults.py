@@ -11,8 +11,8 @@ import numpy as np
 
 from slam.data import BoolArray
 from slam.errors import ConfigurationError
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.worlds.observe import SimulatedFeatures
 
 _CHOSEN = ("drop", "dropright", "black", "bright", "blur", "burst", "hand")

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from slam.data import BoolArray, IdArray
-from slam.se3 import Array, transform
+from slam.geometry.se3 import Array, transform
 
 
 class Texture(Protocol):

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from slam.camera import PinholeCamera
-from slam.se3 import Array
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.se3 import Array
 
 
 class View(NamedTuple):

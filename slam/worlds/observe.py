@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import hidden
 from slam.worlds.world import World
 

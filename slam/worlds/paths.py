@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam.euler import rotation
-from slam.se3 import Array, pose
+from slam.geometry.euler import rotation
+from slam.geometry.se3 import Array, pose
 
 #: Camera axes of a level camera that looks along world +y: x right, y down, z forward.
 R_LEVEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
 from slam.worlds.lens import View
 

@@ -18,7 +18,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
 from slam.worlds.lens import View
 from slam.worlds.placing import Placed, place

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.se3 import Array, exp, inverse, log
+from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults
 from slam.worlds.imaging import ImagingModel, sense
 from slam.worlds.lens import Lens

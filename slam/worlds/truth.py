@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam.camera import PinholeCamera
-from slam.se3 import Array
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
 from slam.worlds.world import World
 

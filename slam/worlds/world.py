@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from slam.data import IdArray
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
 
 

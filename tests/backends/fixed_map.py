@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam import se3
 from slam.data import Estimate, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
-from slam.gating import chi_square_gate
+from slam.geometry import se3
+from slam.geometry.pnp import find_consensus
+from slam.geometry.rig import StereoRig
+from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.pose_solver import find_consensus
-from slam.rig import StereoRig
-from slam.trajectory import Trajectory
+from slam.tracking.gating import chi_square_gate
 
 MODELS = EstimatorModels()
 

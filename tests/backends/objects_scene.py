@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations
+from slam.evaluation.metrics import nees
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
-from slam.metrics import nees
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.objects.data import ObjectEstimate, ObjectObservations
-from slam.rig import StereoRig
-from slam.se3 import Array
+from slam.object_data import ObjectEstimate, ObjectObservations
 
 SIGMA = 0.7
 HANDHELD = StereoRig.rectified_pair(260.0, 159.5, 119.5, 0.12, 320, 240)

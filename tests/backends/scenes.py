@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam import se3
 from slam.data import Observations, UpdateReport
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.models import MotionModel
-from slam.rig import StereoRig
-from slam.se3 import Array
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import backends
-from slam import se3
+from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import RIG, path, run, scene
 

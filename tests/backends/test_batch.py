@@ -13,13 +13,13 @@ from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.solver import SolverError
-from slam import se3
-from slam.map_management import MapConfig
-from slam.metrics import absolute_errors
+from slam.evaluation.metrics import absolute_errors
+from slam.geometry import se3
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.selection import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.replay import replay
-from slam.trajectory import Trajectory
-from slam.worlds.recording import true_recording
+from slam.run.replay import replay
+from slam.run.simulated_recording import true_recording
 from tests.backends.scenes import RIG, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
@@ -62,7 +62,7 @@ def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
     original = batch_module._Solution
 
     def solution(smoother):
-        solved.append(smoother.records.path.count)
+        solved.append(smoother.measurement_log.path.count)
         return original(smoother)
 
     monkeypatch.setattr(batch_module, "_Solution", solution)

@@ -9,9 +9,9 @@ from threadpoolctl import threadpool_limits
 
 import backends.ekf.filter as ekf_filter
 from backends.ekf import EkfBackend
-from slam import se3
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError
+from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
 from tests.slam.numeric import jacobian
@@ -138,7 +138,7 @@ def test_augmentation_is_the_derivative_of_triangulation(drive, landmarks):
 
     def coordinates(x):
         turned = ekf_filter.attitude(backend._R_world_angles, x[3:6])
-        return marks.coordinates.of(marks.charts[-1:], x[:3] + (h + x[6:]) @ turned.T)[0]
+        return marks.coordinates.of(marks.anchors[-1:], x[:3] + (h + x[6:]) @ turned.T)[0]
 
     J = jacobian(coordinates, np.concatenate([camera[:6], np.zeros(3)]))
     whole = backend._covariance.full()
@@ -387,8 +387,8 @@ def test_what_nothing_measures_stays_unknown(drive, landmarks):
         shift[3:6, 3:] = np.linalg.inv(A)
         shift[6:9, 3:] = -se3.hat(camera[6:9])
         if not consistent:
-            marks.refer(np.arange(len(marks)))
-        shift[12:] = marks.by_world.reshape(-1, 6)
+            marks.transport(np.arange(len(marks)))
+        shift[12:] = marks.gauge_jacobian.reshape(-1, 6)
         information = sigma**2 * shift.T @ np.linalg.solve(backend._covariance.full(), shift)
         learnt.append(np.diag(information))
     assert (learnt[0] < 1.01).all()  # less than 1 where the model's impulses have loosened it

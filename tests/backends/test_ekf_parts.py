@@ -20,9 +20,9 @@ from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks
 from backends.ekf.measurement import StereoMeasurement, innovation_covariances, stacked
 from backends.ekf.solve import Problem, _iterate, gate, solve
-from slam import se3
 from slam.errors import MeasurementError
-from slam.euler import angles, body_rate_matrix, rotation
+from slam.geometry import se3
+from slam.geometry.euler import angles, body_rate_matrix, rotation
 from slam.testing import GENERAL_RIG
 from tests.backends.scenes import RIG
 from tests.slam.numeric import jacobian
@@ -106,7 +106,7 @@ def test_the_jacobian_of_a_new_angles_world(phi):
 
 
 def model(rig, world) -> StereoMeasurement:
-    """With landmarks in world coordinates: they have no charts."""
+    """With landmarks in world coordinates: they have no anchors."""
     return StereoMeasurement(rig, world, Euclidean(), np.zeros((0, 3, 4)))
 
 
@@ -157,28 +157,28 @@ def test_innovation_covariances_are_blocks_of_the_dense_ones():
 @pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
 def test_coordinates_there_and_back(coordinates):
     rng = np.random.default_rng(0)
-    charts = np.concatenate([se3.so3_exp(rng.standard_normal((5, 3))), rng.standard_normal((5, 3, 1))], axis=2)
+    anchors = np.concatenate([se3.so3_exp(rng.standard_normal((5, 3))), rng.standard_normal((5, 3, 1))], axis=2)
     local = rng.uniform((-2, -2, 1), (2, 2, 60), (5, 3))
-    points = (charts[:, :, :3] @ local[:, :, None])[:, :, 0] + charts[:, :, 3]
-    c = coordinates.of(charts, points)
-    np.testing.assert_allclose(coordinates.points(charts, c), points, atol=1e-10)
-    for i, D in enumerate(coordinates.jacobian(charts, c)):
-        numeric = jacobian(lambda x, i=i: coordinates.points(charts[[i]], x[None])[0], c[i], 1e-6 * abs(c[i, 2]))
+    points = (anchors[:, :, :3] @ local[:, :, None])[:, :, 0] + anchors[:, :, 3]
+    c = coordinates.of(anchors, points)
+    np.testing.assert_allclose(coordinates.points(anchors, c), points, atol=1e-10)
+    for i, D in enumerate(coordinates.jacobian(anchors, c)):
+        numeric = jacobian(lambda x, i=i: coordinates.points(anchors[[i]], x[None])[0], c[i], 1e-6 * abs(c[i, 2]))
         np.testing.assert_allclose(D, numeric, rtol=1e-4, atol=1e-4)
 
 
 def test_a_pixel_error_at_first_sight_is_linear_in_inverse_depth():
     h = np.array([[3.0, -1.0, 60.0]])
-    chart = np.eye(3, 4)[None]
+    anchor = np.eye(3, 4)[None]
     z = RIG.project_stereo(h)[0]
-    c = [InverseDepth().of(chart, RIG.triangulate(z[:, :2], z[:, [2, 1]] + [d, 0]))[0] for d in (-0.5, 0.0, 0.5)]
+    c = [InverseDepth().of(anchor, RIG.triangulate(z[:, :2], z[:, [2, 1]] + [d, 0]))[0] for d in (-0.5, 0.0, 0.5)]
     np.testing.assert_allclose(c[0] + c[2], 2 * c[1], atol=1e-12)
 
 
 def test_landmarks_keep_their_names():
-    marks, charts = Landmarks(InverseDepth()), np.tile(np.eye(3, 4), (4, 1, 1))
+    marks, anchors = Landmarks(InverseDepth()), np.tile(np.eye(3, 4), (4, 1, 1))
     points = np.arange(12.0).reshape(4, 3) + 1
-    marks.append(np.array([7, 3, 9, 1]), charts, points)
+    marks.append(np.array([7, 3, 9, 1]), anchors, points)
     marks.remove(np.array([3, 9]), np.array([1]), np.array([3]))
     assert marks.ids.tolist() == [7, 1] and marks.slots([1, 7]).tolist() == [1, 0]
     np.testing.assert_allclose(marks.points, points[[0, 3]])

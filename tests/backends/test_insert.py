@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import backends
-from slam import se3
 from slam.data import Observations, UpdateStatus
 from slam.errors import MeasurementError
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 from slam.interfaces import MapBackend
 from slam.models import EstimatorModels
-from slam.rig import StereoRig
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=640, height=480)
 SIGMA = 0.5
@@ -151,7 +151,7 @@ def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
 
     def forget(k, backend):
         if k == 5:
-            backend.records.forget_measurements()
+            backend.measurement_log.forget_measurements()
             backend._graph._rebuild(solved=False)
 
     forgotten = tracked("smoother", scene, disturb=forget, share=0.4)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import backends
-from slam import se3
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry import se3
 from slam.interfaces import ObjectBackend
-from slam.objects.data import ObjectObservations
-from slam.objects.models import ObjectModels
+from slam.object_data import ObjectObservations
+from slam.object_models import ObjectModels
 from slam.testing import GENERAL_RIG
 from tests.backends.objects_scene import BodyScene, box_scene, car_scene, follow, score
 

@@ -13,9 +13,9 @@ from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change
 from backends.smoother.objects_factors import System, add_measurements, add_motion, velocities
 from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
 from backends.smoother.stereo import RectifiedStereo
-from slam import se3
-from slam.metrics import chi_square_band
-from slam.objects.models import ObjectModels
+from slam.evaluation.metrics import chi_square_band
+from slam.geometry import se3
+from slam.object_models import ObjectModels
 from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
 from tests.backends.objects_scene import HANDHELD, KITTI, SIGMA, box_points, box_scene, car_scene, follow, score
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from backends.smoother import SmootherBackend, growth
-from slam import se3
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import RIG, observe, path, run, scene, step
 
@@ -31,10 +31,10 @@ def errors(T, truth):
 
 def measurements_in_factors(backend: SmootherBackend) -> list[int]:
     """Rows of all measurements that are in some factor, with repetition."""
-    records = backend.records
-    rows = [row for finished in records.history.finished for row in finished.tolist()]
-    rows += [row for explicit in records.history.explicit.values() for row in explicit]
-    return rows + [row for track in records.landmarks.tracks.values() for row in track.rows]
+    measurement_log = backend.measurement_log
+    rows = [row for finished in measurement_log.history.finished for row in finished.tolist()]
+    rows += [row for explicit in measurement_log.history.explicit.values() for row in explicit]
+    return rows + [row for track in measurement_log.landmarks.tracks.values() for row in track.rows]
 
 
 @pytest.mark.parametrize("options", [{}, {"explicit": 0}, {"track": 3, "explicit": 5}, {"lag": 12}], ids=str)
@@ -44,7 +44,7 @@ def test_every_measurement_is_in_one_factor(options):
     run(backend, data)
     rows = measurements_in_factors(backend)
     assert len(rows) == len(set(rows)), "a measurement is used twice"
-    accepted = np.flatnonzero(backend.records.measurements.landmark >= 0)
+    accepted = np.flatnonzero(backend.measurement_log.measurements.landmark >= 0)
     # Only what never became a factor may be missing: tracks of one measurement that ended.
     assert len(set(accepted.tolist()) - set(rows)) < 0.1 * len(accepted)
     moved, turned = errors(backend.trajectory().poses, data.poses)
@@ -58,14 +58,14 @@ def test_smart_factors_grow_and_are_finished():
     longest, restarted = 0, 0
     for k, (stamp, _, seen) in enumerate(data):
         step(backend, stamp, seen, known)
-        tracks = backend.records.landmarks.tracks.values()
+        tracks = backend.measurement_log.landmarks.tracks.values()
         longest = max([longest, *(len(t) for t in tracks)])
         restarted += sum(len(t) == 0 for t in tracks)
         assert all(len(t) < t.limit for t in tracks), f"frame {k}: a track is longer than its limit"
         assert all((t.factor >= 0) == t.informative for t in tracks)
     assert 5 <= longest < 2 * 5, "limits lie between one and two times the option"
-    assert restarted and len(backend.records.history.finished) > 20
-    lengths = {len(rows) for rows in backend.records.history.finished}
+    assert restarted and len(backend.measurement_log.history.finished) > 20
+    lengths = {len(rows) for rows in backend.measurement_log.history.finished}
     assert max(lengths) < 10 and len(lengths) > 1
 
 
@@ -73,12 +73,12 @@ def test_well_known_landmarks_become_variables_up_to_the_limit():
     data = drive(30)
     backend = SmootherBackend(RIG, MODELS, track=4, explicit=7)
     run(backend, data)
-    marks = backend.records.landmarks
+    marks = backend.measurement_log.landmarks
     explicit = marks.variable[marks.used()]
     assert (explicit >= 0).any() and len(set(explicit[explicit >= 0].tolist())) == (explicit >= 0).sum()
     in_view = np.isin(marks.ids, data.observations[-1].ids) & (marks.variable >= 0)
     assert in_view.sum() <= 7
-    assert backend.records.history.finished, "the others go on in smart factors"
+    assert backend.measurement_log.history.finished, "the others go on in smart factors"
 
 
 def test_what_removed_landmarks_have_told_stays_known():
@@ -87,7 +87,9 @@ def test_what_removed_landmarks_have_told_stays_known():
     run(backend, data)
     before, P = backend.trajectory(), backend.estimate().covariance
     rows = sorted(measurements_in_factors(backend))
-    informative = {row for t in backend.records.landmarks.tracks.values() if not t.informative for row in t.rows}
+    informative = {
+        row for t in backend.measurement_log.landmarks.tracks.values() if not t.informative for row in t.rows
+    }
     backend.remove(backend.estimate().ids)
     assert len(backend.estimate().ids) == 0
     assert set(measurements_in_factors(backend)) == set(rows) - informative
@@ -197,7 +199,7 @@ def test_landmarks_in_the_map_outlast_the_lag():
     for k, T in enumerate(poses):
         step(backend, DT * k, observe(T, points, 1.0, rng, limit=12), known)
         if k == 60:
-            marks = backend.records.landmarks
+            marks = backend.measurement_log.landmarks
             first = [
                 i for i in known if marks.last[marks.slots([i])[0]] < 15 and marks.variable[marks.slots([i])[0]] >= 0
             ]
@@ -209,7 +211,7 @@ def test_landmarks_in_the_map_outlast_the_lag():
     for k in range(10):
         step(backend, DT * (len(poses) + k), observe(poses[-1], points, 1.0, rng, limit=12), known)
     keys = set(backend._graph._solver.values().keys())
-    assert all(key in keys for key in backend.records.landmarks.variable.tolist() if key >= 0)
+    assert all(key in keys for key in backend.measurement_log.landmarks.variable.tolist() if key >= 0)
 
 
 def test_a_landmark_that_left_the_lag_may_be_seen_again():
@@ -224,8 +226,8 @@ def test_a_landmark_that_left_the_lag_may_be_seen_again():
         assert step(backend, stamp, seen, known).status in (UpdateStatus.OK, UpdateStatus.EMPTY)
     moved, turned = errors(backend.trajectory().poses, data.poses)
     assert moved.max() < 0.05 and turned.max() < 0.01
-    keys = backend.records.history.explicit
-    assert len({key for key in backend.records.landmarks.variable.tolist() if key >= 0} - set(keys)) == 0
+    keys = backend.measurement_log.history.explicit
+    assert len({key for key in backend.measurement_log.landmarks.variable.tolist() if key >= 0} - set(keys)) == 0
 
 
 def test_the_lag_is_not_shorter_than_the_window():
@@ -280,11 +282,11 @@ def test_no_two_landmarks_share_a_variable(monkeypatch):
     for k, (stamp, _, seen) in enumerate(data):
         step(backend, stamp, seen, known)
         if k % 5 == 4:
-            slots = np.flatnonzero(backend.records.landmarks.variable >= 0)[:3]
-            for slot, key in zip(slots, backend.records.landmarks.variable[slots].tolist()):
-                rows = np.array(backend.records.history.explicit[key])
+            slots = np.flatnonzero(backend.measurement_log.landmarks.variable >= 0)[:3]
+            for slot, key in zip(slots, backend.measurement_log.landmarks.variable[slots].tolist()):
+                rows = np.array(backend.measurement_log.history.explicit[key])
                 for row in rows[::-1]:
-                    backend.records.take_back(np.array([slot]), np.array([row]))
+                    backend.measurement_log.take_back(np.array([slot]), np.array([row]))
             backend._graph._recover()
     numbers = [gtsam.symbolIndex(key) for key in given]
     assert len(numbers) > 20 and len(set(numbers)) == len(numbers)
@@ -295,7 +297,7 @@ def test_the_path_that_is_asked_for_is_solved_to_the_last():
     loose, tight = (SmootherBackend(RIG, MODELS, relinearise=px) for px in (0.3, 0.001))
     run(loose, data)
     run(tight, data)
-    before = errors(loose.records.path.poses, tight.records.path.poses)[0].max()
+    before = errors(loose.measurement_log.path.poses, tight.measurement_log.path.poses)[0].max()
     after = errors(loose.trajectory().poses, tight.trajectory().poses)[0].max()
     assert after < 0.1 * before and after < 2e-4, (before, after)
     assert loose.estimate().covariance.shape == (6, 6)

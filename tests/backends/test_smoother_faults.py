@@ -1,4 +1,4 @@
-"""gtsam fails: the smoother rebuilds from its records and the run goes on, the same way every time."""
+"""gtsam fails: the smoother rebuilds from its measurement_log and the run goes on, the same way every time."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 
 from backends import smoother
 from backends.smoother import SmootherBackend, rebuild, solver
-from slam import se3
 from slam.data import Observations, UpdateStatus
+from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from tests.backends.scenes import RIG, path, run, scene, step
 
@@ -211,13 +211,13 @@ def test_starting_over_keeps_the_path(break_isam):
     known: set[int] = set()
     for k, (stamp, _, seen) in enumerate(data):
         if k == 15:
-            backend.records.forget_measurements()
+            backend.measurement_log.forget_measurements()
             backend._graph._rebuild(solved=False)
             before = backend.trajectory().poses
             off = se3.log(se3.inverse(data.poses[:15]) @ before)
             assert np.abs(off).max() < 0.05
         assert step(backend, stamp, seen, known).status in (UpdateStatus.OK, UpdateStatus.EMPTY)
-    assert backend.records.history.restarted == 15
+    assert backend.measurement_log.history.restarted == 15
     near_the_truth(backend, data, factor=4)  # the first half's measurements are gone
 
 

@@ -8,8 +8,8 @@ import pytest
 import frontends
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
-from slam.rig import StereoRig
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)

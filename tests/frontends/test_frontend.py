@@ -12,8 +12,8 @@ import frontends
 from frontends.surf import SurfConfig, SurfFrontend
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
-from slam.rig import StereoRig
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -171,7 +171,7 @@ def test_options_override_a_configuration():
 
 
 def test_without_a_folder_for_the_cache_kernels_still_run(monkeypatch, caplog):
-    from slam import compilation
+    from slam.runtime import compilation
 
     real = compilation.njit
 

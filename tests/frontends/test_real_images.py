@@ -8,7 +8,7 @@ import pytest
 
 from frontends.surf import SurfFrontend
 from slam.data import StereoFrame
-from slam.rig import StereoRig
+from slam.geometry.rig import StereoRig
 
 
 def test_middlebury_disparities(slam_data):

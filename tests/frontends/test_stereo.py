@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from frontends.surf import SurfFrontend
-from slam import se3
-from slam.camera import PinholeCamera
 from slam.data import StereoFrame
-from slam.rig import StereoRig
+from slam.geometry import se3
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
 from tests.frontends.scenes import photograph, stereo_pair, texture
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)

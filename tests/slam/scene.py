@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam import se3
 from slam.data import StereoFeatures
-from slam.rig import StereoRig
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
 
 RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
 

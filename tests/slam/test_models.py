@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam import se3
 from slam.errors import ConfigurationError
+from slam.geometry import se3
 from slam.models import KINDS, EstimatorModels, MotionModel, models_for
 
 

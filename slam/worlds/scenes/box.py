@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.se3 import Array, pose
+from slam.geometry.se3 import Array, pose
 from slam.worlds.options import Option
 from slam.worlds.paths import through, yaw_pitch_roll
 from slam.worlds.scenes.common import CAMERAS, assemble, carton, clock, laboratory, make_rig, watching

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from slam.camera import PinholeCamera
-from slam.rig import StereoRig
-from slam.se3 import Array, so3_exp
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, so3_exp
 from slam.worlds.geometry import Rectangle, cuboid, place_landmarks, rectangle
 from slam.worlds.paths import camera_poses, carried
 from slam.worlds.textures.surfaces import Material

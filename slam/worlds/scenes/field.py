@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.se3 import pose
+from slam.geometry.se3 import pose
 from slam.worlds.geometry import Rectangle, cuboid, rectangle
 from slam.worlds.options import Option
 from slam.worlds.paths import camera_poses, carried, sway, through, yaw_pitch_roll

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 
 BAY = 0.9  #: width of a bay of shelves [m]
 UPRIGHT = 0.03  #: thickness of the uprights between bays [m]

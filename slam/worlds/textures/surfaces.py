@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from slam.se3 import Array
+from slam.geometry.se3 import Array
 from slam.worlds.textures import layout
 
 

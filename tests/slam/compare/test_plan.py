@@ -4,7 +4,7 @@ import shlex
 
 import pytest
 
-from slam.compare.command import quick, variants_of
+from slam.commands.compare import quick, variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.errors import ConfigurationError
 

@@ -188,7 +188,7 @@ def test_the_report_holds_everything_and_asks_nothing_of_the_network(done):
 
 
 def test_no_workers():
-    from slam.compare.command import compare
+    from slam.commands.compare import compare
 
     with pytest.raises(ConfigurationError, match="worker"):
         compare(PLAN, None, workers=0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.objects.data import ObjectEstimate
-from slam.se3 import so3_log
+from slam.geometry.se3 import so3_log
+from slam.object_data import ObjectEstimate
 
 
 class FitBackend:

@@ -10,9 +10,9 @@ from slam import registry
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
+from slam.geometry.se3 import inverse, transform
 from slam.objects.config import ObjectsConfig
 from slam.objects.metrics import score_for
-from slam.se3 import inverse, transform
 from tests.slam.objects.double import FitBackend
 
 

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.geometry.se3 import exp
 from slam.objects import scene_kernels, track_kernels
-from slam.se3 import exp
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6

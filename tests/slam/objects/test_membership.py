@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from slam.data import StereoFeatures
+from slam.geometry.se3 import Array, exp, transform
 from slam.objects import membership
 from slam.objects.bodies import Body, new_body, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.tracks import Tracks, fit_positions, record
-from slam.se3 import Array, exp, transform
 
 WINDOW = 12
 SLOT = WINDOW - 1

@@ -5,7 +5,8 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
-from slam.euler import rotation
+from slam.geometry.euler import rotation
+from slam.geometry.se3 import exp, inverse, log, pose, transform
 from slam.objects.procedure1 import (
     ObjectDatabase,
     body_frame,
@@ -14,7 +15,6 @@ from slam.objects.procedure1 import (
     motion_of_triples,
     why_degenerate,
 )
-from slam.se3 import exp, inverse, log, pose, transform
 from tests.slam.scene import RIG
 
 POINTS = np.array([[0.0, 0.1, 1.5], [0.2, 0.12, 1.55], [0.05, 0.25, 1.45], [0.15, 0.2, 1.6]])

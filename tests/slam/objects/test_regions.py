@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.geometry.se3 import hat
 from slam.objects.displacements import Displacements
 from slam.objects.regions import judge_scene
-from slam.se3 import hat
 
 RNG = np.random.default_rng(3)
 

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from slam.errors import SequenceError
-from slam.euler import rotation
+from slam.geometry.euler import rotation
+from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
-from slam.trajectory import Trajectory
 from slam.worlds import open_world
 from slam.worlds.export import DEPTH_STEPS, write_euroc
 

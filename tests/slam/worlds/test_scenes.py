@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.se3 import inverse, rotation_angle, transform
+from slam.geometry.se3 import inverse, rotation_angle, transform
 from slam.sequences import Sequence, open_sequence
 from slam.worlds import names, open_world
 from slam.worlds.scenes import aisle, box, boxes, startup, street

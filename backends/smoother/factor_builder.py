@@ -1,0 +1,144 @@
+"""How measurements become factors: tracks that grow, landmarks that become variables, and what is eliminated late."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from backends.smoother.config import SmootherConfig
+from backends.smoother.graph import FactorMaker
+from backends.smoother.lag import FixedLag
+from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog, Track
+from backends.smoother.solver import Change
+from backends.smoother.variables import landmark_key, landmark_threshold, pose_key
+from slam.geometry.se3 import Array
+
+#: A landmark unseen for so many frames is seen again: a smart factor over the gap would touch all poses between.
+_GAP = 20
+
+#: Landmarks seen within so many frames are likely to be seen again.
+_LATE = 60
+
+
+class FactorBuilder:
+    """Puts measurements into factors.
+
+    A landmark is a smart factor that grows with each measurement. When its track is long enough the factor is
+    finished: the landmark becomes a variable with a factor for each measurement, as long as few of those in view are,
+    or else goes on in a new smart factor. No measurement is ever used twice.
+
+    Args:
+        make: makes the factors.
+        config: limits and thresholds.
+        measurement_log: what is on record.
+        lag: which variables are still in the solver; None for all.
+    """
+
+    def __init__(
+        self, make: FactorMaker, config: SmootherConfig, measurement_log: MeasurementLog, lag: FixedLag | None
+    ) -> None:
+        self.measurement_log = measurement_log
+        self._make = make
+        self._config = config
+        self._lag = lag
+
+    def newest(self) -> list[int]:
+        """Frames of the window."""
+        first = 0 if self._lag is None else self._lag.first
+        return self.measurement_log.path.newest(self._config.window, first).tolist()
+
+    def eliminate_late(self, change: Change) -> None:
+        """Have the landmarks of late eliminated late, and the newest poses last."""
+        marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count - 1
+        landmarks, poses = change.late
+        poses.update(pose_key(i) for i in self.newest())
+        recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
+        landmarks.update(marks.variable[recent].tolist())
+
+    def grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> list[tuple[Track, int]]:
+        """Put measurements into factors; returns tracks with the places of their new smart factors in the change."""
+        make, marks, frame = self._make, self.measurement_log.landmarks, self.measurement_log.path.count - 1
+        key, explicit = pose_key(frame), self.measurement_log.history.explicit
+        self._enter_known(change, slots)
+        variables, again = marks.variable[slots], (frame - marks.last[slots] > _GAP).tolist()
+        room = self._config.explicit - int((variables >= 0).sum())
+        grown = []
+        columns = (slots.tolist(), variables.tolist(), rows.tolist(), z.tolist(), np.isfinite(z[:, 2]).tolist(), again)
+        for slot, variable, row, zi, stereo, long_unseen in zip(*columns):
+            point = make.point(zi)
+            if variable >= 0:
+                explicit[variable].append(row)
+                change.factors.add(make.explicit(point, key, variable))
+                continue
+            track = marks.tracks[slot]
+            if long_unseen and room <= 0:
+                self.measurement_log.finish(track)
+            track.append(row, point, key, stereo)
+            if not track.informative:
+                continue
+            if track.factor >= 0:
+                change.removed.append(track.factor)
+            change.late[1].update(track.keys)
+            if (long_unseen or len(track) >= track.limit) and room > 0 and self._well_known(slot):
+                room -= 1
+                self._make_variable(change, slot, track)
+                continue
+            grown.append((track, change.factors.size()))
+            change.factors.add(make.smart(track.points, track.keys))
+        return grown
+
+    def _well_known(self, slot: int) -> bool:
+        """Whether a landmark's position is known to a tenth of its distance: else it is no good as a variable."""
+        marks = self.measurement_log.landmarks
+        offset = marks.position[slot] - self.measurement_log.path.poses[-1][:3, 3]
+        return bool(np.trace(marks.covariance[slot]) < 0.01 * (offset @ offset))
+
+    def _make_variable(self, change: Change, slot: int, track: Track) -> None:
+        """Give a landmark a variable of its own, with all that its track holds."""
+        key = self._new_variable(change, slot)
+        self.measurement_log.history.explicit[key] = track.rows
+        for point, pose in zip(track.points, track.keys):
+            change.factors.add(self._make.explicit(point, pose, key))
+        track.restart()
+
+    def _known(self, slot: int) -> Known | None:
+        """What was known of a landmark beforehand, as long as what it hangs on is in the solver."""
+        known = self.measurement_log.history.known.get(int(self.measurement_log.landmarks.serial[slot]))
+        gone = known is not None and known.frame is not None and self._lag is not None and known.frame < self._lag.first
+        return None if gone else known
+
+    def _enter_known(self, change: Change, slots: IndexArray) -> None:
+        """Give landmarks that were known beforehand variables of their own, where they have none yet."""
+        if not self.measurement_log.history.known:
+            return
+        marks = self.measurement_log.landmarks
+        for slot in slots[marks.variable[slots] < 0].tolist():
+            known = self._known(slot)
+            if known is None or len(marks.tracks[slot]):
+                continue
+            key = self._new_variable(change, slot)
+            change.factors.add(self._make.known(key, known))
+            if known.frame is not None:
+                change.late[1].add(pose_key(known.frame))
+            self.measurement_log.history.explicit[key] = []
+
+    def _new_variable(self, change: Change, slot: int) -> int:
+        """A variable for a landmark, placed where the landmark is believed to be."""
+        history, marks = self.measurement_log.history, self.measurement_log.landmarks
+        place = marks.position[slot].copy()
+        distance = float(np.linalg.norm(place - self.measurement_log.path.poses[-1][:3, 3]))
+        threshold = landmark_threshold(self._make.stereo, distance, self._config.relinearise)
+        key = landmark_key(history.variables, threshold)
+        history.variables += 1
+        marks.variable[slot], history.places[key] = key, place
+        change.values.insert(key, place)
+        if self._lag is not None:
+            self._lag.enter(key)
+        return key
+
+    def finish_tracks(self, slots: IndexArray) -> None:
+        """Finish the smart factors that are long enough."""
+        marks = self.measurement_log.landmarks
+        for slot in slots[marks.variable[slots] < 0].tolist():
+            track = marks.tracks[slot]
+            if len(track.rows) >= track.limit:
+                self.measurement_log.finish(track)

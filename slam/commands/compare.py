@@ -1,0 +1,90 @@
+"""``slam compare``: run the plan, write tables and report, and say what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from slam.compare.plan import Plan, Trial, Variant, parse_variant
+from slam.compare.report import conclusions, most_trials, write_report
+from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler, available_cores
+from slam.compare.sweep import Run, check, sweep
+from slam.compare.tables import groups, write_tables
+from slam.compare.wording import caution
+from slam.errors import ConfigurationError
+
+_QUICK_FRAMES, _QUICK_TRIALS = 30, 2
+
+
+def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
+    """Front ends by name and variants by their texts; `settings` hold for all.
+
+    Raises:
+        ConfigurationError: a variant is not of its form.
+    """
+    named = [Variant(name, name, tuple(settings)) for name in frontends]
+    return (*named, *(parse_variant(text, tuple(settings)) for text in variants)) or (
+        Variant("surf", "surf", tuple(settings)),
+    )
+
+
+def quick(plan: Plan) -> Plan:
+    """The plan cut down to see whether it works."""
+    stop = plan.start + _QUICK_FRAMES
+    stop = stop if plan.stop is None else min(plan.stop, stop)
+    return replace(plan, trials=min(plan.trials, _QUICK_TRIALS), stop=stop)
+
+
+def compare(
+    plan: Plan, out: Path, workers: int | None = None, address: str | None = None, quiet: bool = False
+) -> list[Run]:
+    """Run a comparison to its end and leave ``report.html`` and the tables in `out`.
+
+    Args:
+        plan: what to run.
+        out: folder; a sweep that was stopped in it goes on.
+        workers: processes on this machine; None for as many as there are cores.
+        address: of a Dask scheduler to be used instead.
+        quiet: show nothing.
+
+    Raises:
+        SlamError: bad input; nothing has been run then.
+    """
+    from slam.commands.display import counting
+
+    if workers is not None and workers < 1:
+        raise ConfigurationError(f"comparison: there must be at least one worker, got {workers}")
+    count = workers or available_cores()
+    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
+    where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
+    check(plan)  # before there is a progress bar
+    total = sum(1 for mode in plan.modes for _ in plan.trials_of(mode))
+    done = 0
+    with counting(total, "runs", quiet) as progress:
+
+        def on_done(trial: Trial) -> None:
+            nonlocal done
+            done += 1
+            progress(done)
+
+        runs = sweep(plan, out, scheduler, on_done)
+    write_tables(plan, runs, out)
+    report = write_report(plan, runs, out, where)
+    if not quiet:
+        _print_conclusions(plan, runs, report)
+    return runs
+
+
+def _print_conclusions(plan: Plan, runs: Sequence[Run], report: Path) -> None:
+    every = groups(plan, runs)
+    for found in conclusions(every):
+        print(found.name)
+        for line in found.short:
+            print(f"  {line}")
+        for line in found.full:
+            print(f"    {line}")
+    if caution(most_trials(every)):
+        print(caution(most_trials(every)))
+    failed = sum(not run.completed for run in runs)
+    print(f"{len(runs)} runs, {failed} failed. Report: {report}")

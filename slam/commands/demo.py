@@ -1,0 +1,55 @@
+"""``slam demo``: the built-in bookshelf aisle with a moving box through both back ends, in a table and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from slam.commands.display import Progress, print_summary
+from slam.config import SystemConfig
+from slam.run.drawing import draw_objects
+from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.outputs import write_json
+from slam.run.runner import RunOptions, run
+from slam.sequences import open_sequence
+
+BACKENDS = ("ekf", "smoother")
+
+
+def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
+    """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
+
+    Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``top_view.png``,
+    ``map_3d.png``, ``errors.png`` and ``frame.png``.
+
+    Args:
+        out: folder for everything.
+        frames: number of frames.
+        quiet: show nothing.
+    """
+    import cv2
+    import matplotlib
+
+    matplotlib.use("Agg")
+    world = f"synthetic:aisle?frames={frames}&speed=2&box=1"
+    summaries: list[dict[str, Any]] = []
+    last = None
+    for backend in BACKENDS:
+        sequence = open_sequence(world)
+        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+        with Progress(len(sequence), f"{sequence.name} · {backend}", quiet) as progress:
+            summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), progress.frame))
+            last = progress.last
+    write_json(out / "comparison.json", {"runs": summaries})
+    runs = [RunData.read(out / backend, backend) for backend in BACKENDS]
+    truth = open_sequence(world).ground_truth
+    draw_top_view(runs, truth, out / "top_view.png")
+    draw_map_3d(runs, out / "map_3d.png")
+    if truth is not None:
+        draw_errors(runs, truth, out / "errors.png")
+    if last is not None:
+        frame = next(iter(open_sequence(world).frames(frames - 1)))
+        cv2.imwrite(str(out / "frame.png"), draw_objects(frame.left, last, open_sequence(world).rig))
+    if not quiet:
+        print_summary(summaries, out)
+    return summaries

@@ -1,0 +1,126 @@
+"""How many associations are right, where a world's truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slam.data import FrameResult, IdArray
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.trajectory import Trajectory
+
+
+class TrueWorld(Protocol):
+    """What is asked of a sequence with known truth; `slam.worlds.WorldSequence` has it."""
+
+    @property
+    def rig(self) -> StereoRig:
+        """The cameras."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory:
+        """Pose of the left camera at every frame."""
+        ...
+
+    def depth(self, k: int) -> np.ndarray:
+        """True distance along the left camera's axis in frame k (H, W) [m], 0 where nothing is."""
+        ...
+
+    def object_ids(self, k: int) -> np.ndarray:
+        """Object of every pixel of frame k's left image (H, W), 0 for the still world."""
+        ...
+
+
+@dataclass(frozen=True)
+class AssociationScore:
+    """Counts of associations.
+
+    Attributes:
+        right: the feature lies where the landmark's surface point is.
+        wrong: it lies elsewhere, or the landmark was first seen on something that moves.
+    """
+
+    right: int
+    wrong: int
+
+    @property
+    def precision(self) -> float:
+        """Share of the right ones; NaN where there is none."""
+        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
+
+
+class SurfacePoints:
+    """Which point of the still world each landmark is: the one that its feature showed at first sight.
+
+    Args:
+        world: the sequence with its truth.
+    """
+
+    def __init__(self, world: TrueWorld) -> None:
+        self._world = world
+        self._points: dict[int, Array] = {}
+
+    def add(self, frame: int, ids: IdArray, uv_left: Array) -> None:
+        """Landmarks `ids` (N,) first seen at left pixels (N, 2) of this frame."""
+        if not len(ids):
+            return
+        depth, objects = self._world.depth(frame), self._world.object_ids(frame)
+        local = surface_points(self._world.rig.left, depth, uv_left)
+        column, row = _nearest_pixels(uv_left, depth.shape)
+        local[objects[row, column] > 0] = np.nan
+        points = transform(self._world.ground_truth.poses[frame], local)
+        self._points.update(zip(np.asarray(ids).tolist(), points))
+
+    def positions(self, ids: IdArray) -> Array:
+        """Where landmarks `ids` truly are (N, 3) [m], in the world of the truth; NaN for those on no still surface."""
+        return np.array([self._points[i] for i in np.asarray(ids).tolist()]).reshape(-1, 3)
+
+    def errors(self, frame: int, ids: IdArray, uv_left: Array) -> Array:
+        """Distances (N,) [px] of left pixels (N, 2) from where the landmarks `ids` (N,) truly are.
+
+        Infinite for landmarks that were first seen on something that moves, or on nothing.
+        """
+        if not len(ids):
+            return np.zeros(0)
+        points = np.array([self._points[i] for i in np.asarray(ids).tolist()])
+        expected = self._world.rig.left.project(transform(inverse(self._world.ground_truth.poses[frame]), points))
+        distance = np.linalg.norm(uv_left - expected, axis=1)
+        return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def surface_points(camera: PinholeCamera, depth: np.ndarray, uv: Array) -> Array:
+    """Points (N, 3) [m] in camera coordinates that pixels (N, 2) show; NaN where nothing is."""
+    column, row = _nearest_pixels(uv, depth.shape)
+    z = np.where(depth[row, column] > 0, depth[row, column], np.nan).astype(float)
+    xy = camera.normalise(uv)
+    return np.column_stack([xy * z[:, None], z])
+
+
+def score_associations(world: TrueWorld, results: Iterable[FrameResult], tolerance: float = 3.0) -> AssociationScore:
+    """Count which associations of a run are right.
+
+    Args:
+        world: the sequence that was run, from its first frame on.
+        results: of its frames, in order.
+        tolerance: largest distance of a feature from the landmark's true place [px].
+    """
+    points = SurfacePoints(world)
+    right = wrong = 0
+    for frame, result in enumerate(results):
+        error = points.errors(frame, result.matched, result.features.uv_left[result.matched_features])
+        right += int((error < tolerance).sum())
+        wrong += int((error >= tolerance).sum())
+        points.add(frame, result.added, result.features.uv_left[result.added_features])
+    return AssociationScore(right, wrong)
+
+
+def _nearest_pixels(uv: Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows (N,) of the pixels that hold these positions."""
+    pixels = np.rint(uv).astype(int)
+    return np.clip(pixels[:, 0], 0, shape[1] - 1), np.clip(pixels[:, 1], 0, shape[0] - 1)

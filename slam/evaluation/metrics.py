@@ -1,0 +1,324 @@
+"""Accuracy of an estimated path: ATE, RPE by frames and by distance, GPS distance, and consistency (NEES).
+
+Definitions, with P the estimated and Q the true poses ``T_world_left`` at common stamps:
+
+- ATE: ``|p_i − q_i|`` [m] and the angle of ``Q_i⁻¹ P_i`` [deg] after one alignment of the whole path.
+- RPE over Δ frames: translation [m] and angle [deg] of ``(Q_i⁻¹ Q_{i+Δ})⁻¹ (P_i⁻¹ P_{i+Δ})``; no alignment.
+- Segment error: the same over stretches of the true path of given lengths, divided by the length (KITTI's measure).
+- NEES: ``eᵀ Σ⁻¹ e`` with ``T_true = T_estimated exp(e)``, e = [rotation, translation] as pose covariances have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.errors import TrajectoryError
+from slam.geometry.alignment import Alignment, align, align_positions
+from slam.geometry.se3 import Array, inverse, log, pose, rotation_angle, so3_exp, so3_log
+from slam.geometry.stamps import pair
+from slam.geometry.trajectory import Trajectory
+
+#: Lengths of KITTI's segments [m].
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+
+_ROUNDING = 1e-6  # [s] by which a stamp may differ that was written to a file and read again
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of a set of errors, all in the errors' unit; `count` of them."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    count: int
+
+    @classmethod
+    def of(cls, errors: Array) -> Statistics:
+        """Statistics of errors (N,).
+
+        Raises:
+            TrajectoryError: there is none.
+        """
+        if not len(errors):
+            raise TrajectoryError("no errors to sum up: nothing could be compared")
+        rmse = float(np.sqrt(np.mean(errors**2)))
+        mean, median, std = float(np.mean(errors)), float(np.median(errors)), float(np.std(errors))
+        return cls(rmse, mean, median, std, float(np.min(errors)), float(np.max(errors)), len(errors))
+
+
+@dataclass(frozen=True)
+class PathErrors:
+    """Errors of poses, or of relative motions, row by row.
+
+    Attributes:
+        translation: (N,) [m].
+        rotation: (N,) [deg].
+        alignment: what was applied to the estimate before; None where nothing was.
+    """
+
+    translation: Array
+    rotation: Array
+    alignment: Alignment | None = None
+
+    @property
+    def translation_statistics(self) -> Statistics:
+        """Of the translation [m]."""
+        return Statistics.of(self.translation)
+
+    @property
+    def rotation_statistics(self) -> Statistics:
+        """Of the rotation [deg]."""
+        return Statistics.of(self.rotation)
+
+
+@dataclass(frozen=True)
+class SegmentErrors:
+    """Errors over stretches of the path, a row each.
+
+    Attributes:
+        lengths: length of the stretch that was asked for (M,) [m].
+        translation: translation error by length (M,) [%].
+        rotation: rotation error by length (M,) [deg/m].
+    """
+
+    lengths: Array
+    translation: Array
+    rotation: Array
+
+    @property
+    def mean_translation(self) -> float:
+        """Mean over all stretches of all lengths [%]; NaN where there is none."""
+        return float(np.mean(self.translation)) if len(self.lengths) else float("nan")
+
+    @property
+    def mean_rotation(self) -> float:
+        """Mean over all stretches of all lengths [deg/m]; NaN where there is none."""
+        return float(np.mean(self.rotation)) if len(self.lengths) else float("nan")
+
+    def of_length(self, length: float) -> SegmentErrors:
+        """The stretches of one length."""
+        rows = self.lengths == length
+        return SegmentErrors(self.lengths[rows], self.translation[rows], self.rotation[rows])
+
+
+# ------------------------------------------------------------------------------------------- common stamps
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, tolerance: float = 0.01, interpolated: bool = False
+) -> tuple[Trajectory, Trajectory]:
+    """Both paths at common stamps, row by row: the estimate's rows that have truth, and the truth for them.
+
+    Args:
+        estimate: the estimated path.
+        truth: the true path.
+        tolerance: a true pose may lie so far away in time [s]. Each serves one estimated pose only.
+        interpolated: take the truth between two true poses, see `interpolate`; the nearer of the two must lie within
+            `tolerance`.
+
+    Raises:
+        TrajectoryError: no stamp has a partner.
+    """
+    if interpolated:
+        rows = _covered(truth.stamps, estimate.stamps, tolerance)
+        stamps = estimate.stamps[rows]
+        true = Trajectory(stamps, interpolate(truth, stamps.clip(*truth.stamps[[0, -1]])).poses) if len(rows) else truth
+    else:
+        partner = pair(estimate.stamps, truth.stamps, tolerance)
+        rows = np.flatnonzero(partner >= 0)
+        true = Trajectory(truth.stamps[partner[rows]], truth.poses[partner[rows]])
+    if not len(rows):
+        raise TrajectoryError(
+            f"no estimated pose has a true one within {tolerance:g} s: {_span('estimate', estimate.stamps)}, "
+            f"{_span('truth', truth.stamps)}"
+        )
+    return Trajectory(estimate.stamps[rows], estimate.poses[rows]), true
+
+
+def interpolate(trajectory: Trajectory, stamps: Array) -> Trajectory:
+    """The path at other stamps (N,) inside its span: positions linearly, orientations at constant angular velocity.
+
+    Raises:
+        TrajectoryError: a stamp lies outside the path's span.
+    """
+    own = trajectory.stamps
+    if len(stamps) and (not len(own) or stamps.min() < own[0] or stamps.max() > own[-1]):
+        raise TrajectoryError(f"{_span('stamps', stamps)} lie outside of the path: {_span('path', own)}")
+    after = np.searchsorted(own, stamps, side="left").clip(min(1, len(own) - 1), len(own) - 1)
+    before = (after - 1).clip(0)
+    step = own[after] - own[before]
+    share = np.divide(stamps - own[before], step, out=np.zeros(len(stamps)), where=step > 0)[:, None]
+    first, second = trajectory.poses[before], trajectory.poses[after]
+    turn = so3_log(np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3])
+    R = first[:, :3, :3] @ so3_exp(share * turn)
+    return Trajectory(stamps, pose(R, (1 - share) * first[:, :3, 3] + share * second[:, :3, 3]))
+
+
+def _covered(own: Array, stamps: Array, tolerance: float) -> np.ndarray:
+    """Rows of `stamps` inside the span of `own`, but for rounding, and within `tolerance` of one of its stamps."""
+    if not len(own):
+        return np.zeros(0, int)
+    inside = np.flatnonzero((stamps >= own[0] - _ROUNDING) & (stamps <= own[-1] + _ROUNDING))
+    after = np.searchsorted(own, stamps[inside]).clip(0, max(len(own) - 1, 0))
+    before = (after - 1).clip(0)
+    nearest = np.minimum(np.abs(own[after] - stamps[inside]), np.abs(own[before] - stamps[inside]))
+    return inside[nearest <= tolerance]
+
+
+def _span(name: str, stamps: Array) -> str:
+    return f"{name} from {stamps[0]:.3f} to {stamps[-1]:.3f} s" if len(stamps) else f"{name} is empty"
+
+
+# ------------------------------------------------------------------------------------------- accuracy
+
+
+def absolute_errors(
+    estimate: Trajectory, truth: Trajectory, aligned: bool = True, with_scale: bool = False
+) -> PathErrors:
+    """ATE of two paths of equal length, row by row (see `associate`).
+
+    Args:
+        estimate: the estimated path.
+        truth: the true path.
+        aligned: align the estimate first: SE(3), or Sim(3) with `with_scale`.
+        with_scale: see `aligned`.
+
+    Raises:
+        TrajectoryError: the lengths differ, or there is no pose.
+    """
+    _require_pairs(estimate, truth, 1)
+    alignment = align(estimate, truth, with_scale) if aligned else None
+    if alignment is not None:
+        estimate = alignment.apply_trajectory(estimate)
+    distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+    turn = np.swapaxes(truth.poses[:, :3, :3], 1, 2) @ estimate.poses[:, :3, :3]
+    return PathErrors(distance, np.degrees(rotation_angle(turn)), alignment)
+
+
+def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1, overlapping: bool = True) -> PathErrors:
+    """RPE over `delta` frames, from every frame or, with ``overlapping=False``, from every `delta`-th.
+
+    Raises:
+        TrajectoryError: the lengths differ, there are not more than `delta` poses, or `delta` is not positive.
+    """
+    if delta < 1:
+        raise TrajectoryError(f"RPE: delta must be at least 1 frame, got {delta}")
+    _require_pairs(estimate, truth, delta + 1)
+    first = np.arange(0, len(truth) - delta, 1 if overlapping else delta)
+    return PathErrors(*_motion_errors(estimate, truth, first, first + delta))
+
+
+def segment_errors(
+    estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None, step: int = 10
+) -> SegmentErrors:
+    """Errors over stretches of the true path of given lengths, as KITTI's odometry benchmark has them.
+
+    From every `step`-th frame a stretch reaches to the first frame that lies farther along the path than its length;
+    starts from which the path is too short give none. `lengths` defaults to `segment_lengths` of the path.
+
+    Raises:
+        TrajectoryError: the lengths of the two paths differ or there is no pose, or a length is not positive.
+    """
+    _require_pairs(estimate, truth, 1)
+    lengths = segment_lengths(truth.length) if lengths is None else lengths
+    if step < 1 or any(not length > 0 for length in lengths):
+        raise TrajectoryError(f"segments: lengths and step must be positive, got {list(lengths)} and {step}")
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).cumsum()])
+    starts = np.arange(0, len(truth), step)
+    rows = []
+    for length in lengths:
+        ends = np.searchsorted(along, along[starts] + length, side="right")
+        inside = ends < len(truth)
+        translation, rotation = _motion_errors(estimate, truth, starts[inside], ends[inside])
+        rows.append((np.full(len(translation), length), 100 * translation / length, rotation / length))
+    if not rows:
+        return SegmentErrors(*(np.zeros(0) for _ in range(3)))
+    return SegmentErrors(*(np.concatenate(column) for column in zip(*rows)))
+
+
+def segment_lengths(path_length: float) -> tuple[float, ...]:
+    """KITTI's 100 to 800 m for a path of at least 1 km, else eight lengths up to four fifths of the path."""
+    if path_length >= 1000:
+        return KITTI_LENGTHS
+    return tuple(path_length * i / 10 for i in range(1, 9)) if path_length > 1e-6 else ()
+
+
+def plane_errors(estimate: Trajectory, gps: Array, tolerance: float = 0.01) -> Array:
+    """Distances (N,) [m] from a positions-only track in the plane, after a rigid alignment in the plane.
+
+    Args:
+        estimate: the estimated path; the plane is spanned by its first camera's z (forward) and x (right) axes.
+        gps: rows (M, 3 or more) of stamp [s], forward, right [m], in any heading.
+        tolerance: a row of the track may lie so far away in time [s].
+
+    Raises:
+        TrajectoryError: no stamp has a partner.
+    """
+    partner = pair(estimate.stamps, gps[:, 0], tolerance)
+    rows = np.flatnonzero(partner >= 0)
+    if not len(rows):
+        raise TrajectoryError(
+            f"no estimated pose has a GPS position within {tolerance:g} s: {_span('estimate', estimate.stamps)}, "
+            f"{_span('GPS', gps[:, 0])}"
+        )
+    start = inverse(estimate.poses[0])
+    source = (estimate.positions[rows] @ start[:3, :3].T + start[:3, 3])[:, [2, 0]]
+    target = gps[partner[rows], 1:3]
+    return np.asarray(np.linalg.norm(align_positions(source, target).apply(source) - target, axis=1), np.float64)
+
+
+def _require_pairs(estimate: Trajectory, truth: Trajectory, count: int) -> None:
+    if len(estimate) != len(truth):
+        raise TrajectoryError(f"{len(estimate)} estimated poses, {len(truth)} true ones: associate them first")
+    if len(estimate) < count:
+        raise TrajectoryError(f"{len(estimate)} poses are too few, {count} are needed")
+
+
+def _motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray, last: np.ndarray) -> tuple[Array, Array]:
+    """Translation [m] and rotation [deg] of the errors of the motions between rows `first` and `last`."""
+    true = inverse(truth.poses[first]) @ truth.poses[last]
+    estimated = inverse(estimate.poses[first]) @ estimate.poses[last]
+    error = inverse(true) @ estimated
+    return np.linalg.norm(error[:, :3, 3], axis=1), np.degrees(rotation_angle(error[:, :3, :3]))
+
+
+# ------------------------------------------------------------------------------------------- consistency
+
+
+def pose_residuals(estimated: Array, true: Array) -> Array:
+    """``e`` (N, 6) = [rotation, translation] with ``T_true = T_estimated exp(e)``, for poses (N, 4, 4)."""
+    return log(inverse(estimated) @ true)
+
+
+def nees(residuals: Array, covariances: Array) -> Array:
+    """Normalised estimation error squared (N,) of residuals (N, D) with covariances (N, D, D).
+
+    Raises:
+        TrajectoryError: a covariance is not positive definite.
+    """
+    try:
+        L = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        raise TrajectoryError("NEES: a covariance is not positive definite") from None
+    whitened = np.linalg.solve(L, residuals[..., None])[..., 0]
+    return np.asarray((whitened**2).sum(axis=-1), np.float64)
+
+
+def chi_square_band(dof: int, count: int = 1, probability: float = 0.95) -> tuple[float, float]:
+    """Bounds between which the mean of `count` independent NEES of `dof` degrees of freedom lies.
+
+    The sum of the `count` values has a χ² distribution of ``dof · count`` degrees of freedom; the band is two-sided and
+    holds with `probability` where the estimator is consistent. Values of one run are not independent: take the mean
+    over runs (Monte Carlo), or read the band as a guide.
+    """
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([(1 - probability) / 2, (1 + probability) / 2], dof * count) / count
+    return float(low), float(high)

@@ -1,0 +1,240 @@
+"""One pinhole camera with lens distortion: projection, its Jacobian, and the way back (paper A, Eq. 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import CalibrationError
+from slam.geometry.se3 import Array
+
+#: Distortion models and the number of coefficients each accepts.
+DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
+
+_UNDISTORT_ITERATIONS = 50
+_UNDISTORT_TOLERANCE = 1e-13  # in normalised coordinates: 1e-10 px at any usual focal length
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Pinhole camera with distortion (paper A, Eq. 5 with its misprint mended: ``I_x = u0 + f_u h_x / h_z``).
+
+    Attributes:
+        fu, fv: focal lengths [px].
+        u0, v0: principal point [px]; the centre of the first pixel is (0, 0).
+        width, height: image size [px].
+        model: ``"none"``, ``"radtan"`` (Brown-Conrady: k1, k2, p1, p2[, k3[, k4, k5, k6]], OpenCV's order) or
+            ``"equidistant"`` (Kannala-Brandt fisheye: k1..k4).
+        distortion: its coefficients.
+
+    Raises:
+        CalibrationError: a value is not finite, a focal length or size not positive, or the number of
+            distortion coefficients does not fit the model.
+    """
+
+    fu: float
+    fv: float
+    u0: float
+    v0: float
+    width: int
+    height: int
+    model: str = "none"
+    distortion: tuple[float, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        values = (self.fu, self.fv, self.u0, self.v0, *self.distortion)
+        if not np.all(np.isfinite(values)):
+            raise CalibrationError(f"camera calibration is not finite: {values}")
+        if self.fu <= 0 or self.fv <= 0:
+            raise CalibrationError(f"focal lengths must be positive, got fu={self.fu}, fv={self.fv}")
+        if self.width <= 0 or self.height <= 0:
+            raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
+        if self.model not in DISTORTION_MODELS:
+            raise CalibrationError(f"unknown distortion model {self.model!r}: {', '.join(DISTORTION_MODELS)}")
+        if len(self.distortion) not in DISTORTION_MODELS[self.model]:
+            raise CalibrationError(
+                f"distortion model {self.model!r} takes {DISTORTION_MODELS[self.model]} coefficients, "
+                f"got {len(self.distortion)}"
+            )
+
+    @property
+    def K(self) -> Array:
+        """Camera matrix (3, 3)."""
+        return np.array([[self.fu, 0, self.u0], [0, self.fv, self.v0], [0, 0, 1.0]])
+
+    @property
+    def has_distortion(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return self.model == "equidistant" or any(c != 0 for c in self.distortion)
+
+    def project(self, points: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3) [m] in camera coordinates; NaN for points not in front of the camera."""
+        return self.project_with_jacobian(points, jacobian=False)[0]
+
+    def project_with_jacobian(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
+        """Pixels (N, 2) and Jacobian (N, 2, 3) [px/m] of the projection by the point.
+
+        Rows of points at or behind the camera are NaN (never a mirrored pixel).
+        """
+        points = np.asarray(points, float).reshape(-1, 3)
+        z = np.where(points[:, 2] > 1e-9, points[:, 2], np.nan)
+        a, b = points[:, 0] / z, points[:, 1] / z
+        distorted, D = self._distort(np.stack([a, b], axis=1), jacobian)
+        uv = distorted * (self.fu, self.fv) + (self.u0, self.v0)
+        if not jacobian:
+            return uv, np.empty((0, 2, 3))
+        J = np.zeros((len(points), 2, 3))
+        J[:, 0, 0] = J[:, 1, 1] = 1 / z
+        J[:, 0, 2], J[:, 1, 2] = -a / z, -b / z
+        if D is not None:
+            J = D @ J
+        J *= np.array([self.fu, self.fv])[:, None]
+        return uv, J
+
+    def normalise(self, uv: Array) -> Array:
+        """Undistorted normalised coordinates (N, 2) = (x/z, y/z) of pixels (N, 2); NaN stays NaN."""
+        uv = np.asarray(uv, float).reshape(-1, 2)
+        distorted = (uv - (self.u0, self.v0)) / (self.fu, self.fv)
+        return self._undistort(distorted) if self.has_distortion else distorted
+
+    def in_image(self, uv: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which pixels (N, 2) lie inside the image, `margin` [px] away from its border; NaN lies outside."""
+        u, v = uv[:, 0], uv[:, 1]
+        with np.errstate(invalid="ignore"):
+            inside = (u >= margin) & (v >= margin)
+            return inside & (u <= self.width - 1 - margin) & (v <= self.height - 1 - margin)
+
+    def in_view(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Which points (N, 3) are in the angle of view: in front and inside the image (paper A, Fig. 3)."""
+        return self.in_image(self.project(points), margin)
+
+    def _distort(self, ab: Array, jacobian: bool) -> tuple[Array, Array | None]:
+        """Distorted normalised coordinates (N, 2) and, if asked for, the Jacobian (N, 2, 2).
+
+        Rows outside the region where the distortion is one-to-one are NaN: there the polynomial folds far rays back
+        into the image.
+        """
+        if not self.has_distortion:
+            return ab, None
+        distort = _distort_equidistant if self.model == "equidistant" else _distort_radtan
+        if np.isfinite(self._radius_limit):
+            with np.errstate(invalid="ignore"):
+                folded = np.hypot(ab[:, 0], ab[:, 1]) > self._radius_limit
+            ab = np.where(folded[:, None], np.nan, ab)
+        return distort(ab, np.asarray(self.distortion), jacobian)
+
+    @cached_property
+    def _radius_limit(self) -> float:
+        """Undistorted radius up to which the radial distortion grows with the radius."""
+        if self.model == "equidistant":
+            return np.inf
+        r = np.linspace(0, 5, 2001)
+        distorted, _ = _distort_radtan(np.stack([r, 0 * r], axis=1), _without_tangential(self.distortion), False)
+        falling = np.diff(distorted[:, 0]) <= 0
+        return float(r[np.argmax(falling)]) if falling.any() else np.inf
+
+    def _undistort(self, target: Array) -> Array:
+        """Invert `_distort`; NaN where no ray leads to the pixel."""
+        if self.model == "equidistant":
+            return _undistort_equidistant(target, np.asarray(self.distortion))
+        return _undistort_radtan(target, np.asarray(self.distortion), self._radius_limit)
+
+
+def _without_tangential(coefficients: tuple[float, ...]) -> Array:
+    """Brown-Conrady coefficients with p1 = p2 = 0."""
+    out = np.array(coefficients)
+    out[2:4] = 0
+    return out
+
+
+def _undistort_radtan(target: Array, coefficients: Array, radius_limit: float) -> Array:
+    """Newton steps from the distorted coordinates; what does not converge is NaN."""
+    ab = target.copy()
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        for _ in range(_UNDISTORT_ITERATIONS):
+            distorted, D = _distort_radtan(ab, coefficients, True)
+            assert D is not None
+            residual = distorted - target
+            det = D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0]
+            step_a = (D[:, 1, 1] * residual[:, 0] - D[:, 0, 1] * residual[:, 1]) / det
+            step_b = (D[:, 0, 0] * residual[:, 1] - D[:, 1, 0] * residual[:, 0]) / det
+            ab -= np.stack([step_a, step_b], axis=1)
+            largest = np.maximum(np.abs(step_a), np.abs(step_b))
+            if not (largest > _UNDISTORT_TOLERANCE).any():  # NaN rows never converge and need not
+                break
+        good = (largest < 1e-9) & (np.hypot(ab[:, 0], ab[:, 1]) <= radius_limit)
+    return np.where(good[:, None], ab, np.nan)
+
+
+def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
+    """Newton steps on the angle θ alone; rays 90° or more off the axis are NaN."""
+    k1, k2, k3, k4 = coefficients
+    theta_d = np.hypot(target[:, 0], target[:, 1])
+    theta = np.minimum(theta_d, 1.5)
+    for _ in range(_UNDISTORT_ITERATIONS):
+        t2 = theta * theta
+        value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        step = (value - theta_d) / slope
+        theta = theta - step
+        if not (np.abs(step) > _UNDISTORT_TOLERANCE).any():
+            break
+    with np.errstate(invalid="ignore"):
+        good = (np.abs(step) < 1e-9) & (theta < np.pi / 2 - 1e-6) & (theta >= 0)
+    theta = np.where(good, theta, np.nan)
+    near = theta_d < 1e-8
+    return target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, theta_d))[:, None]
+
+
+def _distort_radtan(ab: Array, coefficients: Array, jacobian: bool) -> tuple[Array, Array | None]:
+    """Brown-Conrady distortion with up to three radial, two tangential and three rational coefficients."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
+    a, b = ab[:, 0], ab[:, 1]
+    r2 = a * a + b * b
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    out = np.stack(
+        [
+            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
+        ],
+        axis=1,
+    )
+    if not jacobian:
+        return out, None
+    d_numerator = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    d_denominator = k4 + r2 * (2 * k5 + r2 * 3 * k6)
+    d_radial = 2 * (d_numerator - radial * d_denominator) / denominator  # d radial / d a = d_radial · a
+    D = np.empty((len(ab), 2, 2))
+    D[:, 0, 0] = radial + a * a * d_radial + 2 * p1 * b + 6 * p2 * a
+    D[:, 0, 1] = a * b * d_radial + 2 * p1 * a + 2 * p2 * b
+    D[:, 1, 0] = D[:, 0, 1]
+    D[:, 1, 1] = radial + b * b * d_radial + 6 * p1 * b + 2 * p2 * a
+    return out, D
+
+
+def _distort_equidistant(ab: Array, coefficients: Array, jacobian: bool) -> tuple[Array, Array | None]:
+    """Kannala-Brandt distortion: ``θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`` along the ray's azimuth."""
+    k1, k2, k3, k4 = coefficients
+    a, b = ab[:, 0], ab[:, 1]
+    r = np.hypot(a, b)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    near = r < 1e-8
+    safe = np.where(near, 1.0, r)
+    scale = np.where(near, 1.0, theta_d / safe)
+    out = ab * scale[:, None]
+    if not jacobian:
+        return out, None
+    d_theta_d = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    d_scale = np.where(near, 0.0, (d_theta_d / (1 + r * r) - scale) / safe**2)
+    D = np.empty((len(ab), 2, 2))
+    D[:, 0, 0] = scale + a * a * d_scale
+    D[:, 0, 1] = D[:, 1, 0] = a * b * d_scale
+    D[:, 1, 1] = scale + b * b * d_scale
+    return out, D

@@ -1,0 +1,233 @@
+"""The camera's pose from landmarks of known position: robust consensus and least squares on reprojection errors.
+
+It tells which matches agree with one rigid motion before any estimator sees them, and gives a smoother its first guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, exp, inverse
+
+_MINIMAL = 3  # stereo points that fix a pose
+_REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
+_CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
+_POLISHING_ROUNDS = 5
+_STEPS = 10  # of Gauss-Newton at most
+_BATCH = 50  # hypotheses tried at once
+_APPROACHES = 3
+_ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
+_CONVERGED = 1e-4  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
+
+
+@dataclass(frozen=True)
+class PoseConsensus:
+    """A pose and the matches that agree with it.
+
+    Attributes:
+        T_world_left: pose (4, 4).
+        inliers: which matches agree (M,).
+    """
+
+    T_world_left: Array
+    inliers: BoolArray
+
+
+def measurement_rows(uv_left: Array, uv_right: Array) -> Array:
+    """Stereo measurements (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel."""
+    return np.concatenate([uv_left, uv_right[:, :1]], axis=1)
+
+
+def find_consensus(
+    rig: StereoRig, points: Array, measured: Array, guess: Array, threshold: float, hypotheses: int, seed: int
+) -> PoseConsensus:
+    """The pose with which most matches agree (RANSAC on minimal sets of three, then least squares on all that agree).
+
+    The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
+    a clear majority agrees. Other hypotheses are rigid fits of three triangulated points, refined on their reprojection
+    errors.
+
+    Args:
+        rig: the cameras.
+        points: landmark positions (M, 3) in world coordinates [m].
+        measured: (M, 3) = (uL, vL, uR), uR NaN for monocular rows.
+        guess: expected pose T_world_left (4, 4).
+        threshold: largest reprojection error of an inlier, on each of uL, vL, uR [px].
+        hypotheses: how many minimal sets are tried.
+        seed: of the random choice.
+    """
+    clear = _CLEAR_MAJORITY * len(points)
+    first = _polish(rig, points, measured, inverse(guess), threshold)
+    if first.inliers.sum() >= clear:
+        return first
+    nearer = _polish(rig, points, measured, _approach(rig, points, measured, inverse(guess)), threshold)
+    if nearer.inliers.sum() >= max(clear, first.inliers.sum()):
+        return nearer
+    stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    if len(stereo) < _MINIMAL:
+        return first
+    T_left_world = _best_hypothesis(rig, points, measured, stereo, threshold, hypotheses, seed)
+    if T_left_world is None:
+        return first
+    best = _polish(rig, points, measured, T_left_world, threshold)
+    return best if best.inliers.sum() > first.inliers.sum() else first
+
+
+def _best_hypothesis(
+    rig: StereoRig,
+    points: Array,
+    measured: Array,
+    stereo: NDArray[np.intp],
+    threshold: float,
+    hypotheses: int,
+    seed: int,
+) -> Array | None:
+    """The pose T_left_world (4, 4) from three stereo matches with which most matches agree; None where there is none.
+
+    Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
+    """
+    rng = np.random.default_rng(seed)
+    best, most, tried = None, 0, 0
+    while tried < hypotheses:
+        poses = _minimal_poses(rig, points, measured, stereo, min(_BATCH, hypotheses - tried), rng)
+        tried += _BATCH
+        if not len(poses):
+            continue
+        support = _agreement(rig, points, measured, poses, threshold).sum(axis=1)
+        if support.max() > most:
+            best, most = poses[int(np.argmax(support))], int(support.max())
+        if (1 - (most / len(points)) ** _MINIMAL) ** tried < 0.01:
+            break
+    return best
+
+
+def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> PoseConsensus:
+    """Least squares on the matches that agree with a pose, repeated while their number grows."""
+    inliers = _agreement(rig, points, measured, T_left_world[None], threshold)[0]
+    for _ in range(_POLISHING_ROUNDS):
+        if inliers.sum() < _MINIMAL:
+            break
+        better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], _STEPS)[0]
+        again = _agreement(rig, points, measured, better[None], threshold)[0]
+        if again.sum() < inliers.sum():
+            break
+        T_left_world, grown = better, again.sum() > inliers.sum()
+        inliers = again
+        if not grown:
+            break
+    return PoseConsensus(inverse(T_left_world), inliers)
+
+
+def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """A pose T_left_world (4, 4) nearer to the better half of the matches, where the guess is too far off for any."""
+    for _ in range(_APPROACHES):
+        error = _errors(rig, points, measured, T_left_world[None])[0]
+        good = np.isfinite(error)
+        if good.sum() < _MINIMAL:
+            break
+        rows = _some(good & (error <= _median(error[good])))
+        T_left_world = _refined(rig, points, measured, rows[None], T_left_world[None], 2)[0]
+    return T_left_world
+
+
+def _some(mask: BoolArray) -> NDArray[np.intp]:
+    """Rows of a mask; evenly chosen ones where they are more than a pose needs."""
+    rows = np.flatnonzero(mask)
+    if len(rows) <= _ENOUGH:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
+
+
+def _median(values: Array) -> float:
+    """The median of a few numbers; NumPy's takes longer to begin than these need."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
+
+
+def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = _STEPS) -> Array:
+    """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
+    return _refined(rig, points, measured, np.arange(len(points))[None], T_left_world[None], steps)[0]
+
+
+def _refined(
+    rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T_left_world: Array, steps: int
+) -> Array:
+    """Least-squares poses (H, 4, 4) from poses T_left_world, each by the matches `rows` (H, K)."""
+    if rig.is_rectified:
+        from slam.geometry.pnp_kernels import refine_rectified
+
+        T = T_left_world.copy()
+        refine_rectified(rig.rectified_parameters, points, measured, rows, T, steps, _CONVERGED)
+        return T
+    T = T_left_world
+    for _ in range(steps):
+        delta = _gauss_newton_steps(rig, points[rows], measured[rows], T)
+        T = exp(delta) @ T
+        if np.abs(delta).max() < _CONVERGED:
+            break
+    return T
+
+
+def _minimal_poses(
+    rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, rng: np.random.Generator
+) -> Array:
+    """Poses T_left_world (H, 4, 4) from random triples of stereo matches."""
+    triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :_MINIMAL]]
+    uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
+    local = rig.triangulate(measured[:, :2], uv_right)
+    good = np.isfinite(local[triples]).all(axis=(1, 2))
+    triples = triples[good]
+    if not len(triples):
+        return np.zeros((0, 4, 4))
+    poses = rigid_fit(points[triples], local[triples])
+    poses = _refined(rig, points, measured, triples, poses, _REFINEMENTS)
+    return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def rigid_fit(source: Array, target: Array) -> Array:
+    """Least-squares rigid motions (H, 4, 4) taking points (H, K, 3) to points (H, K, 3) (Kabsch, Umeyama 1991)."""
+    mean_s, mean_t = source.mean(axis=1), target.mean(axis=1)
+    covariance = np.swapaxes(target - mean_t[:, None], 1, 2) @ (source - mean_s[:, None])
+    U, _, Vt = np.linalg.svd(covariance)
+    sign = np.ones((len(source), 3))
+    sign[:, 2] = np.linalg.det(U @ Vt)
+    R = (U * sign[:, None, :]) @ Vt
+    T = np.tile(np.eye(4), (len(source), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = mean_t - (R @ mean_s[..., None])[..., 0]
+    return T
+
+
+def _gauss_newton_steps(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """Steps (H, 6) that reduce the errors of poses T_left_world (H, 4, 4), with a set of matches (H, K, 3) each."""
+    from slam.geometry.pnp_kernels import gauss_newton_steps
+
+    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
+    z, J_point = rig.project_stereo(local.reshape(-1, 3))
+    residual = measured - z.reshape(local.shape)
+    return np.asarray(gauss_newton_steps(local, residual, J_point.reshape(*local.shape, 3)))
+
+
+def _agreement(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, threshold: float) -> BoolArray:
+    """Which matches (H, M) reproject within `threshold` [px] under each pose."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(_errors(rig, points, measured, T_left_world) < threshold)
+
+
+def _errors(rig: StereoRig, points: Array, measured: Array, T_left_world: Array) -> Array:
+    """Largest error of uL, vL, uR (H, M) [px] of each match under each pose; NaN behind the camera."""
+    if rig.is_rectified:
+        from slam.geometry.pnp_kernels import errors_rectified
+
+        return np.asarray(errors_rectified(rig.rectified_parameters, points, measured, T_left_world))
+    local = points @ np.swapaxes(T_left_world[:, :3, :3], 1, 2) + T_left_world[:, None, :3, 3]
+    z = rig.project_stereo(local.reshape(-1, 3), jacobian=False)[0].reshape(local.shape)
+    error = np.abs(measured - z)
+    right = error[..., 2]
+    right[:, np.isnan(measured[:, 2])] = 0.0
+    return np.asarray(np.maximum(np.maximum(error[..., 0], error[..., 1]), right))

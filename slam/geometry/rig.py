@@ -1,0 +1,286 @@
+"""Two cameras: the general, unrectified stereo rig of paper A (Eqs. 5-10) and its rectified rectified_rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from slam.errors import CalibrationError
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.se3 import Array, nearest_rotation
+
+_ZERO_DISPARITY = 1024  # OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
+
+_FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rectified_rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+
+
+class RectificationMaps(NamedTuple):
+    """Remapping tables for one camera, float32 (H, W): where each rectified pixel lies in the raw image."""
+
+    x: np.ndarray
+    y: np.ndarray
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """Two pinhole cameras and how they stand to each other (paper A, Eqs. 6 and 7).
+
+    ``h_right = R (h_left + b)``, as Eq. (6) is printed; so `b` is minus the right camera's centre in left-camera axes.
+    A rectified rig with baseline B > 0 has ``R = I``, ``b = (−B, 0, 0)``.
+
+    Attributes:
+        left, right: the cameras, with images of the same size.
+        R: rotation (3, 3) from left-camera to right-camera axes.
+        b: translation (3,) [m].
+
+    Raises:
+        CalibrationError: R is no rotation, the baseline is zero or not finite, the image sizes differ, or the
+            right camera stands on the left of the left one.
+    """
+
+    left: PinholeCamera
+    right: PinholeCamera
+    R: Array
+    b: Array
+
+    def __post_init__(self) -> None:
+        R, b = np.array(self.R, float), np.array(self.b, float).reshape(-1)
+        if R.shape != (3, 3) or b.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(b).all()):
+            raise CalibrationError("stereo extrinsics must be a finite (3, 3) rotation and (3,) translation")
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+            raise CalibrationError("stereo extrinsics: R is not a rotation matrix")
+        if (self.left.width, self.left.height) != (self.right.width, self.right.height):
+            raise CalibrationError(
+                f"left images are {self.left.width}x{self.left.height}, "
+                f"right images {self.right.width}x{self.right.height}: they must have one size"
+            )
+        baseline = float(np.linalg.norm(b))
+        if baseline < 1e-6:
+            raise CalibrationError("stereo baseline is zero: depth cannot be measured")
+        if -b[0] < 0:
+            raise CalibrationError(
+                f"the right camera stands {b[0]:.4f} m to the left of the left one: are the cameras swapped?"
+            )
+        if -b[0] < 0.5 * baseline:
+            raise CalibrationError("the cameras do not stand side by side: the baseline is not along image rows")
+        R = nearest_rotation(R)
+        R.flags.writeable = b.flags.writeable = False
+        object.__setattr__(self, "R", R)
+        object.__setattr__(self, "b", b)
+
+    @classmethod
+    def rectified_pair(
+        cls, f: float, u0: float, v0: float, baseline: float, width: int, height: int, doffs: float = 0.0
+    ) -> StereoRig:
+        """A rectified rig: two equal cameras `baseline` [m] apart; `doffs` [px] is u0 of the right less the left."""
+        left = PinholeCamera(f, f, u0, v0, width, height)
+        right = PinholeCamera(f, f, u0 + doffs, v0, width, height)
+        return cls(left, right, np.eye(3), np.array([-baseline, 0, 0]))
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the camera centres [m]."""
+        return float(np.linalg.norm(self.b))
+
+    @property
+    def width(self) -> int:
+        """Image width [px]."""
+        return self.left.width
+
+    @property
+    def height(self) -> int:
+        """Image height [px]."""
+        return self.left.height
+
+    @cached_property
+    def T_right_left(self) -> Array:
+        """Pose (4, 4) taking left-camera to right-camera coordinates."""
+        T = np.eye(4)
+        T[:3, :3] = self.R
+        T[:3, 3] = self.R @ self.b
+        return T
+
+    @cached_property
+    def is_rectified(self) -> bool:
+        """No distortion, parallel axes, baseline along rows, and the same focal length and rows in both images."""
+        a, c = self.left, self.right
+        return bool(
+            not (a.has_distortion or c.has_distortion)
+            and np.abs(self.R - np.eye(3)).max() < 1e-9
+            and np.abs(self.b[1:]).max() < 1e-9 * self.baseline
+            and abs(a.fu - c.fu) + abs(a.fv - c.fv) + abs(a.v0 - c.v0) < 1e-9 * a.fu
+            and abs(a.fu - a.fv) < 1e-9 * a.fu
+        )
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Left and right pixels (N, 2) of points (N, 3) [m] in left-camera coordinates; NaN behind a camera."""
+        return self.left.project(points), self.right.project((points + self.b) @ self.R.T)
+
+    def project_stereo(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
+        """Stereo measurements ``(uL, vL, uR)`` (N, 3) and Jacobian (N, 3, 3) by points (N, 3) in left coordinates.
+
+        The right image's row adds nothing but the epipolar check (paper A uses only its x, Eq. 8), so it is no
+        part of the measurement. Rows of points behind a camera are NaN. Without `jacobian` it has no rows.
+        """
+        if self.is_rectified:
+            return self._project_rectified(points, jacobian)
+        left, J_left = self.left.project_with_jacobian(points, jacobian)
+        right, J_right = self.right.project_with_jacobian((points + self.b) @ self.R.T, jacobian)
+        z = np.concatenate([left, right[:, :1]], axis=1)
+        return z, np.concatenate([J_left, (J_right @ self.R)[:, :1]], axis=1)
+
+    @cached_property
+    def rectified_parameters(self) -> Array:
+        """What projection by a rectified rig depends on (7,): fu, fv, u0, v0, fu and u0 of the right camera, b_x."""
+        a, c = self.left, self.right
+        return np.array([a.fu, a.fv, a.u0, a.v0, c.fu, c.u0, self.b[0]])
+
+    def _project_rectified(self, points: Array, jacobian: bool) -> tuple[Array, Array]:
+        """`project_stereo` of a rectified rig."""
+        from slam.geometry.rig_kernels import project_rectified
+
+        z, J = project_rectified(self.rectified_parameters, np.ascontiguousarray(points, float), jacobian)
+        return z, J
+
+    def triangulate(self, uv_left: Array, uv_right: Array) -> Array:
+        """Points (N, 3) [m] in left-camera coordinates by paper A, Eqs. (8)-(9).
+
+        The misprints of Eqs. (8b) and (8c) are mended: all three use the right image's x. Rows whose rays are
+        parallel, whose depth comes out negative, or whose pixels are NaN are NaN.
+        """
+        if self.is_rectified:
+            from slam.geometry.rig_kernels import triangulate_rectified
+
+            left, right = np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float)
+            return np.asarray(triangulate_rectified(self.rectified_parameters, left, right))
+        left = self.left.normalise(uv_left)
+        x_right = self.right.normalise(uv_right)[:, 0]
+        rays = np.concatenate([left, np.ones((len(left), 1))], axis=1)
+        d = self.R @ self.b  # Eq. (9b)
+        k = rays @ self.R[0] - x_right * (rays @ self.R[2])  # Eq. (9a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (x_right * d[2] - d[0]) / k  # Eq. (8c)
+            depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan)
+        return rays * depth[:, None]
+
+    def triangulation_covariance(self, points: Array, sigma: float | Array) -> Array:
+        """Covariance (N, 3, 3) [m²] of triangulated points (N, 3) for pixel noise `sigma` [px] on uL, vL and uR.
+
+        First order: the inverse of the (3, 3) stereo projection Jacobian carries the noise back. `sigma` is one
+        number or (3,) numbers.
+        """
+        _, J = self.project_stereo(points)
+        out = np.full((len(points), 3, 3), np.nan)
+        good = np.isfinite(J).all(axis=(1, 2))
+        inverse = np.linalg.inv(J[good]) * np.broadcast_to(sigma, (3,))
+        out[good] = inverse @ np.swapaxes(inverse, 1, 2)
+        return out
+
+    @cached_property
+    def rectified(self) -> RectifiedTwin:
+        """The rectified rectified_rig: itself where `is_rectified`."""
+        return rectify(self)
+
+
+@dataclass(frozen=True)
+class RectifiedTwin:
+    """The rectified rig that sees the same, and the ways between its pixels and the original's.
+
+    Attributes:
+        original: the rig as calibrated.
+        rig: the rectified rig (same image size).
+        R_left, R_right: rotations (3, 3) taking original camera axes to rectified camera axes.
+    """
+
+    original: StereoRig
+    rig: StereoRig
+    R_left: Array
+    R_right: Array
+
+    @cached_property
+    def T_left_rectified(self) -> Array:
+        """Pose (4, 4) of the rectified left camera in the original left camera: a pure rotation."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_left.T
+        return T
+
+    def rectify_left(self, uv: Array) -> Array:
+        """Rectified left pixels (N, 2) of original left pixels (N, 2)."""
+        return _move_pixels(self.original.left, self.rig.left, self.R_left, uv)
+
+    def rectify_right(self, uv: Array) -> Array:
+        """Rectified right pixels (N, 2) of original right pixels (N, 2)."""
+        return _move_pixels(self.original.right, self.rig.right, self.R_right, uv)
+
+    def unrectify_left(self, uv: Array) -> Array:
+        """Original left pixels (N, 2) of rectified left pixels (N, 2)."""
+        return _move_pixels(self.rig.left, self.original.left, self.R_left.T, uv)
+
+    def unrectify_right(self, uv: Array) -> Array:
+        """Original right pixels (N, 2) of rectified right pixels (N, 2)."""
+        return _move_pixels(self.rig.right, self.original.right, self.R_right.T, uv)
+
+    @cached_property
+    def maps(self) -> tuple[RectificationMaps, RectificationMaps]:
+        """Tables for ``cv2.remap``, left and right."""
+        v, u = np.mgrid[: self.rig.height, : self.rig.width]
+        grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+        tables = []
+        for uv in (self.unrectify_left(grid), self.unrectify_right(grid)):
+            table = np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2)
+            tables.append(RectificationMaps(table[..., 0].copy(), table[..., 1].copy()))
+        return tables[0], tables[1]
+
+
+def rectify(rig: StereoRig) -> RectifiedTwin:
+    """The rectified rectified_rig of a rig, by OpenCV's ``stereoRectify`` with only valid pixels (no black borders).
+
+    Raises:
+        CalibrationError: the cameras look so far apart that no common rectified image is left.
+    """
+    if rig.is_rectified:
+        return RectifiedTwin(rig, rig, np.eye(3), np.eye(3))
+    R_left, R_right, P_left, P_right = _stereo_rectify(rig)
+    f = float(P_left[0, 0])
+    if rig.left.model == "equidistant":
+        # A flat image cannot hold a fisheye's whole view: keep the middle at a useful resolution instead.
+        f = max(f, _FISHEYE_ZOOM * rig.left.fu)
+        P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
+        P_right[0, 2] = P_left[0, 2]
+    if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * rig.left.fu < f < 20 * rig.left.fu):
+        raise CalibrationError("stereo rig cannot be rectified: the two cameras share no usable view")
+    rectified_rig = StereoRig.rectified_pair(
+        f,
+        float(P_left[0, 2]),
+        float(P_left[1, 2]),
+        rig.baseline,
+        rig.width,
+        rig.height,
+        float(P_right[0, 2] - P_left[0, 2]),
+    )
+    return RectifiedTwin(rig, rectified_rig, R_left, R_right)
+
+
+def _stereo_rectify(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
+    """Rotations and projection matrices of both rectified cameras, from OpenCV."""
+    import cv2
+
+    a, c = rig.left, rig.right
+    size = (rig.width, rig.height)
+    D_left, D_right = np.array(a.distortion or (0.0,) * 4), np.array(c.distortion or (0.0,) * 4)
+    t = (rig.R @ rig.b).reshape(3, 1)
+    if a.model == c.model == "equidistant":
+        return cv2.fisheye.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, _ZERO_DISPARITY)[:4]
+    if "equidistant" in (a.model, c.model):
+        raise CalibrationError("one camera is a fisheye and the other is not: such a pair cannot be rectified")
+    return cv2.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, alpha=0)[:4]
+
+
+def _move_pixels(source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:
+    """Pixels of `target` that look along the same rays as pixels of `source`, turned by R."""
+    xy = source.normalise(uv)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    return target.project(rays @ R.T)

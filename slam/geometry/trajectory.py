@@ -1,0 +1,133 @@
+"""A camera's path: stamps and poses, in the file forms of TUM, KITTI and EuRoC."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.errors import TrajectoryError
+from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time.
+
+    Attributes:
+        stamps: times (N,) [s], strictly increasing.
+        poses: ``T_world_left`` (N, 4, 4).
+
+    Raises:
+        TrajectoryError: shapes differ, a value is not finite, or time does not increase.
+    """
+
+    stamps: Array
+    poses: Array
+
+    def __post_init__(self) -> None:
+        if self.poses.shape != (len(self.stamps), 4, 4):
+            raise TrajectoryError(f"trajectory: {len(self.stamps)} stamps, poses {self.poses.shape}")
+        if not (np.isfinite(self.stamps).all() and np.isfinite(self.poses).all()):
+            raise TrajectoryError("trajectory: a value is not finite")
+        if (np.diff(self.stamps) <= 0).any():
+            row = int(np.argmax(np.diff(self.stamps) <= 0)) + 1
+            raise TrajectoryError(f"trajectory: time does not increase at row {row}")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def positions(self) -> Array:
+        """Camera positions (N, 3) [m]."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def length(self) -> float:
+        """Length of the path [m]."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
+        """Paths that follow each other in time, as one."""
+        return cls(np.concatenate([p.stamps for p in parts]), np.concatenate([p.poses for p in parts]))
+
+    def write_tum(self, path: str | Path) -> None:
+        """Write ``stamp tx ty tz qx qy qz qw`` lines."""
+        with Path(path).open("w", encoding="ascii") as file:
+            file.writelines(tum_line(s, T) for s, T in zip(self.stamps, self.poses))
+
+    def write_kitti(self, path: str | Path) -> None:
+        """Write rows of twelve numbers, the upper (3, 4) of each pose; stamps are lost."""
+        np.savetxt(path, self.poses[:, :3].reshape(-1, 12), fmt="%.9e")
+
+    def write_euroc(self, path: str | Path) -> None:
+        """Write EuRoC's CSV: ``timestamp [ns], position, quaternion w x y z``."""
+        q = quaternion(self.poses[:, :3, :3])[:, [3, 0, 1, 2]]
+        with Path(path).open("w", encoding="ascii") as file:
+            file.write(
+                "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+            )
+            for stamp, p, qi in zip(self.stamps, self.positions, q):
+                file.write(",".join([str(round(stamp * 1e9)), *(f"{x:.9f}" for x in (*p, *qi))]) + "\n")
+
+    @classmethod
+    def read_tum(cls, path: str | Path) -> Trajectory:
+        """Read ``stamp tx ty tz qx qy qz qw`` lines; raises TrajectoryError with the file's name."""
+        rows = _read_table(path, None, 8)
+        return cls._of_file(path, rows[:, 0], pose(_rotations(path, rows[:, 4:8]), rows[:, 1:4]))
+
+    @classmethod
+    def read_kitti(cls, path: str | Path, stamps: Array | None = None) -> Trajectory:
+        """Read rows of twelve numbers; `stamps` (N,) [s] default to the row numbers."""
+        rows = _read_table(path, None, 12)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3] = rows[:, :12].reshape(-1, 3, 4)
+        return cls._of_file(path, np.arange(len(rows), dtype=float) if stamps is None else stamps[: len(rows)], poses)
+
+    @classmethod
+    def read_euroc(cls, path: str | Path) -> Trajectory:
+        """Read EuRoC's ground truth CSV (body frame): the first eight columns."""
+        rows = _read_table(path, ",", 8)
+        R = _rotations(path, rows[:, [5, 6, 7, 4]])
+        return cls._of_file(path, rows[:, 0] * 1e-9, pose(R, rows[:, 1:4]))
+
+    @classmethod
+    def _of_file(cls, path: str | Path, stamps: Array, poses: Array) -> Trajectory:
+        """The trajectory of a file's rows; faults are reported under the file's name."""
+        try:
+            return cls(stamps, poses)
+        except TrajectoryError as error:
+            raise TrajectoryError(f"{path}: {error}") from error
+
+
+def tum_line(stamp: float, T: Array) -> str:
+    """One line of a TUM file, newline included."""
+    values = (*T[:3, 3], *quaternion(T[:3, :3]))
+    return f"{stamp:.9f} " + " ".join(f"{v:.9f}" for v in values) + "\n"
+
+
+def _rotations(path: str | Path, quaternions: Array) -> Array:
+    """Rotations (N, 3, 3) of a file's quaternions (N, 4) as (x, y, z, w)."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if (lengths < 1e-6).any():
+        raise TrajectoryError(f"{path}: the quaternion of row {int(np.argmax(lengths < 1e-6))} is zero")
+    return rotation_from_quaternion(quaternions)
+
+
+def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
+    """Finite numbers of a text table with at least `columns` columns."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty file is an error below
+            rows = np.loadtxt(path, delimiter=delimiter, ndmin=2, comments="#")
+    except (OSError, ValueError) as error:
+        raise TrajectoryError(f"{path}: cannot be read as a trajectory: {error}") from error
+    if rows.shape[1] < columns or not len(rows):
+        raise TrajectoryError(f"{path}: a trajectory has {columns} columns, found {rows.shape}")
+    if not np.isfinite(rows[:, :columns]).all():
+        raise TrajectoryError(f"{path}: a value is not finite")
+    return rows

@@ -1,0 +1,49 @@
+"""Landmarks whose place is known beforehand: what every back end asks of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.data import IdArray
+from slam.errors import MeasurementError
+from slam.geometry.se3 import Array
+
+_SYMMETRIC = 1e-6  # largest share by which a covariance may differ from its transpose
+
+
+def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
+    """Check what is handed to `slam.interfaces.MapBackend`.
+
+    Args:
+        backend: its name, for the message.
+        ids: (N,).
+        positions: (N, 3) [m].
+        covariances: (N, 3, 3) [m²].
+
+    Raises:
+        MeasurementError: shapes differ, an id stands twice, a position is not finite, or a covariance is not symmetric
+            and positive definite.
+    """
+    n = len(ids)
+    if positions.shape != (n, 3) or covariances.shape != (n, 3, 3):
+        shapes = f"positions {positions.shape} and covariances {covariances.shape}"
+        raise MeasurementError(f"{backend}: {n} landmark ids, but {shapes}")
+    if len(np.unique(ids)) != n:
+        raise MeasurementError(f"{backend}: a landmark id stands twice")
+    bad = ~np.isfinite(positions).all(axis=1)
+    if bad.any():
+        raise MeasurementError(f"{backend}: the position of landmark {ids[bad][0]} is not finite")
+    bad = ~_positive_definite(covariances)
+    if bad.any():
+        raise MeasurementError(
+            f"{backend}: the covariance of landmark {ids[bad][0]} is not symmetric and positive definite"
+        )
+
+
+def _positive_definite(covariances: Array) -> np.ndarray:
+    """Which matrices (N,) are finite, symmetric and positive definite."""
+    good = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    C = np.where(good[:, None, None], covariances, np.eye(3))
+    scale = np.abs(C).max(axis=(1, 2))
+    good &= np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale
+    return np.asarray(good & (np.linalg.eigvalsh(C)[:, 0] > 0))

@@ -1,0 +1,234 @@
+"""A map in a file: written by one run, started from by another. The format is described in docs/saved_maps.md.
+
+A file is two lines of text and a zip archive of a JSON header and NumPy arrays; nothing in it can be executed. The
+second line is the SHA-256 of the archive, so that no altered file is taken for a map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import IdArray
+from slam.errors import MeasurementError, SlamError
+from slam.geometry.se3 import Array
+from slam.landmarks import LandmarkRows
+from slam.mapping.known_landmarks import require_known
+
+if TYPE_CHECKING:
+    from slam.system import StereoSlam
+
+_MAGIC = "surf-stereo-slam map "
+_VERSION = 2
+_DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
+
+#: World frame of a map that was begun without another one.
+FIRST_FRAME = "left camera at the first frame"
+
+_TYPES = {
+    "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,
+    "laplacian": np.int8, "seen": np.int64, "in_view": np.int64, "seen_from": np.float64,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """A map apart from any run, a row per landmark, ids ascending.
+
+    Attributes:
+        ids: landmark ids (N,).
+        positions: (N, 3) [m] in the map's world frame.
+        covariances: their marginal covariances (N, 3, 3) [m²].
+        descriptors: unit vectors (N, D) float32.
+        laplacian: signs of the Laplacian (N,) int8.
+        seen: number of frames in which each was measured (N,).
+        in_view: number of frames in which each should have been detected or was (N,).
+        frontend: name of the front end that the descriptors are from; empty where it is not known.
+        world_frame: what the world's axes are, for people.
+        written_by: name and version of the program.
+        seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
+        source: where it was read from, for messages; not part of the map.
+
+    Raises:
+        SlamError: arrays that do not fit together, or landmarks that no back end would take.
+    """
+
+    ids: IdArray
+    positions: Array
+    covariances: Array
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    seen: IdArray
+    in_view: IdArray
+    frontend: str = ""
+    world_frame: str = FIRST_FRAME
+    written_by: str = ""
+    source: str = "the map"
+    seen_from: Array = field(default=None)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if self.seen_from is None:
+            object.__setattr__(self, "seen_from", np.full((n, 3), np.nan))
+        for name, dtype in _TYPES.items():
+            array = getattr(self, name)
+            if array.dtype != dtype or len(array) != n:
+                raise SlamError(f"{self.source}: {name} must be {n} rows of {np.dtype(dtype)}")
+        if self.descriptors.ndim != 2 or any(
+            getattr(self, a).ndim != 1 for a in ("ids", "laplacian", "seen", "in_view")
+        ):
+            raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
+        if self.seen_from.shape != (n, 3):
+            raise SlamError(f"{self.source}: seen_from must be {n} rows of 3 numbers")
+        if n and (self.ids[0] < 0 or (np.diff(self.ids) <= 0).any()):
+            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on")
+        if not np.isfinite(self.descriptors).all():
+            raise SlamError(f"{self.source}: a descriptor is not finite")
+        try:
+            require_known(self.source, self.ids, self.positions, self.covariances)
+        except MeasurementError as error:
+            raise SlamError(str(error)) from None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def dimensions(self) -> int:
+        """Length D of the descriptors."""
+        return self.descriptors.shape[1]
+
+    @property
+    def rows(self) -> LandmarkRows:
+        """The map's bookkeeping at the start of a run, in which nothing has been seen yet."""
+        none = np.zeros(len(self), np.int64)
+        return LandmarkRows(
+            self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1, self.seen_from
+        )  # fmt: skip
+
+    @classmethod
+    def of(cls, system: StereoSlam) -> SavedMap:
+        """The map of a system as it is now.
+
+        Raises:
+            SlamError: there is no map yet.
+        """
+        if system.unlocated_map is not None:
+            return system.unlocated_map
+        if system.landmarks is None:
+            raise SlamError("there is no map yet: no frame was processed")
+        from slam import __version__
+
+        marks, estimate = system.landmarks, system.estimate()
+        P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
+        return cls(
+            estimate.ids.astype(np.int64), estimate.positions, P, marks.descriptors.astype(np.float32),
+            marks.laplacian.astype(np.int8), marks.seen, marks.in_view, system.frontend_name, system.world_frame,
+            f"surf-stereo-slam {__version__}", seen_from=marks.seen_from,
+        )  # fmt: skip
+
+    def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
+        """Check that a front end's descriptors can be compared with the map's.
+
+        Args:
+            frontend: its name; empty where it is not known.
+            dimensions: length of its descriptors, where it is known.
+
+        Raises:
+            SlamError: they cannot.
+        """
+        if self.frontend and frontend and self.frontend != frontend:
+            raise SlamError(f"{self.source}: its descriptors are of front end {self.frontend!r}, not {frontend!r}")
+        if dimensions is not None and dimensions != self.dimensions and len(self):
+            raise SlamError(
+                f"{self.source}: its descriptors have {self.dimensions} numbers, those of the front end {dimensions}"
+            )
+
+
+def save_map(path: str | Path, what: StereoSlam | SavedMap) -> None:
+    """Write a map, or that of a system, to a file: whole or not at all.
+
+    Raises:
+        SlamError: there is no map yet, or the file cannot be written.
+    """
+    data = encode(what if isinstance(what, SavedMap) else SavedMap.of(what))
+    path = Path(path)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise SlamError(f"{path}: the map cannot be written: {error.strerror or error}") from error
+
+
+def load_map(path: str | Path) -> SavedMap:
+    """Read a map.
+
+    Raises:
+        SlamError: the file is missing, is no map, is of a version that this program does not know, or was altered or
+            cut short.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise SlamError(f"{path}: the map cannot be read: {error.strerror or error}") from error
+    return decode(data, str(path))
+
+
+def encode(saved: SavedMap) -> bytes:
+    """The bytes of a file; the same for the same map."""
+    header = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
+    members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
+    for name in _TYPES:
+        buffer = io.BytesIO()
+        np.lib.format.write_array(buffer, np.ascontiguousarray(getattr(saved, name)), (1, 0), allow_pickle=False)
+        members[f"{name}.npy"] = buffer.getvalue()
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as file:
+        for name, content in members.items():
+            file.writestr(zipfile.ZipInfo(name, _DATE), content)
+    body = archive.getvalue()
+    return f"{_MAGIC}{_VERSION}\n{hashlib.sha256(body).hexdigest()}\n".encode() + body
+
+
+def decode(data: bytes, source: str) -> SavedMap:
+    """The map of a file's bytes; `source` names it in messages. Raises as `load_map` does."""
+    first, _, rest = data.partition(b"\n")
+    digest, _, body = rest.partition(b"\n")
+    if not first.startswith(_MAGIC.encode()):
+        raise SlamError(f"{source}: not a saved map")
+    version = first[len(_MAGIC) :].decode("ascii", "replace")
+    if version != str(_VERSION):
+        raise SlamError(f"{source}: a map of version {version!r}; this program reads version {_VERSION}")
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
+    try:
+        content = _members(body)
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        raise SlamError(f"{source}: the map cannot be read: {error}") from error
+    return SavedMap(**content, source=source)
+
+
+def _members(body: bytes) -> dict[str, Any]:
+    """The attributes of `SavedMap` in an archive."""
+    with zipfile.ZipFile(io.BytesIO(body)) as file:
+        header = json.loads(file.read("header.json"))
+        texts = [f.name for f in fields(SavedMap) if f.name in ("frontend", "world_frame", "written_by")]
+        if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
+            raise ValueError(f"header.json must give {', '.join(texts)}")
+        content: dict[str, Any] = {name: header[name] for name in texts}
+        for name in _TYPES:
+            content[name] = np.lib.format.read_array(io.BytesIO(file.read(f"{name}.npy")), allow_pickle=False)
+    return content

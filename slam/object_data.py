@@ -1,0 +1,140 @@
+"""What flows between the detector of moving objects, the back ends and the caller. Units and frames as in `slam.data`.
+
+A body's pose ``T_world_object`` takes body coordinates to world coordinates. The body frame is fixed when the body is
+found: its origin is the mean of the points seen then, its axes are those of the world. Motions are independent of that
+choice when written in world coordinates: ``H`` takes a point of the body from where it was to where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, IdArray
+from slam.errors import MeasurementError
+from slam.geometry.se3 import Array
+
+
+@dataclass(frozen=True)
+class ObjectObservations:
+    """Points of one rigid body seen in the current frame, a row each.
+
+    Attributes:
+        id: of the body.
+        points: ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked.
+        uv_left: left pixels (M, 2), finite.
+        uv_right: right pixels (M, 2), NaN where there is no stereo match.
+        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement, it only
+            says where to linearise first. None where there is no guess.
+
+    Raises:
+        MeasurementError: shapes differ, a point stands twice, or a left pixel is not finite.
+    """
+
+    id: int
+    points: IdArray
+    uv_left: Array
+    uv_right: Array
+    T_world_object: Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        if self.uv_left.shape != (n, 2) or self.uv_right.shape != (n, 2):
+            raise MeasurementError(
+                f"object {self.id}: {n} points, but uv_left is {self.uv_left.shape} and uv_right {self.uv_right.shape}"
+            )
+        if len(np.unique(self.points)) != n:
+            raise MeasurementError(f"object {self.id}: a point stands twice")
+        if not np.isfinite(self.uv_left).all():
+            raise MeasurementError(f"object {self.id}: a left pixel is not finite")
+
+    @property
+    def has_stereo(self) -> BoolArray:
+        """Which observations have a right pixel (M,)."""
+        return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a back end made of a body's observations in one frame.
+
+    Attributes:
+        measured: whether they measured the body.
+        used: ids of the points whose observations were used (K,).
+        rejected: ids of those that failed the gate (R,).
+    """
+
+    measured: bool = False
+    used: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True)
+class ObjectEstimate:
+    """A back end's belief about one body at one time.
+
+    Attributes:
+        id: of the body.
+        stamp: time [s].
+        T_world_object: pose (4, 4).
+        covariance: its covariance (6, 6), [rotation, translation], of a perturbation on the right (body axes),
+            given the camera's uncertainty too. It is that of the motion since the first sight, where the pose has none.
+        velocity: angular [rad/s] and linear [m/s] velocity (6,) of the body's origin, in world axes.
+        velocity_covariance: its covariance (6, 6).
+        measured: whether the body was measured in this frame; else it was predicted.
+        used: ids of the points whose observations were used (K,).
+        rejected: ids of those that failed the gate (R,).
+    """
+
+    id: int
+    stamp: float
+    T_world_object: Array
+    covariance: Array
+    velocity: Array
+    velocity_covariance: Array
+    measured: bool
+    used: IdArray
+    rejected: IdArray
+
+
+@dataclass(frozen=True)
+class MovingObject:
+    """A moving rigid body as the system reports it with every frame.
+
+    Attributes:
+        id: stays the same through stops and occlusions.
+        features: rows of the frame's features that belong to it (K,).
+        estimate: pose, velocity and their covariances.
+        motion: motion (4, 4) since the previous frame, in world coordinates.
+        motion_since_found: motion (4, 4) since the body was found, in world coordinates.
+        extent: least and largest corner (2, 3) [m] of the box around its points, in body coordinates; 5th and 95th
+            percentiles, of the points that have moved with it for certain.
+        moving: whether it moves now; a body that stops stays an object.
+        found_at: when it was found [s]; NaN where that was before the run.
+    """
+
+    id: int
+    features: NDArray[np.intp]
+    estimate: ObjectEstimate
+    motion: Array
+    motion_since_found: Array
+    extent: Array
+    moving: bool
+    found_at: float = float("nan")
+
+
+@dataclass(frozen=True)
+class MotionLabels:
+    """What a frame's features are.
+
+    Attributes:
+        moving: rows of features that move, or lie on a body that does (V,).
+        undecided: rows of features not seen for long enough to be judged, or in doubt (U,).
+        landmarks: ids of landmarks that turned out to move (L,).
+    """
+
+    moving: NDArray[np.intp]
+    undecided: NDArray[np.intp]
+    landmarks: IdArray

@@ -1,0 +1,172 @@
+"""Frames with what is seen drawn in: beacons yellow, new ones green, object features black, boxes and axes.
+
+The colours are those of paper B, Fig. 10.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.data import FrameResult, StereoFrame
+from slam.errors import SlamError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, transform
+from slam.object_data import MovingObject
+
+_BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
+_AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
+_BOXES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
+_EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
+_PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
+
+
+def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: int = 960) -> np.ndarray:
+    """The left image (BGR uint8), enlarged to about `width`, with landmarks, moving features, boxes and axes.
+
+    Args:
+        image: left image of the frame.
+        result: of the step.
+        rig: the cameras.
+        width: of the picture [px].
+    """
+    import cv2
+
+    picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    scale = max(1, round(width / picture.shape[1]))
+    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for thing in result.objects:
+        _draw_object(picture, thing, result, rig, scale)
+    moving = np.zeros(len(result.features), bool)
+    moving[result.moving_features] = True
+    beacons = result.matched_features[~moving[result.matched_features]]
+    for rows, colour in ((beacons, _BEACON), (result.added_features, _NEW)):
+        for u, v in result.features.uv_left[rows]:
+            cv2.circle(picture, _pixel(u, v, scale), 2 * scale, colour, 1, cv2.LINE_AA)
+    for u, v in result.features.uv_left[moving]:
+        cv2.circle(picture, _pixel(u, v, scale), 2 * scale + 1, _RING, 1, cv2.LINE_AA)
+        cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _MOVING, 2, cv2.LINE_AA)
+    return picture
+
+
+def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int) -> None:
+    """Box, axes, number and speed of one body; thinner where it is not seen in this frame."""
+    import cv2
+
+    T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
+    lower, upper = thing.extent
+    corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
+    colour = _BOXES[(thing.id - 1) % len(_BOXES)]
+    thickness = 2 if thing.estimate.measured else 1
+    for a, b in _EDGES:
+        _line(picture, rig, transform(T_left_object, np.linspace(corners[a], corners[b], _PARTS)), colour, thickness,
+              scale)  # fmt: skip
+    length = 0.6 * max(float((upper - lower).max()), 1e-3)
+    for axis, axis_colour in enumerate(_AXES):
+        ends = np.linspace(np.zeros(3), length * np.eye(3)[axis], _PARTS)
+        _line(picture, rig, transform(T_left_object, ends), axis_colour, 2 * thickness, scale)
+    top = rig.left.project(transform(T_left_object, corners))
+    if np.isfinite(top).all():
+        u, v = top.min(axis=0)
+        speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
+        text = f"{thing.id}  {speed:.2f} m/s" if thing.moving else f"{thing.id}  at rest"
+        at = _pixel(u, v - 3, scale)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _RING, 3, cv2.LINE_AA)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
+
+
+def _line(
+    picture: np.ndarray, rig: StereoRig, points: Array, colour: tuple[int, int, int], thickness: int, scale: int
+) -> None:
+    """A polyline through points (N, 3) in left-camera coordinates; pieces behind the camera are left out."""
+    import cv2
+
+    uv = rig.left.project(points)
+    limit = 20 * rig.width
+    good = np.asarray((np.abs(np.nan_to_num(uv, nan=2.0 * limit)) < limit).all(axis=1))
+    for i in range(len(points) - 1):
+        if good[i] and good[i + 1]:
+            cv2.line(
+                picture,
+                _pixel(uv[i, 0], uv[i, 1], scale),
+                _pixel(uv[i + 1, 0], uv[i + 1, 1], scale),
+                colour,
+                thickness,
+                cv2.LINE_AA,
+            )
+
+
+def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
+    return round(scale * (u + 0.5)), round(scale * (v + 0.5))
+
+
+class FramePictures:
+    """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
+
+    The video's rate is that of the first two frames.
+
+    Args:
+        path: folder or video.
+
+    Raises:
+        SlamError: the video cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._film = path.suffix.lower() == ".mp4"
+        self._first: tuple[float, np.ndarray] | None = None
+        self._video: Any = None
+        if path.suffix and not self._film:
+            raise SlamError(f"{path}: pictures go to a folder, or to a video FILE.mp4")
+        try:
+            (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SlamError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+    def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
+        """Append a step's picture; a `slam.run.runner.Watch`."""
+        self.add(frame.index, frame.stamp, draw_objects(frame.left, result, system.rig))
+
+    def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
+        """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
+        import cv2
+
+        if not self._film:
+            file = self.path / f"{number:06d}.png"
+            if not cv2.imwrite(str(file), picture):
+                raise SlamError(f"{file}: cannot be written")
+        elif self._first is None:
+            self._first = (stamp, picture)
+        else:
+            if self._video is None:
+                self._video = self._opened(1.0 / (stamp - self._first[0]))
+            self._video.write(picture)
+
+    def _opened(self, rate: float) -> Any:
+        """The video, with the first picture in it."""
+        import cv2
+
+        assert self._first is not None
+        picture = self._first[1]
+        size = (picture.shape[1], picture.shape[0])
+        video = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        if not video.isOpened():
+            raise SlamError(f"{self.path}: cannot be written")
+        video.write(picture)
+        return video
+
+    def close(self) -> None:
+        """Finish the video; a single picture is shown for a second."""
+        if self._video is None and self._first is not None:
+            self._video = self._opened(1.0)
+        if self._video is not None:
+            self._video.release()
+
+    def __enter__(self) -> FramePictures:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

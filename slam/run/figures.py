@@ -1,0 +1,206 @@
+"""Pictures of runs, made from the files that they leave: maps with covariance ellipsoids, paths, errors over time."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slam.evaluation.metrics import align, associate
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
+_COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f")
+_SIGMAS = 2.0  # size of ellipses and ellipsoids
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What a run's folder says.
+
+    Attributes:
+        name: shown in the pictures.
+        online, final: paths.
+        positions: landmarks (N, 3) [m].
+        covariances: (N, 3, 3) [m²].
+        seen_last: which landmarks were measured in the last frame (N,).
+        deviations: of the online position in world axes (F, 3) [m].
+        status: of each frame (F,).
+    """
+
+    name: str
+    online: Trajectory
+    final: Trajectory
+    positions: Array
+    covariances: Array
+    seen_last: np.ndarray
+    deviations: Array
+    status: list[str]
+
+    @classmethod
+    def read(cls, folder: Path, name: str) -> RunData:
+        """Read the files of a finished run."""
+        landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
+        upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
+        last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
+        return cls(
+            name,
+            Trajectory.read_tum(folder / "trajectory.txt"),
+            Trajectory.read_tum(folder / "trajectory_final.txt"),
+            _numbers(landmarks, ("x", "y", "z")),
+            upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
+            last_seen == int(frames[-1]["frame"]),
+            _numbers(frames, ("sd_x", "sd_y", "sd_z")),
+            [row["status"] for row in frames],
+        )
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
+    """Columns of a table as numbers (N, C)."""
+    return np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, len(columns))
+
+
+def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
+    """Top view (right, forward) of each run: landmarks red if seen in the last frame, else green (paper A, Fig. 6)."""
+    from matplotlib.collections import EllipseCollection
+
+    figure, axes = _figure(len(runs), (6.4, 6.0))
+    for axis, run in zip(axes, runs):
+        plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
+        values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
+        angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+        for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
+            ellipses = EllipseCollection(
+                width[rows, 1], width[rows, 0], angle[rows], units="xy", offsets=run.positions[rows][:, [0, 2]],
+                offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
+            )  # fmt: skip
+            axis.add_collection(ellipses)
+            axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
+        axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
+        _draw_truth(axis, run.online, truth, (0, 2))
+        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
+        _limit_to_most(axis, run)
+        _draw_end(axis, run.online, truth)
+    axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
+    _save(figure, path)
+
+
+def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
+    """The map in 3D with covariance ellipsoids and the path (paper A, Fig. 5)."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(6.4 * len(runs), 5.4), layout="constrained")
+    u, v = np.mgrid[0 : 2 * np.pi : 9j, 0 : np.pi : 6j]
+    sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    for i, run in enumerate(runs):
+        axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
+        near = _near_rows(run)[-most:]
+        for row in near:
+            values, vectors = np.linalg.eigh(run.covariances[row])
+            shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]
+            colour = _SEEN if run.seen_last[row] else _UNSEEN
+            axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
+        p = run.online.positions
+        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5, label="path")
+        for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
+            axis.plot([], [], [], color=colour, lw=1, label=label)
+        axis.legend(loc="upper left", fontsize=8, frameon=False)
+        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        axis.set_aspect("equal")
+        axis.view_init(elev=25, azim=-65)
+    _save(figure, path)
+
+
+def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
+    """Position error over time of each run, component by component, inside the ±3σ that the run claims."""
+    figure, axes = _figure(3, (9.0, 2.3), rows=True)
+    for colour, run in zip(_COLOURS, runs):
+        own, true = associate(run.online, truth, 0.02, interpolated=True)
+        start = own.poses[0] @ np.linalg.inv(true.poses[0])
+        expected = true.positions @ start[:3, :3].T + start[:3, 3]
+        error = 100 * (own.positions - expected)
+        rows = np.searchsorted(run.online.stamps, own.stamps)
+        band = 300 * run.deviations[rows]
+        for axis, component, label in zip(axes, range(3), ("right", "down", "forward")):
+            t = own.stamps - own.stamps[0]
+            axis.fill_between(t, -band[:, component], band[:, component], color=colour, alpha=0.15, lw=0)
+            axis.plot(t, error[:, component], color=colour, lw=1.2, label=run.name)
+            axis.set_ylabel(f"{label} [cm]")
+            axis.axhline(0, color="0.6", lw=0.5)
+    axes[0].set_title("Error of the position, online (band: ±3σ as claimed)")
+    axes[0].legend(loc="upper left", fontsize=8, frameon=False)
+    axes[-1].set_xlabel("time [s]")
+    _save(figure, path)
+
+
+def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:
+    """The true path, aligned to the estimated one."""
+    if truth is None:
+        return
+    own, true = associate(online, truth, 0.02, interpolated=True)
+    aligned = align(true, own).apply_trajectory(true)
+    axis.plot(*aligned.positions[:, list(components)].T, "--", color=_TRUTH, lw=1.2, label="true path")
+
+
+def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
+    """The end of the path in an inset, large enough to tell it from the true path."""
+    if truth is None or len(online) < 3:
+        return
+    extent = max(float(np.ptp(online.positions, axis=0).max()), 1e-3)
+    own, true = associate(online, truth, 0.02, interpolated=True)
+    error = float(np.linalg.norm((align(true, own).apply_trajectory(true).positions - own.positions)[-1]))
+    end, half = own.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
+    inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
+    inset.plot(*online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6)
+    _draw_truth(inset, online, truth, (0, 2))
+    inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
+    inset.set(xticks=[], yticks=[])
+    inset.set_title(f"end of the path, {200 * half:.2g} cm wide", fontsize=7)
+    axis.indicate_inset_zoom(inset, edgecolor="0.5")
+
+
+def _near_rows(run: RunData) -> np.ndarray:
+    """Landmarks that are well known and near the path, most recent last: others would spoil the picture's scale."""
+    size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
+    extent = max(float(np.ptp(run.online.positions, axis=0).max()), 1.0)
+    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    return np.flatnonzero((size < 0.2 * extent) & (distance < 2.0 * extent + 3.0))
+
+
+def _limit_to_most(axis: Axes, run: RunData) -> None:
+    """Axis limits that hold the path and the well-known landmarks."""
+    points = np.concatenate([run.online.positions, run.positions[_near_rows(run)]])[:, [0, 2]]
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.05 * float((high - low).max()) + 0.1
+    axis.set_xlim(low[0] - margin, high[0] + margin)
+    axis.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _figure(count: int, size: tuple[float, float], rows: bool = False) -> tuple[Any, list[Any]]:
+    import matplotlib.pyplot as plt
+
+    shape = (count, 1) if rows else (1, count)
+    figure, axes = plt.subplots(
+        *shape, figsize=(size[0] * shape[1], size[1] * shape[0]), squeeze=False, layout="constrained", sharex=rows
+    )
+    return figure, list(axes.ravel())
+
+
+def _save(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)

@@ -1,0 +1,369 @@
+"""What a run gave its back end, recorded, and given to any back end again.
+
+So estimators are compared on identical measurements, where in closed loop each one's predictions steer its own data
+association. Files: `slam.run.recording`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from slam.data import (
+    FrameResult,
+    FrameStatus,
+    IdArray,
+    Observations,
+    Prediction,
+    StereoFeatures,
+    UpdateReport,
+    UpdateStatus,
+)
+from slam.errors import MeasurementError
+from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.interfaces import Backend, RevisingBackend
+from slam.landmarks import LandmarkRows
+from slam.models import EstimatorModels
+from slam.tracking.association import AssociationConfig
+
+_TRACKED = 3  # stereo points that fix a pose
+_STAGES = ("predict", "associate", "update", "manage", "estimate")
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """What a back end was given in one frame.
+
+    Attributes:
+        number: of the frame in its sequence.
+        stamp: time [s].
+        observed: landmarks of the map, as measured.
+        added: landmarks that joined the map, at their first sight.
+        removed: ids of those that left it (R,).
+        shift: before the frame, the right pixels of all earlier ones were moved by so much [px].
+    """
+
+    number: int
+    stamp: float
+    observed: Observations
+    added: Observations
+    removed: IdArray
+    shift: float = 0.0
+
+    @classmethod
+    def of(cls, result: FrameResult, number: int | None = None) -> RecordedFrame:
+        """From what a step of the system did; `number` defaults to the step's."""
+        f, seen, new = result.features, result.matched_features, result.added_features
+        return cls(
+            result.index if number is None else number,
+            f.stamp,
+            Observations(result.matched, f.uv_left[seen], f.uv_right[seen]),
+            Observations(result.added, f.uv_left[new], f.uv_right[new]),
+            result.erased,
+            result.shift,
+        )
+
+
+@dataclass(frozen=True)
+class RecordedRows:
+    """Observations of many frames, a row each.
+
+    Attributes:
+        frame: row of the recording's stamps (M,), ascending.
+        ids: landmark ids (M,).
+        uv_left, uv_right: pixels (M, 2), `uv_right` NaN where there is no stereo match.
+    """
+
+    frame: IdArray
+    ids: IdArray
+    uv_left: Array
+    uv_right: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def at(self, k: int) -> Observations:
+        """Those of frame k."""
+        rows = slice(*np.searchsorted(self.frame, [k, k + 1]))
+        return Observations(self.ids[rows], self.uv_left[rows], self.uv_right[rows])
+
+    @classmethod
+    def of(cls, frames: Sequence[Observations]) -> RecordedRows:
+        """Of each frame's observations."""
+        none = Observations.empty()
+        every = [none, *frames]
+        return cls(
+            np.repeat(np.arange(len(frames)), [len(o) for o in frames]),
+            np.concatenate([o.ids for o in every]),
+            np.concatenate([o.uv_left for o in every]),
+            np.concatenate([o.uv_right for o in every]),
+        )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All that a back end was given in a run, and what it takes to give it to another one.
+
+    Attributes:
+        name: of the sequence.
+        rig: the cameras.
+        models: noise, priors and motion that the run assumed.
+        numbers: of the frames in their sequence (F,).
+        stamps: times (F,) [s], increasing.
+        observed: measurements of landmarks that the map had.
+        added: first measurements of those that joined it.
+        removed_frame, removed: row of `stamps`, ascending, and id of each landmark that left the map (R,).
+        ground_truth: the left camera's true path, where it is known.
+        shift: of the right pixels of all earlier frames, before each (F,) [px]; None for none at all.
+        kind: of motion, which chooses a back end's default options.
+
+    Raises:
+        MeasurementError: arrays do not fit each other, stamps do not increase, or a value is not finite.
+    """
+
+    name: str
+    rig: StereoRig
+    models: EstimatorModels
+    numbers: IdArray
+    stamps: Array
+    observed: RecordedRows
+    added: RecordedRows
+    removed_frame: IdArray
+    removed: IdArray
+    ground_truth: Trajectory | None = None
+    warnings: list[str] = field(default_factory=list)
+    shift: Array | None = None
+    kind: str = "handheld"
+
+    format: ClassVar[str] = "recording"
+
+    def __post_init__(self) -> None:
+        count = len(self.stamps)
+        if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
+            raise MeasurementError("recording: stamps must be finite and increase, with a number each")
+        if self.shift is not None and (self.shift.shape != (count,) or not np.isfinite(self.shift).all()):
+            raise MeasurementError("recording: shift must be finite, with a value for each stamp")
+        if self.removed.shape != self.removed_frame.shape:
+            raise MeasurementError("recording: removed and removed_frame differ in length")
+        frames = {"observed": self.observed.frame, "added": self.added.frame, "removed": self.removed_frame}
+        for what, frame in frames.items():
+            if len(frame) and (frame[0] < 0 or frame[-1] >= count or (np.diff(frame) < 0).any()):
+                raise MeasurementError(f"recording: frames of {what} must ascend from 0 to {count - 1}")
+        for what, rows in (("observed", self.observed), ("added", self.added)):
+            _check_rows(what, rows)
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __iter__(self) -> Iterator[RecordedFrame]:
+        return (self.frame(k) for k in range(len(self)))
+
+    def frame(self, k: int) -> RecordedFrame:
+        """What was given in frame k."""
+        gone = self.removed[slice(*np.searchsorted(self.removed_frame, [k, k + 1]))]
+        number, stamp = int(self.numbers[k]), float(self.stamps[k])
+        shift = 0.0 if self.shift is None else float(self.shift[k])
+        return RecordedFrame(number, stamp, self.observed.at(k), self.added.at(k), gone, shift)
+
+    def map_size(self, k: int) -> int:
+        """Number of landmarks in the map after frame k."""
+        added, removed = np.searchsorted(self.added.frame, k + 1), np.searchsorted(self.removed_frame, k + 1)
+        return int(added - removed)
+
+    def landmarks(self, frames: int) -> LandmarkRows:
+        """The map after the first so many frames: how often each landmark was given, and when; no appearance."""
+        ids, frame = (
+            np.concatenate([getattr(rows, name) for rows in (self.added, self.observed)]) for name in ("ids", "frame")
+        )
+        ids, frame = ids[frame < frames], frame[frame < frames]
+        unique, place, seen = np.unique(ids, return_inverse=True, return_counts=True)
+        last = np.zeros(len(unique), np.int64)
+        np.maximum.at(last, place, frame)
+        kept = ~np.isin(unique, self._gone(frames))
+        unique, seen, last = unique[kept], seen[kept], last[kept]
+        none = np.zeros(len(unique), np.int64)
+        looks = np.zeros((len(unique), 0), np.float32)
+        return LandmarkRows(unique, looks, none.astype(np.int8), seen, seen, none, last)
+
+    def _gone(self, frames: int) -> IdArray:
+        """Ids of landmarks that left the map in the first so many frames, and did not come back after that."""
+        left = dict(zip(self.removed[self.removed_frame < frames].tolist(), self.removed_frame.tolist()))
+        came = self.added.frame < frames
+        back = {i for i, k in zip(self.added.ids[came].tolist(), self.added.frame.tolist()) if k > left.get(i, k)}
+        return np.array(sorted(set(left) - back), np.int64)
+
+    @classmethod
+    def of(
+        cls,
+        frames: Iterable[RecordedFrame],
+        rig: StereoRig,
+        models: EstimatorModels,
+        name: str = "",
+        ground_truth: Trajectory | None = None,
+    ) -> Recording:
+        """Of what was given frame by frame."""
+        every = list(frames)
+        return cls(
+            name,
+            rig,
+            models,
+            np.array([f.number for f in every], np.int64),
+            np.array([f.stamp for f in every], float),
+            RecordedRows.of([f.observed for f in every]),
+            RecordedRows.of([f.added for f in every]),
+            np.repeat(np.arange(len(every)), [len(f.removed) for f in every]),
+            np.concatenate([np.zeros(0, np.int64), *(np.asarray(f.removed, np.int64) for f in every)]),
+            ground_truth,
+            shift=np.array([f.shift for f in every]),
+        )
+
+
+def _check_rows(what: str, rows: RecordedRows) -> None:
+    count = len(rows)
+    if rows.frame.shape != (count,) or rows.uv_left.shape != (count, 2) or rows.uv_right.shape != (count, 2):
+        raise MeasurementError(f"recording: arrays of {what} differ in length")
+    if not np.isfinite(rows.uv_left).all():
+        raise MeasurementError(f"recording: a left pixel of {what} is not finite")
+    order = np.lexsort((rows.ids, rows.frame))
+    frame, ids = rows.frame[order], rows.ids[order]
+    twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(ids) == 0))
+    if len(twice):
+        raise MeasurementError(f"recording: landmark {ids[twice[0]]} stands twice in {what} of frame {frame[twice[0]]}")
+
+
+def record(
+    results: Iterable[FrameResult],
+    rig: StereoRig,
+    models: EstimatorModels,
+    name: str = "",
+    ground_truth: Trajectory | None = None,
+) -> Recording:
+    """What the back end was given in a run.
+
+    Args:
+        results: of all steps, from the first one on.
+        rig: the cameras.
+        models: noise, priors and motion that the run assumed.
+        name: of the sequence.
+        ground_truth: the left camera's true path, where it is known.
+    """
+    return Recording.of((RecordedFrame.of(result) for result in results), rig, models, name, ground_truth)
+
+
+def replay(
+    recording: Recording, backend: Backend, guess: bool = True, association: AssociationConfig | None = None
+) -> Iterator[FrameResult]:
+    """Give a back end what was recorded, frame by frame; what it made of it comes back frame by frame.
+
+    Args:
+        recording: what to give.
+        backend: a new back end for the recording's rig.
+        guess: give `Backend.update` the pose on which the observations agree, as the system does; it is found anew
+            from this back end's own map. All observations are given, also those that do not agree.
+        association: settings of that search; None for the defaults.
+
+    Yields:
+        results as the system gives them; their features are the recorded observations, without descriptors.
+
+    Raises:
+        MeasurementError: the recording is not consistent: an unknown id, or one that is in the map already.
+    """
+    config = association or AssociationConfig()
+    for k, frame in enumerate(recording):
+        yield _step(recording, backend, k, frame, config if guess else None)
+
+
+def _step(
+    recording: Recording, backend: Backend, k: int, frame: RecordedFrame, config: AssociationConfig | None
+) -> FrameResult:
+    """One frame."""
+    times = [time.perf_counter()]
+    if frame.shift and isinstance(backend, RevisingBackend):
+        backend.shift_right(frame.shift)
+    prediction = backend.predict(frame.stamp)
+    times.append(time.perf_counter())
+    guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
+    times.append(time.perf_counter())
+    report = backend.update(frame.observed, guess)
+    times.append(time.perf_counter())
+    _keep_map(backend, frame)
+    times.append(time.perf_counter())
+    estimate = backend.estimate(landmarks=False)
+    times.append(time.perf_counter())
+    first = bool(len(recording.added)) and k == recording.added.frame[0]
+    status, reason = _status(report, first)
+    seen, new = len(frame.observed), len(frame.added)
+    return FrameResult(
+        index=k,
+        status=status,
+        reason=reason,
+        estimate=estimate,
+        report=report,
+        features=_features(frame),
+        predicted=len(prediction.ids),
+        matched=frame.observed.ids,
+        matched_features=np.arange(seen),
+        added=frame.added.ids,
+        added_features=np.arange(seen, seen + new),
+        erased=frame.removed,
+        map_size=recording.map_size(k),
+        shift=frame.shift,
+        milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
+    )
+
+
+def _agreement(
+    recording: Recording,
+    backend: Backend,
+    prediction: Prediction,
+    observed: Observations,
+    config: AssociationConfig,
+    seed: int,
+) -> Array | None:
+    """The pose on which most observations agree; None without any."""
+    if not len(observed):
+        return None
+    measured = measurement_rows(observed.uv_left, observed.uv_right)
+    threshold = config.consistency_sigmas * recording.models.pixel_sigma
+    points, expected = backend.positions(observed.ids), prediction.T_world_left
+    found = find_consensus(recording.rig, points, measured, expected, threshold, config.hypotheses, seed)
+    return found.T_world_left
+
+
+def _keep_map(backend: Backend, frame: RecordedFrame) -> None:
+    """Remove and add landmarks in the order in which the system does; what has just been added may leave at once."""
+    at_once = np.isin(frame.removed, frame.added.ids)
+    if not at_once.all():
+        backend.remove(frame.removed[~at_once])
+    if len(frame.added):
+        backend.add(frame.added)
+    if at_once.any():
+        backend.remove(frame.removed[at_once])
+
+
+def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
+    if report.status is UpdateStatus.FAILED:
+        return FrameStatus.FAILED, report.reason
+    if len(report.used) >= _TRACKED:
+        return FrameStatus.TRACKED, ""
+    if first:
+        return FrameStatus.STARTED, ""
+    return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks recognised"
+
+
+def _features(frame: RecordedFrame) -> StereoFeatures:
+    """The observations as features: first those of the map, then the new ones."""
+    uv_left = np.concatenate([frame.observed.uv_left, frame.added.uv_left])
+    uv_right = np.concatenate([frame.observed.uv_right, frame.added.uv_right])
+    nothing = np.full(len(uv_left), np.nan)
+    none = np.zeros((len(uv_left), 0), np.float32)
+    return StereoFeatures(
+        frame.stamp, uv_left, uv_right, nothing, nothing, nothing, np.zeros(len(uv_left), np.int8), none
+    )

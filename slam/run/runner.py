@@ -1,0 +1,359 @@
+"""Run a sequence through the system and leave the files of `slam.run.outputs`; the algorithm itself is in `slam.system`."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam import registry
+from slam.config import SystemConfig
+from slam.data import Estimate, FrameResult, StereoFrame
+from slam.errors import SlamError
+from slam.evaluation.summary import consistency, evaluate
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.interfaces import Backend, Frontend
+from slam.landmarks import LandmarkRows
+from slam.mapping.map_io import load_map, save_map
+from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.run.outputs import STAGES, RunFiles
+from slam.run.recording import save_recording
+from slam.run.replay import RecordedFrame, Recording, replay
+from slam.sequences import Sequence
+from slam.system import StereoSlam
+
+_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
+
+#: Is shown each step: its images, what came of it, and the system after it.
+Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What to run and where to leave the files.
+
+    Attributes:
+        backend, frontend: names.
+        config: all settings.
+        out: folder for the files.
+        start, stop: range of frames; `stop` None for all.
+        record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
+        known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
+        save_map: file for the map at the end; None for none.
+        mono: use the left images alone.
+    """
+
+    backend: str
+    frontend: str
+    config: SystemConfig
+    out: Path
+    start: int = 0
+    stop: int | None = None
+    record: Path | None = None
+    known_map: Path | None = None
+    save_map: Path | None = None
+    mono: bool = False
+
+
+@dataclass
+class RunRecord:
+    """What a run has gathered so far: the online path, frame by frame, but for frames that have no pose at all."""
+
+    numbers: list[int] = field(default_factory=list)
+    stamps: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    statuses: list[str] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    milliseconds: list[dict[str, float]] = field(default_factory=list)
+    rejected: int = 0
+    used: int = 0
+    nis: float = 0.0
+    nis_dof: int = 0
+
+    def add(self, number: int, result: FrameResult) -> None:
+        """Take in one frame, `number` in its sequence."""
+        self.numbers.append(number)
+        self.statuses.append(result.status.value)
+        self.milliseconds.append(dict(result.milliseconds))
+        if not result.located:
+            return
+        self.stamps.append(result.estimate.stamp)
+        self.poses.append(result.estimate.T_world_left)
+        self.covariances.append(result.estimate.covariance)
+        self.rejected += len(result.report.rejected)
+        self.used += len(result.report.used)
+        if result.report.dof:
+            self.nis += result.report.nis
+            self.nis_dof += result.report.dof
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The online path."""
+        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
+
+
+def run(
+    sequence: Sequence,
+    options: RunOptions,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    frontend: Frontend | None = None,
+    watches: Iterable[Watch] = (),
+) -> dict[str, Any]:
+    """Run a sequence; returns the summary that is also written to ``summary.json``.
+
+    The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
+    summary says how it ended, and the exception goes on.
+
+    Args:
+        sequence: what to run.
+        options: names, settings, folder, range of frames.
+        on_frame: called after every frame, for a progress display.
+        frontend: used in place of the one that the options name.
+        watches: called after every step with its images, its result and the system, to show or to draw it.
+
+    Raises:
+        SlamError: bad input; one line says what and where.
+    """
+    for target in (options.record, options.save_map):
+        if target is not None and not target.parent.is_dir():
+            raise SlamError(f"{target}: there is no folder {target.parent}")
+    if options.known_map is not None and options.record is not None:
+        raise SlamError("a run that starts in a known map cannot be recorded: the recording would lack the map")
+    if options.config.map.monocular and options.record is not None:
+        raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
+    frames = sequence.frames(options.start, options.stop)
+    if options.mono:
+        frames = (replace(frame, right=None) for frame in frames)
+    known = None if options.known_map is None else load_map(options.known_map)
+    system = StereoSlam(
+        sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
+    )
+    return _drive(sequence, options, system, _processed(system, frames, tuple(watches)), RunRecord(), on_frame)
+
+
+def run_recording(
+    recording: Recording, options: RunOptions, on_frame: Callable[[FrameResult], None] | None = None
+) -> dict[str, Any]:
+    """Replay a recording through a back end; leaves the files of a run and returns its summary, as `run` does.
+
+    Args:
+        recording: what the back end is given.
+        options: back end, settings and folder; there is no front end and no range of frames.
+        on_frame: called after every frame, for a progress display.
+
+    Raises:
+        SlamError: bad input; one line says what and where.
+    """
+    config = options.config
+    backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
+    results = zip(recording.numbers.tolist(), replay(recording, backend, association=config.association))
+    record = RunRecord()
+    return _drive(recording, options, _Replayed(recording, backend, record), results, record, on_frame)
+
+
+def _drive(
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    results: Iterable[tuple[int, FrameResult]],
+    record: RunRecord,
+    on_frame: Callable[[FrameResult], None] | None,
+) -> dict[str, Any]:
+    """Write what each frame gives, and in the end the rest, however it ends; returns the summary."""
+    tape: list[RecordedFrame] = []
+    score = score_for(sequence)
+    ended = "completed"
+    with RunFiles(options.out) as files:
+        files.write_json("config.json", _config_tree(sequence, options, system))
+        try:
+            for number, result in results:
+                record.add(number, result)
+                files.write_frame(number, result)
+                if score is not None:
+                    score.add(number, result, labels_in_images(sequence, number, result.features))
+                if options.record is not None:
+                    tape.append(RecordedFrame.of(result, number))
+                if on_frame is not None:
+                    on_frame(result)
+        except BaseException as error:
+            ended = f"stopped: {error or type(error).__name__}"
+            raise
+        finally:
+            summary = _finish(sequence, options, system, record, files, ended, score)
+            if options.record is not None:
+                save_recording(_recording(sequence, options, system, tape), options.record)
+            if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
+                save_map(options.save_map, system)
+    return summary
+
+
+def _recording(
+    sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed, tape: list[RecordedFrame]
+) -> Recording:
+    """What was given to the back end of a run.
+
+    Raises:
+        SlamError: it was given to more than one.
+    """
+    if isinstance(system, StereoSlam) and system.restarted:
+        raise SlamError(
+            f"{options.record}: not written: the camera was carried off, and another back end went on in frame "
+            f"{system.restarted[0]}; what is recorded is for one"
+        )
+    whole = Recording.of(tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
+    return replace(whole, kind=sequence.kind)
+
+
+def _processed(
+    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]
+) -> Iterator[tuple[int, FrameResult]]:
+    """Each frame's number and what the system did with it."""
+    for frame, elapsed in _timed(frames):
+        result = system.process(frame)
+        result.milliseconds["read"] = elapsed  # type: ignore[index]
+        yield frame.index, result
+        for watch in watches:
+            watch(frame, result, system)
+
+
+@dataclass(frozen=True)
+class _Replayed:
+    """A back end that is given a recording, as the summary sees a system."""
+
+    recording: Recording
+    backend: Backend
+    record: RunRecord
+
+    def trajectory(self) -> Trajectory:
+        """The back end's last word on every frame."""
+        return self.backend.trajectory()
+
+    def estimate(self) -> Estimate:
+        """Pose and map with covariances."""
+        return self.backend.estimate()
+
+    @property
+    def landmarks(self) -> LandmarkRows:
+        """How often, and when last, each landmark was given so far."""
+        return self.recording.landmarks(len(self.record.stamps))
+
+
+def _timed(frames: Iterator[StereoFrame]) -> Iterator[tuple[StereoFrame, float]]:
+    """Frames with the wall time that reading each took [ms]."""
+    while True:
+        start = time.perf_counter()
+        frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame, 1e3 * (time.perf_counter() - start)
+
+
+def _finish(
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    files: RunFiles,
+    ended: str,
+    score: ObjectScore | None,
+) -> dict[str, Any]:
+    """Write the last files and return the summary."""
+    summary: dict[str, Any] = {
+        "sequence": sequence.name,
+        "format": sequence.format,
+        "frontend": options.frontend,
+        "backend": options.backend,
+        "ended": ended,
+        "frames": len(record.numbers),
+        "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
+        "warnings": list(sequence.warnings),
+    }
+    if record.stamps:
+        final = system.trajectory()
+        files.write_final(final, system.estimate(), system.landmarks, record.numbers)
+        summary["path_length_m"] = record.trajectory.length
+        summary["landmarks"] = 0 if system.landmarks is None else len(system.landmarks)
+        summary["observations"] = {"used": record.used, "rejected": record.rejected}
+        summary["accuracy"] = {
+            "online": evaluate(record.trajectory, sequence),
+            "final": evaluate(final, sequence),
+        }
+        summary["consistency"] = {
+            "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
+            **consistency(record.trajectory, np.array(record.covariances), sequence),
+        }
+        if isinstance(system, StereoSlam):
+            summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+        if score is not None:
+            summary["objects"] = score.summary()
+        summary["milliseconds"] = _timings(record)
+        summary["frames_per_second"] = _rate(record)
+    summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
+    summary["configuration"] = options.config.to_json()
+    summary["versions"] = versions()
+    files.write_json("summary.json", summary)
+    return summary
+
+
+def _rate(record: RunRecord) -> float | None:
+    """Frames per second over all frames but the first, which may wait for compilers; None for a single frame."""
+    seconds = sum(sum(m.values()) for m in record.milliseconds[1:]) / 1e3
+    return (len(record.milliseconds) - 1) / seconds if seconds > 0 else None
+
+
+def _timings(record: RunRecord) -> dict[str, Any]:
+    """Median per stage over all frames but the first, and the first frame's total [ms]."""
+    totals = [sum(m.values()) for m in record.milliseconds]
+    later = record.milliseconds[1:] or record.milliseconds
+    median = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in STAGES}
+    return {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}
+
+
+def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed) -> dict[str, Any]:
+    """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
+    parts = {"frontend": getattr(system, "frontend", None), "backend": system.backend}
+    in_force = {name: getattr(part, "config", None) for name, part in parts.items()}
+    return {
+        "sequence": sequence.name,
+        "format": sequence.format,
+        "frontend": options.frontend,
+        "backend": options.backend,
+        "frames": [options.start, options.stop],
+        "settings": options.config.to_json(),
+        "in_force": {name: asdict(c) for name, c in in_force.items() if is_dataclass(c) and not isinstance(c, type)},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that shape a result."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def parse_frames(text: str | None) -> tuple[int, int | None]:
+    """``A:B`` (either may be left out) as a range of frames.
+
+    Raises:
+        SlamError: not of that form.
+    """
+    if text is None:
+        return 0, None
+    first, colon, last = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return int(first or 0), int(last) if last else None
+    except ValueError:
+        raise SlamError(f"frames {text!r} is not of the form A:B") from None

@@ -1,0 +1,105 @@
+"""Recordings of worlds with true association: what a back end is given by a data association without fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from slam.data import IdArray, Observations
+from slam.mapping.selection import MapConfig, new_landmarks
+from slam.models import EstimatorModels, models_for
+from slam.run.replay import RecordedFrame, RecordedRows, Recording
+from slam.worlds.observe import SimulatedFeatures
+from slam.worlds.sequence import WorldSequence
+
+_LEAST_SIGMA = 0.01  # assumed pixel noise where there is none [px]: with none at all nothing could be weighed
+
+
+def true_recording(
+    sequence: WorldSequence,
+    start: int = 0,
+    stop: int | None = None,
+    *,
+    models: EstimatorModels | None = None,
+    config: MapConfig | None = None,
+    false_stereo: bool = False,
+    keep: int | None = None,
+) -> Recording:
+    """What a back end is given where every feature is known to be of its landmark.
+
+    As in the system, landmarks are added where fewer than ``config.target_in_view`` are measured, spread over the
+    image; false features and those of moving objects are left out.
+
+    Args:
+        sequence: the recorded world.
+        start: first frame.
+        stop: end of the frames, itself left out; None for all.
+        models: noise, priors and motion; default: those of the sequence's kind, with its pixel noise.
+        config: which features become landmarks.
+        false_stereo: take also true features whose right pixel is false.
+        keep: landmarks that were not seen for so many frames leave the map; None: they stay for ever.
+    """
+    if models is None:
+        models = replace(models_for(sequence.kind), pixel_sigma=max(sequence.values["sigma"], _LEAST_SIGMA))
+    end = len(sequence) if stop is None else min(stop, len(sequence))
+    frames = _frames(sequence, range(start, end), models, config or MapConfig(), false_stereo, keep)
+    return Recording.of(frames, sequence.rig, models, sequence.name, sequence.ground_truth)
+
+
+def with_mismatches(recording: Recording, share: float, seed: int = 0) -> Recording:
+    """The recording with wrong matches: in every frame this share of the observations exchange their pixels.
+
+    Args:
+        recording: what to spoil; the first sights of landmarks stay as they are.
+        share: of the observations in each frame, 0 to 1.
+        seed: of the random choice.
+    """
+    rng = np.random.default_rng(seed)
+    rows, source = recording.observed, np.arange(len(recording.observed))
+    for k in range(len(recording)):
+        first, last = np.searchsorted(rows.frame, [k, k + 1])
+        wrong = first + np.flatnonzero(rng.random(last - first) < share)
+        source[wrong] = _deranged(wrong, rng)
+    observed = RecordedRows(rows.frame, rows.ids, rows.uv_left[source], rows.uv_right[source])
+    return replace(recording, observed=observed)
+
+
+def _deranged(rows: IdArray, rng: np.random.Generator) -> IdArray:
+    """The rows in another order, none in its place."""
+    order = rng.permutation(len(rows))
+    out = np.empty_like(rows)
+    out[order] = rows[np.roll(order, 1)]
+    return out
+
+
+def _frames(
+    sequence: WorldSequence,
+    numbers: range,
+    models: EstimatorModels,
+    config: MapConfig,
+    false_stereo: bool,
+    keep: int | None,
+) -> Iterator[RecordedFrame]:
+    """What is given, frame by frame."""
+    last_seen: dict[int, int] = {}
+    for k in numbers:
+        seen = sequence.simulate(k)
+        good = (seen.ids >= 0) & (seen.objects == 0) & (false_stereo | ~seen.false_stereo)
+        known = good & np.array([i in last_seen for i in seen.ids.tolist()], bool)
+        occupied = seen.features.uv_left[known]
+        new = new_landmarks(seen.features, good & ~known, occupied, sequence.rig, models.pixel_sigma, config)
+        observed, added = _observations(seen, np.flatnonzero(known)), _observations(seen, new)
+        for i in (*observed.ids.tolist(), *added.ids.tolist()):
+            last_seen[i] = k
+        removed = [] if keep is None else sorted(i for i, last in last_seen.items() if k - last > keep)
+        for i in removed:
+            del last_seen[i]
+        yield RecordedFrame(k, seen.features.stamp, observed, added, np.array(removed, np.int64))
+
+
+def _observations(seen: SimulatedFeatures, rows: IdArray) -> Observations:
+    """Of features with known landmarks, by ascending id."""
+    rows = rows[np.argsort(seen.ids[rows])]
+    return Observations(seen.ids[rows], seen.features.uv_left[rows], seen.features.uv_right[rows])

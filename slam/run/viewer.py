@@ -1,0 +1,187 @@
+"""Runs in the Rerun viewer: images, features, map with ellipsoids, path and objects on one time line.
+
+Rerun is an optional dependency (``pip install 'surf-stereo-slam[viewer]'``), loaded when a viewer is made.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.data import Estimate, FrameResult, StereoFrame
+from slam.errors import SlamError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, quaternion
+from slam.geometry.trajectory import Trajectory
+from slam.run.figures import RunData
+from slam.system import StereoSlam
+
+LIVE = "live"
+
+_SIGMAS = 2.0
+_SEEN, _UNSEEN, _NEW, _PATH, _TRUTH = (229, 57, 53), (124, 179, 66), (255, 235, 59), (21, 101, 192), (120, 120, 120)
+_MOVING = (255, 145, 0)
+_MAP_EVERY = 10  # frames between two pictures of the whole map, whose covariances take their time
+
+
+class Viewer:
+    """Shows a run while it goes on, or keeps it for later; a context manager.
+
+    Args:
+        target: `LIVE` for a viewer window that is started, else the ``.rrd`` file to be written.
+        rig: the cameras; without them no images are shown.
+        truth: the true path, drawn where it is known.
+
+    Raises:
+        SlamError: Rerun is not installed, the viewer cannot be started, or the file not written.
+    """
+
+    def __init__(self, target: str, rig: StereoRig | None = None, truth: Trajectory | None = None) -> None:
+        self._rr = _rerun()
+        self._target = target
+        self._recording = _open(self._rr, target)
+        self._rig = rig
+        self._start: float | None = None
+        self._path: list[Array] = []
+        self._truth = truth
+        self._log("world", self._rr.ViewCoordinates.RDF, static=True)
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self._recording.flush()
+        except RuntimeError as error:  # a window that was closed or never opened takes nothing from the run
+            if kind is None and self._target != LIVE:
+                raise SlamError(f"viewer {self._target}: {_first_line(error)}") from error
+            logging.getLogger(__name__).warning("viewer %s: not all was shown: %s", self._target, _first_line(error))
+
+    def show(self, frame: StereoFrame, result: FrameResult, system: StereoSlam) -> None:
+        """One more frame, right after its step."""
+        rr, e, features = self._rr, result.estimate, result.features
+        self._at(frame.index, e.stamp)
+        if self._truth is not None and not self._path:
+            self._draw_truth(e)
+        self._camera(e.T_world_left)
+        image = frame.left if frame.left.ndim == 2 else frame.left[..., 2::-1]
+        if image.dtype == np.uint8 and self._rig is not None:
+            self._log("world/camera/image", rr.Image(image).compress(jpeg_quality=80))
+        kinds = (
+            ("measured", result.matched_features, _SEEN),
+            ("new", result.added_features, _NEW),
+            ("moving", result.moving_features, _MOVING),
+        )
+        for name, rows, colour in kinds:
+            self._log(f"world/camera/image/{name}", rr.Points2D(features.uv_left[rows], colors=colour, radii=2.0))
+        for moving in result.objects:
+            T, box = moving.estimate.T_world_object, moving.extent
+            self._log(f"world/objects/{moving.id}", _transform(rr, T))
+            boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
+            self._log(f"world/objects/{moving.id}/box", boxes)
+        if result.index % _MAP_EVERY == 0:
+            whole = system.estimate()
+            self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
+
+    def show_map(self, positions: Array, covariances: Array, seen: np.ndarray) -> None:
+        """Landmarks (N, 3) with the 2σ ellipsoids of their covariances (N, 3, 3), red where they are seen."""
+        values, vectors = np.linalg.eigh(covariances.reshape(-1, 3, 3))
+        vectors *= np.sign(np.linalg.det(vectors))[:, None, None]
+        half = _SIGMAS * np.sqrt(np.maximum(values, 0))
+        for name, rows, colour in (("seen", seen, _SEEN), ("not_seen", ~seen, _UNSEEN)):
+            shapes = self._rr.Ellipsoids3D(
+                centers=positions[rows], half_sizes=half[rows], quaternions=quaternion(vectors[rows]), colors=colour
+            )
+            self._log(f"world/map/{name}", shapes)
+
+    def show_pose(self, number: int, stamp: float, T_world_left: Array) -> None:
+        """The camera alone."""
+        self._at(number, stamp)
+        self._camera(T_world_left)
+
+    def show_object(self, name: str, position: list[float]) -> None:
+        """Where a moving object is [m]."""
+        self._log(f"world/objects/{name}", self._rr.Points3D([position], colors=_MOVING, radii=0.03))
+
+    def _camera(self, T_world_left: Array) -> None:
+        rr = self._rr
+        self._path.append(T_world_left[:3, 3])
+        self._log("world/camera", _transform(rr, T_world_left))
+        if self._rig is not None:
+            left = self._rig.left
+            K = [[left.fu, 0, left.u0], [0, left.fv, left.v0], [0, 0, 1]]
+            pinhole = rr.Pinhole(image_from_camera=K, resolution=[left.width, left.height], image_plane_distance=0.2)
+            self._log("world/camera/image", pinhole)
+        self._log("world/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
+
+    def _draw_truth(self, first: Estimate) -> None:
+        """The true path, placed by the first pose."""
+        assert self._truth is not None
+        at = int(np.argmin(np.abs(self._truth.stamps - first.stamp)))
+        placed = first.T_world_left @ np.linalg.inv(self._truth.poses[at]) @ self._truth.poses
+        self._log("world/truth", self._rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
+
+    def _at(self, number: int, stamp: float) -> None:
+        self._start = stamp if self._start is None else self._start
+        self._recording.set_time("frame", sequence=number)
+        self._recording.set_time("time", duration=stamp - self._start)
+
+    def _log(self, path: str, what: Any, static: bool = False) -> None:
+        self._recording.log(path, what, static=static)
+
+
+def view_run(folder: Path, target: str) -> None:
+    """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
+
+    Raises:
+        SlamError: the folder does not hold a finished run, or see `Viewer`.
+    """
+    try:
+        run = RunData.read(folder, folder.name)
+        with (folder / "objects.csv").open(encoding="utf-8", newline="") as file:
+            objects = list(csv.DictReader(file))
+    except (OSError, KeyError, IndexError) as error:
+        raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
+    with Viewer(target) as viewer:
+        for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
+            viewer.show_pose(number, float(stamp), pose)
+            for row in objects:
+                if abs(float(row["stamp"]) - stamp) < 1e-6:
+                    viewer.show_object(row["id"], [float(row[c]) for c in "xyz"])
+        viewer.show_map(run.positions, run.covariances, run.seen_last)
+
+
+def _transform(rr: Any, T: Array) -> Any:
+    return rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+
+
+def _rerun() -> Any:
+    try:
+        return import_module("rerun")
+    except ImportError as error:
+        raise SlamError("the viewer needs Rerun: pip install 'surf-stereo-slam[viewer]'") from error
+
+
+def _open(rr: Any, target: str) -> Any:
+    """A recording stream into a window or a file."""
+    recording = rr.RecordingStream("surf-stereo-slam")
+    try:
+        if target == LIVE:
+            recording.spawn()
+        else:
+            path = Path(target)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            recording.save(str(path))
+    except (OSError, RuntimeError) as error:
+        raise SlamError(f"viewer {target}: {_first_line(error)}") from error
+    return recording
+
+
+def _first_line(error: BaseException) -> str:
+    """What an exception says, without the advice that follows."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

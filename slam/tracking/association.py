@@ -1,0 +1,354 @@
+"""Which feature is which landmark: size-variable search windows and descriptor distance (paper A, III and IV).
+
+Landmarks in the angle of view are looked for around their predicted pixels: in the smallest window first, and, where
+nothing is found, in larger windows under a stricter descriptor distance (paper A, Fig. 4 and Eq. 12). Every landmark's
+best candidate is found before any feature is taken, so that no landmark steals the feature of another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, Prediction, StereoFeatures
+from slam.errors import ConfigurationError
+from slam.geometry.se3 import Array
+from slam.models import FORBID_UNKNOWN, require_not_negative
+
+Descriptors = NDArray[np.float32]
+
+_NONE = np.float32(np.inf)
+_CELL = 24.0  # side of the cells that features are sorted into [px]
+_LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """Settings of the association.
+
+    Attributes:
+        windows: kind of the search windows: ``"covariance"``, ellipses by the innovation's covariance, or ``"fixed"``,
+            squares of fixed sizes as in paper A, Fig. 4.
+        window_sigmas: half sizes of covariance windows, smallest first, in standard deviations of the innovation.
+        window_min, window_max: bounds of the half axes of the smallest covariance window [px].
+        window_sizes: half sizes of fixed windows, smallest first [px].
+        d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
+        ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
+        wide_d_match, wide_ratio: the same for matching against the whole map without windows.
+        wide_share: where nothing was recognised in the last frame, a pose found by matching against the whole map must
+            show again at least this share of the landmarks (or of the features, if fewer) in view from there.
+        minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
+        consistency_sigmas: reprojection error up to which a match agrees with a pose, in units of the pixel noise.
+        hypotheses, wide_hypotheses: number of poses tried in the geometric check, of matches in windows and of matches
+            against the whole map.
+        tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
+            matches suffice, and no second search is made.
+        max_jump, lost_jump: landmarks that agree on a pose further than this from the prediction, in its standard
+            deviations, are not believed at once: while landmarks are recognised in every frame, and after frames in
+            which none was. The prediction allows for what the motion model knows; what is further off was carried.
+        kidnapped_after: where such poses agree with each other in so many successive frames, the camera was carried off,
+            and the back end begins anew at that place in the map.
+        view_angle, view_ratio: landmarks are looked for where the line of sight has turned by no more than this since
+            they were first seen [degrees], and where the distance has not changed by more than this factor: beyond,
+            what is found is not the same point any more. 180 and a large factor for never mind.
+        rematch_after: those that were outside of the image for so many frames are looked for from wherever: what they
+            tell about the drift meanwhile is worth more than what the point may have slid. Found, they count as first
+            seen from there.
+        refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
+    """
+
+    windows: str = "covariance"
+    window_sigmas: tuple[float, ...] = (2.5, 5.0)
+    window_min: float = 4.0
+    window_max: float = 400.0
+    window_sizes: tuple[float, ...] = (10.0, 30.0)
+    d_match: tuple[float, ...] = (0.55, 0.4)
+    ratio: float = 0.8
+    wide_d_match: float = 0.4
+    wide_ratio: float = 0.9
+    wide_share: float = 0.1
+    minimum_consistent: int = 8
+    consistency_sigmas: float = 5.0
+    hypotheses: int = 100
+    wide_hypotheses: int = 1000
+    tight_window: float = 12.0
+    max_jump: float = 15.0
+    lost_jump: float = 6.0
+    kidnapped_after: int = 3
+    view_angle: float = 20.0
+    view_ratio: float = 1.4
+    rematch_after: int = 10
+    refined_window: float = 3.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        require_not_negative(self)
+        if self.windows not in ("covariance", "fixed"):
+            raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
+        name = "window_sizes" if self.windows == "fixed" else "window_sigmas"
+        sizes = getattr(self, name)
+        if len(sizes) != len(self.d_match) or not sizes:
+            raise ConfigurationError(f"association: {name} and d_match must have the same number of values")
+        if list(sizes) != sorted(sizes) or sizes[0] <= 0:
+            raise ConfigurationError(f"association: {name} must be positive and ascending")
+        if not 0 < self.window_min <= self.window_max:
+            raise ConfigurationError("association: 0 < window_min <= window_max is required")
+        if not (0 < self.ratio <= 1 and 0 < self.wide_ratio <= 1):
+            raise ConfigurationError("association: ratios must lie in (0, 1]")
+        if self.view_ratio < 1:
+            raise ConfigurationError("association: view_ratio must be at least 1")
+        if min(self.hypotheses, self.wide_hypotheses) < 1 or self.minimum_consistent < 3:
+            raise ConfigurationError("association: hypotheses >= 1 and minimum_consistent >= 3 are required")
+        if self.kidnapped_after < 1:
+            raise ConfigurationError("association: kidnapped_after must be at least 1")
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Pairs of a landmark and a feature.
+
+    Attributes:
+        landmarks: rows of the landmark list that was given (K,).
+        features: rows of the features (K,).
+    """
+
+    landmarks: NDArray[np.intp]
+    features: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+    def select(self, rows: NDArray) -> Matches:
+        """The pairs of these rows (a mask or indices)."""
+        return Matches(self.landmarks[rows], self.features[rows])
+
+
+def match_in_windows(
+    prediction: Prediction,
+    descriptors: Descriptors,
+    laplacian: NDArray[np.int8],
+    features: StereoFeatures,
+    config: AssociationConfig,
+    among: NDArray[np.intp] | None = None,
+) -> Matches:
+    """Match predicted landmarks (M) to features (N) inside size-variable windows.
+
+    Args:
+        prediction: landmarks in the angle of view, their pixels and innovation covariances.
+        descriptors: of those landmarks (M, D), or of more of which they are the rows `among` (M,).
+        laplacian: signs of their Laplacians, likewise.
+        features: of the frame.
+        config: settings.
+        among: see `descriptors`.
+    """
+    if not len(prediction.ids) or not len(features):
+        return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
+    if among is None:
+        among = np.arange(len(prediction.ids))
+    windows = search_windows(prediction, config)
+    if windows.are_large(features.uv_left):
+        limit = max(config.d_match) / config.ratio  # beyond that no feature is the nearest, nor near enough to doubt it
+        rows, columns = _alike(descriptors[among], laplacian[among], features, limit)
+    else:
+        rows, columns = pairs_in_boxes(prediction.uv_left, windows.reach, features.uv_left)
+        same = laplacian.take(among.take(rows)) == features.laplacian.take(columns)
+        rows, columns = rows[same], columns[same]
+    offset = features.uv_left.take(columns, axis=0) - prediction.uv_left.take(rows, axis=0)
+    level = windows.level(rows, offset.astype(np.float32))
+    inside = level < len(config.d_match)
+    rows, columns, level = rows[inside], columns[inside], level[inside]
+    distance = _distances(descriptors, features.descriptors, among.take(rows), columns)
+    return _by_levels(_Pairs(rows, columns, distance), level, (len(prediction.ids), len(features)), config)
+
+
+def match_everywhere(
+    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, config: AssociationConfig
+) -> Matches:
+    """Match landmarks (M, D) to features by descriptor alone, wherever they lie in the image."""
+    if not len(descriptors) or not len(features):
+        return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
+    rows, columns = _alike(descriptors, laplacian, features, config.wide_d_match / config.wide_ratio)
+    pairs = _Pairs(rows, columns, _distances(descriptors, features.descriptors, rows, columns))
+    best = pairs.mutual_best(config.wide_d_match, config.wide_ratio, len(features))
+    return Matches(pairs.rows[best], pairs.columns[best])
+
+
+@dataclass(frozen=True)
+class SearchWindows:
+    """Where landmarks (M) are looked for: nested windows around their predicted pixels.
+
+    Attributes:
+        sizes: of the windows, smallest first: in the unit of `shape`.
+        reach: half sizes (M, 2) [px] of the boxes around the largest windows.
+        shape: ellipses' information matrices (M, 3) as (uu, uv, vv) [1/px²] where the windows are ellipses, whose
+            `sizes` are in standard deviations; None where they are squares of half `sizes` [px].
+    """
+
+    sizes: tuple[float, ...]
+    reach: Array
+    shape: NDArray[np.float32] | None
+
+    def are_large(self, uv: Array) -> bool:
+        """Whether the boxes around the largest windows hold a good part of the pixels (N, 2), on average."""
+        width, height = (1.0 + np.ptp(uv[:, i]) for i in (0, 1))
+        area = np.dot(np.minimum(2 * self.reach[:, 0], width), np.minimum(2 * self.reach[:, 1], height))
+        return bool(area > _LARGE * len(self.reach) * width * height)
+
+    def level(self, rows: NDArray[np.intp], offset: NDArray[np.float32]) -> NDArray[np.intp]:
+        """The smallest window (P,) of the landmarks `rows` (P,) that holds a pixel this far off (P, 2)."""
+        du, dv = offset[:, 0], offset[:, 1]
+        if self.shape is None:
+            return np.searchsorted(self.sizes, np.maximum(np.abs(du), np.abs(dv)))
+        uu, uv, vv = self.shape.take(rows, axis=0).T
+        return np.searchsorted(np.square(self.sizes), uu * du * du + 2 * uv * du * dv + vv * dv * dv)
+
+
+def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchWindows:
+    """The windows of the predicted landmarks, of the kind that `config.windows` names."""
+    if config.windows == "fixed":
+        sizes = config.window_sizes
+        return SearchWindows(sizes, np.full((len(prediction.ids), 2), sizes[-1]), None)
+    smallest, largest = config.window_sigmas[0], config.window_sigmas[-1]
+    S = prediction.innovation
+    # Eigenvalues and axes of the symmetric 2x2 matrices in closed form; half axes bounded as the settings say.
+    mean, half, cross = 0.5 * (S[:, 0, 0] + S[:, 1, 1]), 0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1]
+    radius = np.hypot(half, cross)
+    safe = np.maximum(radius, np.finfo(float).tiny)
+    c2, cs = 0.5 + 0.5 * half / safe, 0.5 * cross / safe  # cos², cos · sin of the long axis' angle
+    s2 = 1 - c2
+    low, high = (config.window_min / smallest) ** 2, (config.window_max / smallest) ** 2
+    long, short = np.clip(mean + radius, low, high), np.clip(mean - radius, low, high)
+    shape = np.stack([c2 / long + s2 / short, cs / long - cs / short, s2 / long + c2 / short], axis=1)
+    reach = largest * np.sqrt(np.stack([c2 * long + s2 * short, s2 * long + c2 * short], axis=1))
+    return SearchWindows(config.window_sigmas, reach, shape.astype(np.float32))
+
+
+def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending row of the centres.
+
+    Pixels are sorted into square cells, by rows of cells, so that few pairs have to be looked at.
+    """
+    x, y = _Cells.of(centres[:, 0], reach[:, 0], uv[:, 0]), _Cells.of(centres[:, 1], reach[:, 1], uv[:, 1])
+    cell = y.cell * x.count + x.cell
+    order = np.argsort(cell, kind="stable")
+    begin = np.zeros(y.count * x.count + 1, np.intp)
+    np.cumsum(np.bincount(cell, minlength=y.count * x.count), out=begin[1:])
+    rows, line = _expand(y.low, np.where(x.high > x.low, y.high, y.low))
+    line *= x.count
+    which, member = _expand(begin.take(line + x.low.take(rows)), begin.take(line + x.high.take(rows)))
+    rows, members = rows.take(which), order.take(member)
+    near = np.flatnonzero(x.near(rows, members) & y.near(rows, members))
+    return rows.take(near), members.take(near)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Where pixels (N,) and intervals (M,) lie along one axis, in cells counted from the first pixel's."""
+
+    centres: Array
+    reach: Array
+    pixels: Array
+    cell: NDArray[np.intp]  # of each pixel (N,)
+    count: int
+    low: NDArray[np.intp]  # first cell of each interval (M,), and
+    high: NDArray[np.intp]  # the one after the last
+
+    @classmethod
+    def of(cls, centres: Array, reach: Array, pixels: Array) -> _Cells:
+        pixels, centres, scale = np.ascontiguousarray(pixels), np.ascontiguousarray(centres), 1 / _CELL
+        first = pixels.min()
+        cell = ((pixels - first) * scale).astype(np.intp)
+        count = int(cell.max()) + 1
+        middle, half = (centres - first) * scale, reach * scale
+        low = np.minimum(np.maximum(middle - half, 0), count).astype(np.intp)
+        high = np.minimum(np.maximum(middle + half + 1, 0), count).astype(np.intp)
+        return cls(centres, np.ascontiguousarray(reach), pixels, cell, count, low, high)
+
+    def near(self, rows: NDArray[np.intp], members: NDArray[np.intp]) -> BoolArray:
+        """Which pixels `members` (P,) lie in the intervals `rows` (P,)."""
+        return np.asarray(np.abs(self.pixels.take(members) - self.centres.take(rows)) <= self.reach.take(rows))
+
+
+def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which range and which number: all numbers of the ranges [first, last) (M,), one range after the other."""
+    count = np.maximum(last - first, 0)
+    which = np.repeat(np.arange(len(count)), count)
+    return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
+
+
+def _alike(
+    descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures, limit: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of landmarks and of features with the same Laplacian sign whose descriptors are less than `limit` apart."""
+    near = descriptors @ features.descriptors.T > np.float32(1 - 0.5 * limit * limit)
+    near &= laplacian[:, None] == features.laplacian[None, :]
+    rows, columns = np.nonzero(near)
+    return rows, columns
+
+
+def _distances(
+    a: Descriptors, b: Descriptors, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Euclidean distances (P,) of unit descriptors a[rows] and b[columns] (paper A, Eq. 12)."""
+    product = np.einsum("pd,pd->p", a.take(rows, axis=0), b.take(columns, axis=0))
+    return np.asarray(np.sqrt(np.maximum(2 - 2 * product, 0)))
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of a landmark and a feature that may belong together, by ascending landmark.
+
+    Attributes:
+        rows: of landmarks (P,).
+        columns: rows of features (P,).
+        distance: of their descriptors (P,).
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    distance: NDArray[np.float32]
+
+    def select(self, keep: BoolArray) -> _Pairs:
+        """Some of the pairs."""
+        return _Pairs(self.rows[keep], self.columns[keep], self.distance[keep])
+
+    def mutual_best(self, d_match: float, ratio: float, features: int) -> NDArray[np.intp]:
+        """Pairs that are each other's nearest, nearer than `d_match`, and clearly nearer than the landmark's second."""
+        if not len(self.rows):
+            return np.zeros(0, np.intp)
+        starts = np.flatnonzero(np.diff(self.rows, prepend=-1))
+        count = np.diff(starts, append=len(self.rows))
+        nearest = np.repeat(np.minimum.reduceat(self.distance, starts), count)
+        is_nearest = self.distance == nearest
+        others = np.where(is_nearest, _NONE, self.distance)
+        second = np.where(np.add.reduceat(is_nearest, starts, dtype=int) > 1, 0, np.minimum.reduceat(others, starts))
+        of_feature = np.full(features, _NONE)
+        np.minimum.at(of_feature, self.columns, self.distance)
+        good = is_nearest & (self.distance < d_match) & (self.distance <= of_feature[self.columns])
+        good &= self.distance < ratio * np.repeat(second, count)
+        return np.flatnonzero(good)
+
+
+def _by_levels(pairs: _Pairs, level: NDArray[np.intp], size: tuple[int, int], config: AssociationConfig) -> Matches:
+    """Matches in the smallest windows first, then in larger ones, of what is free still (paper A, Fig. 4)."""
+    free_landmarks, free_features = np.ones(size[0], bool), np.ones(size[1], bool)
+    landmarks, taken = [], []
+    for number, d_match in enumerate(config.d_match):
+        allowed = pairs.select((level <= number) & free_landmarks[pairs.rows] & free_features[pairs.columns])
+        best = allowed.mutual_best(d_match, config.ratio, size[1])
+        landmarks.append(allowed.rows[best])
+        taken.append(allowed.columns[best])
+        free_landmarks[landmarks[-1]] = False
+        free_features[taken[-1]] = False
+    return Matches(np.concatenate(landmarks), np.concatenate(taken))
+
+
+def crowded(uv: Array, others: Array, radius: float) -> BoolArray:
+    """Which pixels (N, 2) lie within `radius` [px] of any of `others` (M, 2)."""
+    if not len(others):
+        return np.zeros(len(uv), bool)
+    gap = (uv[:, None] - others[None]).astype(np.float32)
+    return np.asarray(((gap**2).sum(axis=2) < radius * radius).any(axis=1))

@@ -1,0 +1,203 @@
+"""Which landmarks are in this frame: search windows, agreement on one camera pose, and the whole map as a last resort.
+
+The same for every back end: a back end gives predictions and positions, and gets matches that agree with each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, IdArray, Prediction, StereoFeatures
+from slam.geometry.pnp import PoseConsensus, find_consensus, measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, log, transform
+from slam.landmarks import LandmarkRows
+from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
+from slam.tracking.visibility import similar_view
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class LandmarkMatches:
+    """Landmarks found in a frame.
+
+    Attributes:
+        ids: landmark ids (K,), ascending.
+        rows: rows of their features (K,).
+        T_world_left: the pose (4, 4) on which they agree; None where there is none.
+    """
+
+    ids: IdArray
+    rows: NDArray[np.intp]
+    T_world_left: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def without(self, ids: IdArray) -> LandmarkMatches:
+        """The same but for some landmarks."""
+        keep = ~np.isin(self.ids, ids)
+        return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left)
+
+    @classmethod
+    def nothing(cls) -> LandmarkMatches:
+        """No landmark found."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.intp))
+
+
+class Localizer:
+    """Finds landmarks in frames.
+
+    Args:
+        rig: the cameras.
+        config: settings.
+        pixel_sigma: noise of uL, vL, uR [px].
+    """
+
+    def __init__(self, rig: StereoRig, config: AssociationConfig, pixel_sigma: float) -> None:
+        self.rig = rig
+        self.config = config
+        self.pixel_sigma = pixel_sigma
+
+    def localize(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkRows,
+        positions: Array,
+        features: StereoFeatures,
+        seed: int,
+        doubtful: bool = False,
+    ) -> LandmarkMatches:
+        """Landmarks whose features agree with one camera pose.
+
+        In windows around the predictions first. Where these are wide, or too few matches agree, the pose on which the
+        matches agree (from the windows, or from the whole map without windows) predicts anew, and small windows around
+        that find the rest.
+
+        Args:
+            prediction: of the back end.
+            landmarks: the map's bookkeeping (N rows).
+            positions: the landmarks' positions (N, 3) in world coordinates.
+            features: of the frame.
+            seed: of the random choice in the geometric check.
+            doubtful: nothing was recognised in the last frame: the whole map must say more, see `wide_share`.
+        """
+        if not len(landmarks) or not len(features):
+            return LandmarkMatches.nothing()
+        rows = landmarks.rows(prediction.ids)
+        looked_for = self._looked_for(prediction.T_world_left, landmarks, positions)[rows]
+        matches = self._in_windows(_select(prediction, looked_for), landmarks, rows[looked_for], features)
+        consensus = self._consensus(matches, positions, features, prediction.T_world_left, seed)
+        tight = median_deviation(prediction) <= self.config.tight_window
+        least = 0.0
+        if consensus.inliers.sum() < self.config.minimum_consistent:
+            matches_wide = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, self.config)
+            wide = self._consensus(matches_wide, positions, features, prediction.T_world_left, seed, wide=True)
+            if wide.inliers.sum() >= self.config.minimum_consistent:
+                matches, consensus, tight = matches_wide, wide, False
+                least = self.config.wide_share if doubtful else 0.0
+            elif not tight:
+                return LandmarkMatches.nothing()
+        if not tight:
+            expected = self._expected(consensus.T_world_left, prediction, landmarks, positions)
+            matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
+            if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):
+                return LandmarkMatches.nothing()
+        return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
+
+    def similar_view(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+        """Which landmarks (N,) at `positions` look from this pose (4, 4) as they did at first sight."""
+        limits = self.config.view_angle, self.config.view_ratio
+        return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
+
+    def _looked_for(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+        """Which landmarks (N,) are looked for in windows: those that look as they did, and those long away."""
+        alike = self.similar_view(T_world_left, landmarks, positions)
+        return alike | landmarks.long_out_of_view(self.config.rematch_after)
+
+    def _in_windows(
+        self, prediction: Prediction, landmarks: LandmarkRows, rows: NDArray[np.intp], features: StereoFeatures
+    ) -> Matches:
+        """Matches by rows of the whole map."""
+        looks = (landmarks.descriptors, landmarks.laplacian)
+        found = match_in_windows(prediction, *looks, features, self.config, among=rows)
+        return Matches(rows[found.landmarks], found.features)
+
+    def _consensus(
+        self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
+    ) -> PoseConsensus:
+        measured = measurement_rows(features.uv_left[matches.features], features.uv_right[matches.features])
+        threshold = self.config.consistency_sigmas * self.pixel_sigma
+        if wide and len(matches) < self.config.minimum_consistent:
+            return PoseConsensus(guess, np.zeros(len(matches), bool))
+        hypotheses = self.config.wide_hypotheses if wide else self.config.hypotheses
+        return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
+
+    def _expected(
+        self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkRows, positions: Array
+    ) -> Prediction:
+        """What would be seen from another pose, in small windows."""
+        left, right = self.rig.project(transform(inverse(T_world_left), positions))
+        looked_for = self._looked_for(T_world_left, landmarks, positions)
+        view = np.flatnonzero(self.rig.left.in_image(left) & looked_for)
+        innovation = np.tile(np.eye(2) * self.config.refined_window**2, (len(view), 1, 1))
+        return replace(
+            prediction,
+            T_world_left=T_world_left,
+            ids=landmarks.ids[view],
+            uv_left=left[view],
+            uv_right=right[view],
+            innovation=innovation,
+        )
+
+    def _again(
+        self,
+        consensus: PoseConsensus,
+        matches: Matches,
+        expected: Prediction,
+        landmarks: LandmarkRows,
+        positions: Array,
+        features: StereoFeatures,
+        seed: int,
+    ) -> tuple[Matches, PoseConsensus]:
+        """Search once more in small windows around what the consensus pose predicts; the better of both comes back."""
+        matches_anew = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
+        consensus_anew = self._consensus(matches_anew, positions, features, consensus.T_world_left, seed)
+        if consensus_anew.inliers.sum() < consensus.inliers.sum():
+            return matches, consensus
+        return matches_anew, consensus_anew
+
+
+def _select(prediction: Prediction, keep: BoolArray) -> Prediction:
+    """Some of the landmarks of a prediction."""
+    p = prediction
+    return replace(
+        p, ids=p.ids[keep], uv_left=p.uv_left[keep], uv_right=p.uv_right[keep], innovation=p.innovation[keep]
+    )
+
+
+def jump(prediction: Prediction, T_world_left: Array) -> float:
+    """How far a pose (4, 4) lies from the predicted one, in standard deviations of the prediction."""
+    step = log(inverse(prediction.T_world_left) @ T_world_left)
+    squared = step @ np.linalg.solve(prediction.covariance + _TINY * np.eye(6), step)
+    return float(np.sqrt(max(float(squared), 0.0)))
+
+
+def median_deviation(prediction: Prediction) -> float:
+    """Median over landmarks of the larger standard deviation of the innovation [px]."""
+    if not len(prediction.ids):
+        return float("inf")
+    S = prediction.innovation
+    largest = 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
+    return float(np.sqrt(np.median(largest)))
+
+
+def _matches_of(landmarks: LandmarkRows, matches: Matches, T_world_left: Array) -> LandmarkMatches:
+    if not len(matches):
+        return LandmarkMatches.nothing()
+    order = np.argsort(matches.landmarks, kind="stable")
+    return LandmarkMatches(landmarks.ids[matches.landmarks[order]], matches.features[order], T_world_left)

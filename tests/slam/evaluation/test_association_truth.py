@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.evaluation.association_truth import SurfacePoints, surface_points
+from slam.sequences import open_sequence
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    return open_sequence("synthetic:boxes?frames=40&camera=moving")
+
+
+def test_pixels_of_the_still_world_are_found_again(boxes):
+    """Projecting a surface point through the true poses gives the pixel in another frame: its depth agrees there."""
+    points = SurfacePoints(boxes)
+    v, u = np.mgrid[20:220:20, 20:300:20]
+    uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    ids = np.arange(len(uv))
+    points.add(0, ids, uv)
+    still = boxes.object_ids(0)[v.ravel(), u.ravel()] == 0
+    assert np.isinf(points.errors(0, ids, uv)[~still]).all()
+    assert points.errors(0, ids, uv)[still].max() < 1e-6
+    assert (points.errors(0, ids, uv + np.array([0, 4.0]))[still] > 3.9).all()
+    moved = points.errors(30, ids[still], uv[still])  # the camera moves, so the same pixels show other points
+    assert np.median(moved) > 1.0
+
+
+def test_surface_points_have_the_depth_of_their_pixel(boxes):
+    depth = boxes.depth(0)
+    uv = np.array([[100.3, 80.4], [30.0, 200.0]])
+    points = surface_points(boxes.rig.left, depth, uv)
+    np.testing.assert_allclose(points[:, 2], [depth[80, 100], depth[200, 30]])
+    np.testing.assert_allclose(boxes.rig.left.project(points), uv, atol=1e-9)

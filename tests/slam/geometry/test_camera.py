@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.errors import CalibrationError
+from slam.geometry.camera import PinholeCamera
+from tests.slam.numeric import jacobian
+
+CAMERAS = {
+    "ideal": PinholeCamera(260, 255, 160, 118, 320, 240),
+    "euroc": PinholeCamera(458.654, 457.296, 367.215, 248.375, 752, 480, "radtan", (-0.2834, 0.0740, 0.0002, 1.8e-05)),
+    "radtan5": PinholeCamera(984, 981, 690, 233, 1392, 512, "radtan", (-0.373, 0.204, 0.0022, 0.0014, -0.072)),
+    "radtan8": PinholeCamera(500, 500, 320, 240, 640, 480, "radtan", (0.1, -0.2, 1e-3, -1e-3, 0.05, 0.2, -0.1, 0.02)),
+    "fisheye": PinholeCamera(190.98, 190.97, 254.9, 256.9, 512, 512, "equidistant", (0.0035, 0.0007, -0.002, 0.0002)),
+}
+
+
+@pytest.fixture(params=CAMERAS, ids=str)
+def camera(request):
+    return CAMERAS[request.param]
+
+
+def points_in_view(camera, count=200, seed=0):
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform((5, 5), (camera.width - 6, camera.height - 6), (count, 2))
+    xy = camera.normalise(uv)
+    seen = np.isfinite(xy).all(axis=1)  # the corners of a fisheye image look backwards
+    assert seen.mean() > 0.7
+    ray = np.concatenate([xy, np.ones((count, 1))], axis=1) * rng.uniform(0.5, 30, (count, 1))
+    return uv[seen], ray[seen]
+
+
+def test_projection_inverts_normalisation(camera):
+    uv, points = points_in_view(camera)
+    np.testing.assert_allclose(camera.project(points), uv, atol=1e-9)
+
+
+def test_projection_agrees_with_opencv(camera):
+    cv2 = pytest.importorskip("cv2")
+    _, points = points_in_view(camera)
+    if camera.model == "equidistant":
+        D = np.array(camera.distortion)
+        expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.K, D)[0][:, 0]
+    else:
+        D = np.array(camera.distortion or (0.0,) * 4)
+        expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, D)[0][:, 0]
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-8)
+
+
+def test_jacobian_against_finite_differences(camera):
+    _, points = points_in_view(camera, 30)
+    _, J = camera.project_with_jacobian(points)
+    for point, found in zip(points, J):
+        # Step relative to the depth; the error of central differences is of the order step² · third derivative.
+        numeric = jacobian(lambda x: camera.project(x[None]), point, 1e-5 * point[2])
+        np.testing.assert_allclose(found, numeric, atol=1e-5 * np.abs(numeric).max())
+
+
+def test_fisheye_centre_is_smooth():
+    camera = CAMERAS["fisheye"]
+    point = np.array([1e-12, 0.0, 2.0])
+    _, J = camera.project_with_jacobian(point[None])
+    np.testing.assert_allclose(J[0, 0, 0], camera.fu / 2, rtol=1e-9)
+
+
+def test_behind_the_camera_is_nan_and_not_in_view(camera):
+    points = np.array([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0]])
+    assert np.isnan(camera.project(points)).all()
+    assert not camera.in_view(points).any()
+
+
+def test_angle_of_view(camera):
+    _, points = points_in_view(camera, 10)
+    assert camera.in_view(points).all()
+    outside = points * np.array([1, 1, -1])
+    assert not camera.in_view(outside).any()
+    assert not camera.in_image(np.array([[-0.1, 5], [5, -0.1], [camera.width - 0.9, 5], [5, camera.height]])).any()
+    assert camera.in_image(np.array([[0.0, 0.0], [camera.width - 1, camera.height - 1]])).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fu": float("nan")}, "not finite"),
+        ({"fv": -1.0}, "focal"),
+        ({"width": 0}, "image size"),
+        ({"model": "magic"}, "unknown distortion model"),
+        ({"model": "radtan", "distortion": (0.1,)}, "coefficients"),
+        ({"distortion": (0.1, float("inf"))}, "not finite"),
+    ],
+)
+def test_impossible_calibrations(change, message):
+    values = {"fu": 260, "fv": 260, "u0": 160, "v0": 120, "width": 320, "height": 240, **change}
+    with pytest.raises(CalibrationError, match=message):
+        PinholeCamera(**values)
+
+
+def test_far_rays_are_not_folded_back_into_the_image():
+    camera = CAMERAS["radtan5"]
+    a = np.linspace(0.0, 4.0, 400)
+    uv = camera.project(np.stack([a, 0 * a, 1 + 0 * a], axis=1))
+    inside = camera.in_image(uv)
+    assert inside[0]
+    assert not inside[np.argmin(inside) :].any()  # once out of the image, never in again

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.geometry import se3
+from slam.geometry.pnp import find_consensus, measurement_rows, refine_pose, rigid_fit
+from slam.geometry.rig import StereoRig
+from tests.slam.scene import RIG, Cloud
+
+
+def measured_from(T, count=80, noise=0.0, seed=0):
+    cloud = Cloud(400, seed)
+    features, ids = cloud.features(T, 0.0, noise)
+    return cloud.points[ids[:count]], measurement_rows(features.uv_left, features.uv_right)[:count]
+
+
+T_TRUE = se3.exp(np.array([0.05, -0.1, 0.03, 0.2, -0.1, 0.15]))
+
+
+def test_exact_measurements_give_the_exact_pose():
+    points, z = measured_from(T_TRUE)
+    found = refine_pose(RIG, points, z, np.eye(4), steps=20)
+    np.testing.assert_allclose(se3.inverse(found), T_TRUE, atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_consensus_among_wrong_matches(share):
+    points, z = measured_from(T_TRUE, noise=0.3)
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(points)) < share
+    z[wrong] = z[rng.permutation(np.flatnonzero(wrong))]
+    moved = np.abs(z[wrong] - measured_from(T_TRUE, noise=0.0)[1][wrong]).max(axis=1) > 3
+    found = find_consensus(RIG, points, z, np.eye(4), threshold=2.0, hypotheses=200, seed=0)
+    assert found.inliers[~wrong].mean() > 0.98
+    assert not found.inliers[np.flatnonzero(wrong)[moved]].any()
+    error = se3.log(se3.inverse(T_TRUE) @ found.T_world_left)
+    # 0.3 px at f = 300 and 3.5 m, over at least 30 points: 0.3/300/√30 rad and 3.5 m times that; 4 sigmas of it.
+    assert np.abs(error[:3]).max() < 4 * 0.3 / 300 / np.sqrt(30) * 2
+    assert np.abs(error[3:]).max() < 4 * 3.5 * 0.3 / 300 / np.sqrt(30) * 2
+
+
+def test_a_far_guess_does_not_matter():
+    points, z = measured_from(T_TRUE, noise=0.3)
+    guess = se3.exp(np.array([0.3, 0.8, -0.5, 2.0, 1.0, -1.0]))
+    found = find_consensus(RIG, points, z, guess, threshold=2.0, hypotheses=100, seed=0)
+    assert found.inliers.mean() > 0.98
+
+
+def test_monocular_rows_count_by_their_left_pixel():
+    points, z = measured_from(T_TRUE)
+    z[::2, 2] = np.nan
+    z[0, 0] += 50
+    found = find_consensus(RIG, points, z, np.eye(4), threshold=1.0, hypotheses=100, seed=0)
+    assert not found.inliers[0]
+    assert found.inliers[1:].all()
+
+
+def test_the_same_seed_gives_the_same_answer():
+    points, z = measured_from(T_TRUE, noise=0.5)
+    z[::2] = z[::-2]
+    a, b = (find_consensus(RIG, points, z, np.eye(4), 2.0, 50, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(a.T_world_left, b.T_world_left)
+    np.testing.assert_array_equal(a.inliers, b.inliers)
+
+
+def test_compiled_steps_for_rectified_rigs_find_what_those_for_all_rigs_find():
+    points, z = measured_from(T_TRUE, noise=0.3)
+    z[::3] = z[::-3]
+    z[::5, 2] = np.nan
+    other = StereoRig(RIG.left, RIG.right, RIG.R, RIG.b + np.array([0.0, 1e-8, 0.0]))
+    assert RIG.is_rectified and not other.is_rectified
+    a, b = (find_consensus(rig, points, z, np.eye(4), 2.0, 50, seed=3) for rig in (RIG, other))
+    np.testing.assert_array_equal(a.inliers, b.inliers)
+    np.testing.assert_allclose(a.T_world_left, b.T_world_left, atol=1e-7)  # the baselines differ by 1e-8
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_matches_do_no_harm(count):
+    points, z = measured_from(np.eye(4), count)
+    found = find_consensus(RIG, points, z, np.eye(4), 2.0, 50, seed=0)
+    assert np.isfinite(found.T_world_left).all()
+    assert found.inliers.shape == (count,)
+
+
+def test_rigid_fit():
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(5, 4, 3))
+    T = se3.exp(rng.normal(size=(5, 6)))
+    target = source @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+    np.testing.assert_allclose(rigid_fit(source, target), T, atol=1e-12)
+    flat = source * [1, 1, 0]  # three points, or points in a plane: never a mirror image
+    assert (np.linalg.det(rigid_fit(flat[:, :3], flat[:, :3])[:, :3, :3]) > 0).all()

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from slam.geometry import se3
+
+vectors = arrays(float, 3, elements=st.floats(-3, 3))
+twists = arrays(float, 6, elements=st.floats(-1.7, 1.7))
+
+
+@given(vectors)
+def test_so3_exp_is_the_matrix_exponential(w):
+    np.testing.assert_allclose(se3.so3_exp(w), expm(se3.hat(w)), atol=1e-12)
+
+
+@given(twists)
+def test_se3_exp_is_the_matrix_exponential(xi):
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3], matrix[:3, 3] = se3.hat(xi[:3]), xi[3:]
+    np.testing.assert_allclose(se3.exp(xi), expm(matrix), atol=1e-12)
+
+
+@given(twists)
+def test_log_inverts_exp(xi):
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-4, 1.0, np.pi - 1e-7, np.pi])
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
+def test_so3_log_over_all_angles(angle, axis):
+    w = se3.so3_log(se3.so3_exp(angle * np.array(axis)))
+    assert np.linalg.norm(w) == pytest.approx(angle, abs=1e-9)
+    np.testing.assert_allclose(se3.so3_exp(w), se3.so3_exp(angle * np.array(axis)), atol=1e-9)
+
+
+def test_batches_agree_with_single():
+    xi = np.random.default_rng(0).normal(size=(7, 6))
+    np.testing.assert_allclose(se3.exp(xi), [se3.exp(x) for x in xi], atol=1e-15)
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), [se3.log(se3.exp(x)) for x in xi], atol=1e-15)
+
+
+@given(vectors)
+def test_quaternion_agrees_with_scipy(w):
+    R = se3.so3_exp(w)
+    expected = Rotation.from_matrix(R).as_quat(canonical=True)
+    found = se3.quaternion(R)
+    assert abs(abs(found @ expected) - 1) < 1e-12
+    np.testing.assert_allclose(se3.rotation_from_quaternion(found), R, atol=1e-12)
+
+
+@given(twists, twists)
+def test_adjoint_moves_a_twist_through_a_pose(a, b):
+    T = se3.exp(a)
+    b = 0.1 * b
+    np.testing.assert_allclose(
+        T @ se3.exp(b) @ se3.inverse(T), se3.exp(se3.adjoint(T) @ b), atol=1e-12 * (1 + np.abs(a).max()) * 10
+    )
+
+
+@given(vectors, vectors)
+def test_left_jacobian(w, d):
+    step = 1e-6 * d
+    np.testing.assert_allclose(
+        se3.so3_exp(w + step), se3.so3_exp(se3.so3_left_jacobian(w) @ step) @ se3.so3_exp(w), atol=1e-10
+    )
+
+
+def test_nearest_rotation_of_a_disturbed_one():
+    R = se3.so3_exp(np.array([0.3, -0.2, 0.5]))
+    found = se3.nearest_rotation(R + 1e-3 * np.random.default_rng(1).normal(size=(3, 3)))
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(found) > 0
+    np.testing.assert_allclose(found, R, atol=5e-3)
+
+
+def test_transform_and_inverse():
+    rng = np.random.default_rng(2)
+    T, points = se3.exp(rng.normal(size=6)), rng.normal(size=(5, 3))
+    np.testing.assert_allclose(se3.transform(se3.inverse(T), se3.transform(T, points)), points, atol=1e-14)

@@ -1,0 +1,177 @@
+"""Trajectories: what is written is read again, by us and by evo; malformed files are refused with their name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from slam.errors import TrajectoryError
+from slam.geometry.se3 import exp, rotation_angle
+from slam.geometry.trajectory import Trajectory, tum_line
+
+#: Files have nine decimals; a quaternion rounded so turns by at most 2 · sqrt(4) · 0.5e-9 rad.
+POSITION, ANGLE = 0.51e-9, 2.1e-9
+
+
+@st.composite
+def trajectories(draw: st.DrawFn, largest: float = 1e4) -> Trajectory:
+    """Paths with any steps in time, turns up to half a revolution, and epochs from 0 to today's nanoseconds."""
+    count = draw(st.integers(1, 8))
+    start = draw(st.sampled_from([0.0, 17.25, 1_403_715_273.262143, 1.7e9]))
+    steps = draw(st.lists(st.floats(0.001, 5), min_size=count, max_size=count))
+    rows = st.lists(st.floats(-1, 1), min_size=6, max_size=6)
+    xi = np.array(draw(st.lists(rows, min_size=count, max_size=count)))
+    xi[:, :3] *= np.pi / np.sqrt(3)
+    xi[:, 3:] *= largest
+    return Trajectory(start + np.cumsum(steps), exp(xi))
+
+
+def assert_same(read: Trajectory, written: Trajectory, position: float = POSITION) -> None:
+    assert np.abs(read.stamps - written.stamps).max() <= 3e-7  # a double's step at 1.7e9 s is 2.4e-7 s
+    assert np.abs(read.positions - written.positions).max() <= position
+    turn = np.swapaxes(read.poses[:, :3, :3], 1, 2) @ written.poses[:, :3, :3]
+    assert rotation_angle(turn).max() <= ANGLE + 1e-15 * len(turn)
+    assert np.allclose(np.linalg.det(read.poses[:, :3, :3]), 1, atol=1e-8)
+
+
+quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@quick
+@given(trajectories())
+def test_tum_comes_back(tmp_path: Path, trajectory: Trajectory) -> None:
+    trajectory.write_tum(tmp_path / "a.txt")
+    assert_same(Trajectory.read_tum(tmp_path / "a.txt"), trajectory)
+
+
+@quick
+@given(trajectories())
+def test_euroc_comes_back(tmp_path: Path, trajectory: Trajectory) -> None:
+    trajectory.write_euroc(tmp_path / "a.csv")
+    assert_same(Trajectory.read_euroc(tmp_path / "a.csv"), trajectory)
+
+
+@quick
+@given(trajectories(largest=1e3))
+def test_kitti_comes_back(tmp_path: Path, trajectory: Trajectory) -> None:
+    trajectory.write_kitti(tmp_path / "a.txt")
+    read = Trajectory.read_kitti(tmp_path / "a.txt", trajectory.stamps)
+    assert np.array_equal(read.stamps, trajectory.stamps)
+    assert np.abs(read.poses - trajectory.poses).max() <= 1e-6  # ten digits of up to 1e3 · sqrt(3) m
+    numbered = Trajectory.read_kitti(tmp_path / "a.txt")
+    assert np.array_equal(numbered.stamps, np.arange(len(trajectory)))
+
+
+def test_evo_reads_what_is_written(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    trajectory = Trajectory(1.4e9 + np.arange(20) / 20, exp(rng.normal(size=(20, 6))))
+    trajectory.write_tum(tmp_path / "tum.txt")
+    trajectory.write_kitti(tmp_path / "kitti.txt")
+    trajectory.write_euroc(tmp_path / "euroc.csv")
+    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "tum.txt"))
+    euroc = file_interface.read_euroc_csv_trajectory(str(tmp_path / "euroc.csv"))
+    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "kitti.txt"))
+    for theirs in (tum, euroc, kitti):
+        assert np.abs(np.array(theirs.poses_se3) - trajectory.poses).max() < 1e-8
+    for theirs in (tum, euroc):
+        assert np.abs(theirs.timestamps - trajectory.stamps).max() < 3e-7
+
+
+def test_we_read_what_evo_writes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    trajectory = Trajectory(np.arange(5) / 10, exp(rng.normal(size=(5, 6))))
+    trajectory.write_tum(tmp_path / "a.txt")
+    theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "a.txt"))
+    file_interface.write_tum_trajectory_file(str(tmp_path / "b.txt"), theirs)
+    assert_same(Trajectory.read_tum(tmp_path / "b.txt"), Trajectory.read_tum(tmp_path / "a.txt"))
+
+
+def test_a_line_is_readable_by_itself() -> None:
+    line = tum_line(1.5, np.eye(4))
+    assert line == "1.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000\n"
+
+
+def test_length_and_positions() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = [[0, 0, 0], [3, 4, 0], [3, 4, 12], [3, 4, 12]]
+    trajectory = Trajectory(np.arange(4.0), poses)
+    assert trajectory.length == 17
+    assert len(trajectory) == 4
+    assert Trajectory(np.zeros(0), np.zeros((0, 4, 4))).length == 0
+
+
+def test_comments_and_further_columns_do_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("#timestamp,p,q,v\n1000000000,1,2,3,1,0,0,0,9,9,9\n2000000000,1,2,4,1,0,0,0,9,9,9\n")
+    read = Trajectory.read_euroc(path)
+    assert np.allclose(read.stamps, [1, 2])
+    assert np.allclose(read.positions, [[1, 2, 3], [1, 2, 4]])
+
+
+READERS = [
+    (Trajectory.read_tum, "1 0 0 0 0 0 0 1"),
+    (Trajectory.read_kitti, "1 0 0 0 0 1 0 0 0 0 1 0"),
+    (Trajectory.read_euroc, "1,0,0,0,1,0,0,0"),
+]
+
+
+@pytest.mark.parametrize(("read", "row"), READERS, ids=["tum", "kitti", "euroc"])
+class TestMalformedFiles:
+    def test_the_good_row_is_good(self, read, row: str, tmp_path: Path) -> None:
+        (tmp_path / "a.txt").write_text(row + "\n")
+        assert len(read(tmp_path / "a.txt")) == 1
+
+    @pytest.mark.parametrize(
+        "content", ["", "# nothing\n", "hello\n", "1 2 3\n", "1,2,3\n", "{row}\n{row} x\n", "{cut}\n"]
+    )
+    def test_refused_with_the_file_s_name(self, read, row: str, content: str, tmp_path: Path) -> None:
+        path = tmp_path / "a.txt"
+        path.write_text(content.format(row=row, cut=row[:-2]))
+        with pytest.raises(TrajectoryError) as error:
+            read(path)
+        assert str(path) in str(error.value)
+        assert "\n" not in str(error.value)
+
+    def test_not_finite(self, read, row: str, tmp_path: Path) -> None:
+        path = tmp_path / "a.txt"
+        for word in ("nan", "inf"):
+            path.write_text(row[:-1] + word + "\n")
+            with pytest.raises(TrajectoryError, match=r"a\.txt.*not finite"):
+                read(path)
+
+    def test_missing_folder_or_binary(self, read, row: str, tmp_path: Path) -> None:
+        (tmp_path / "binary").write_bytes(bytes(range(256)))
+        for path in (tmp_path / "nowhere.txt", tmp_path, tmp_path / "binary"):
+            with pytest.raises(TrajectoryError) as error:
+                read(path)
+            assert str(path) in str(error.value)
+            assert "\n" not in str(error.value)
+
+
+def test_a_quaternion_of_zeros_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1 0 0 0 0 0 0 0\n")
+    with pytest.raises(TrajectoryError, match=r"a\.txt"):
+        Trajectory.read_tum(tmp_path / "a.txt")
+
+
+def test_time_must_increase(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    with pytest.raises(TrajectoryError, match=r"a\.txt: .*time does not increase at row 2"):
+        Trajectory.read_tum(tmp_path / "a.txt")
+
+
+def test_shapes_must_fit() -> None:
+    with pytest.raises(TrajectoryError, match="2 stamps"):
+        Trajectory(np.arange(2.0), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_kitti_stamps_must_suffice(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    assert len(Trajectory.read_kitti(tmp_path / "a.txt", np.arange(5.0))) == 3
+    with pytest.raises(TrajectoryError, match=r"a\.txt: .*2 stamps"):
+        Trajectory.read_kitti(tmp_path / "a.txt", np.arange(2.0))

@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.data import StereoFeatures
+from slam.errors import ConfigurationError
+from slam.landmarks import LandmarkRows
+from slam.mapping.selection import (
+    MapConfig,
+    bad_landmarks,
+    crowded_landmarks,
+    doubled_landmarks,
+    known_features,
+    new_landmarks,
+    surplus_landmarks,
+)
+from slam.tracking.visibility import MapView, expected_landmarks, similar_view
+from tests.slam.scene import RIG
+
+CONFIG = MapConfig(target_in_view=20, separation=5.0)
+
+
+def features_at(uv, depth=3.0, response=None):
+    uv = np.asarray(uv, float)
+    n = len(uv)
+    right = uv - [RIG.left.fu * RIG.baseline / depth, 0]
+    d = np.eye(16, dtype=np.float32)[np.arange(n) % 16]
+    response = np.ones(n) if response is None else np.asarray(response, float)
+    return StereoFeatures(0.0, uv, right, np.ones(n), np.zeros(n), response, np.ones(n, np.int8), d)
+
+
+def chosen(features, occupied=(), config=CONFIG, free=None):
+    free = np.ones(len(features), bool) if free is None else free
+    return new_landmarks(features, free, np.asarray(occupied, float).reshape(-1, 2), RIG, 1.0, config)
+
+
+def rows_with(**columns):
+    n = len(next(iter(columns.values())))
+    base = {name: np.zeros(n, np.int64) for name in ("seen", "in_view", "missed", "last_seen")}
+    base.update({k: np.asarray(v) for k, v in columns.items()})
+    return LandmarkRows(np.arange(n), np.zeros((n, 16), np.float32), np.ones(n, np.int8), **base)
+
+
+def test_as_many_as_wanted_and_the_strongest_of_a_cell():
+    rng = np.random.default_rng(0)
+    uv = rng.uniform((10, 10), (310, 230), (300, 2))
+    features = features_at(uv, response=rng.random(300))
+    new = chosen(features)
+    assert len(new) == 20
+    gaps = np.linalg.norm(uv[new][:, None] - uv[new][None], axis=2) + 1e9 * np.eye(20)
+    assert gaps.min() >= 5.0
+
+
+def test_empty_regions_come_first():
+    left = [(20.0 + 8 * i, 100.0 + 8 * j) for i in range(5) for j in range(5)]
+    right = [(300.0, 100.0), (300.0, 110.0)]
+    features = features_at(left + right, response=[10.0] * 25 + [0.1] * 2)
+    config = MapConfig(target_in_view=8, separation=5.0, grid=(2, 1))
+    assert {25, 26} <= set(chosen(features, occupied=[(10, 10)] * 4, config=config).tolist())
+
+
+def test_features_on_landmarks_and_without_depth_are_left_out():
+    features = features_at([(50, 50), (100, 100), (200, 100), (250, 50)])
+    features.uv_right[2] = np.nan
+    free = np.array([True, True, True, False])
+    assert chosen(features, occupied=[(51, 51)], free=free).tolist() == [1]
+
+
+def test_uncertain_depth_is_left_out():
+    # f B = 36 px m: at 3 m the disparity is 12 px and 1.4 px of noise are 12 %; at 6 m they are 24 %.
+    assert len(chosen(features_at([(100, 100)], depth=3.0))) == 1
+    assert len(chosen(features_at([(100, 100)], depth=6.0))) == 0
+
+
+def test_enough_landmarks_in_view_need_no_more():
+    features = features_at([(100, 100)])
+    assert len(chosen(features, occupied=np.full((20, 2), 200.0))) == 0
+
+
+def test_erase_what_is_missed_or_seldom_seen():
+    config = MapConfig(erase_missed=5, erase_share=0.3)
+    rows = rows_with(seen=[9, 9, 2, 2, 1], in_view=[10, 14, 10, 5, 1], missed=[1, 5, 1, 3, 0])
+    assert bad_landmarks(rows, config).tolist() == [False, True, True, False, False]
+
+
+def test_what_was_hardly_ever_seen_does_not_stay():
+    times = [80, 80, *range(81, 88)]
+    rows = rows_with(seen=[5, 6, *[5] * 7], in_view=[6] * 9, missed=[0] * 9, last_seen=times)
+    assert bad_landmarks(rows, MapConfig(confirmed=6)).tolist() == [True, False, True, *[False] * 6]
+    dark = rows_with(seen=[5, 9], in_view=[6, 9], missed=[0, 0], last_seen=[80, 200])
+    assert not bad_landmarks(dark, MapConfig(confirmed=6)).any()
+
+
+def test_what_is_not_seen_is_forgotten_only_where_wanted():
+    rows = rows_with(seen=[9, 9, 9], in_view=[9, 9, 9], missed=[0, 0, 0], last_seen=[7, 90, 100])
+    assert not bad_landmarks(rows, MapConfig()).any()
+    assert bad_landmarks(rows, MapConfig(forget_after=20)).tolist() == [True, False, False]
+
+
+def test_out_of_view_is_never_missed():
+    rows = rows_with(seen=[3], in_view=[3], missed=[0], last_seen=[7])
+    features = features_at(np.zeros((0, 2)))
+    none = np.zeros(0, np.int64)
+    for frame in range(100):
+        rows = rows.after_frame(frame, none, none, features, none)
+    assert not bad_landmarks(rows, CONFIG).any()
+
+
+def test_counting_a_frame():
+    rows = rows_with(seen=[1, 1, 1], in_view=[1, 1, 1], missed=[0, 2, 0])
+    features = features_at([(1, 1), (2, 2)])
+    rows = rows.after_frame(8, np.array([0, 1]), np.array([1, 2]), features, np.array([1, 0]))
+    assert rows.in_view.tolist() == [2, 2, 2]
+    assert rows.missed.tolist() == [1, 0, 0]
+    assert rows.seen.tolist() == [1, 2, 2]
+    assert rows.last_seen.tolist() == [0, 8, 8]
+    np.testing.assert_array_equal(rows.descriptors[1], features.descriptors[1])
+
+
+def test_the_longest_unseen_give_way():
+    config = MapConfig(target_in_view=3, max_landmarks=3)
+    rows = rows_with(last_seen=[5, 1, 9, 3, 7], seen=[2, 2, 2, 2, 2])
+    assert surplus_landmarks(rows, config).tolist() == [False, True, False, True, False]
+
+
+def test_the_never_confirmed_give_way_first():
+    config = MapConfig(target_in_view=3, max_landmarks=3)
+    rows = rows_with(last_seen=[5, 1, 9, 3, 9], seen=[1, 4, 1, 4, 2])
+    assert surplus_landmarks(rows, config).tolist() == [True, True, False, False, False]
+
+
+def test_out_of_view_the_map_is_thinned_to_the_best_seen():
+    """Landmarks two metres off, 10 cm apart, the last one 1 m from the others; the first three are out of view."""
+    config = MapConfig(spacing=0.1, erase_missed=2)
+    positions = np.array([[0, 0, 2], [0.1, 0, 2], [0.2, 0, 2], [0.3, 0, 2], [0.4, 0, 2], [1.4, 0, 2.0]])
+    rows = rows_with(seen=[3, 9, 4, 1, 1, 1], last_seen=[4, 5, 6, 7, 8, 9], seen_from=np.zeros((6, 3)))
+    assert crowded_landmarks(rows, positions, config).tolist() == [True, False, True, False, False, False]
+    assert not crowded_landmarks(rows, positions, MapConfig(spacing=0.0, erase_missed=2)).any()
+    apart = positions * [3, 1, 1]  # further apart than a tenth of the distance
+    assert not crowded_landmarks(rows, apart, config).any()
+    unknown = rows_with(seen=rows.seen, last_seen=rows.last_seen)
+    assert not crowded_landmarks(unknown, positions, config).any()
+
+
+def test_of_equally_well_seen_ones_the_older_stays():
+    rows = rows_with(seen=[5, 5, 5, 5], last_seen=[1, 1, 2, 3], seen_from=np.zeros((4, 3)))
+    positions = np.array([[0, 0, 2], [0.05, 0, 2], [1, 0, 2], [2, 0, 2.0]])
+    assert crowded_landmarks(rows, positions, MapConfig(erase_missed=1)).tolist() == [False, True, False, False]
+
+
+def test_what_looks_as_it_did():
+    """One landmark 2 m ahead of where it was first seen from."""
+    from_here = lambda *camera: bool(  # noqa: E731
+        similar_view(np.array([[0, 0, 2.0]]), np.zeros((1, 3)), np.array(camera), 20.0, 1.4)[0]
+    )
+    assert from_here(0, 0, 0) and from_here(0, 0, 0.5) and from_here(0, 0, -0.7) and from_here(0.7, 0, 0)
+    assert not from_here(0, 0, 0.6)  # 1.4 m
+    assert not from_here(0, 0, -0.9)  # 2.9 m
+    assert not from_here(0.75, 0, 0)  # 20.6 degrees
+    unknown = similar_view(np.array([[0, 0, 2.0]]), np.full((1, 3), np.nan), np.array([5.0, 0, 0]), 20.0, 1.4)
+    assert unknown.tolist() == [True]
+
+
+def seen_from_the_origin(positions, features):
+    return MapView.of(RIG, np.eye(4), np.asarray(positions, float), features, 1.0)
+
+
+def like(features, rows, seen):
+    """Landmarks that look like some of the features."""
+    n, none = len(rows), np.zeros(len(rows), np.int64)
+    looks, signs = features.descriptors[rows], features.laplacian[rows]
+    return LandmarkRows(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
+
+
+def test_a_feature_that_is_a_landmark_already_is_known():
+    features = features_at([(100, 100), (200, 100), (250, 50)], depth=3.0)
+    points = RIG.triangulate(features.uv_left, features.uv_right)
+    landmarks = like(features, [0, 1, 1], [1, 1, 1])
+    # The first: 0.2 m deeper, within the uncertainty of 12 %. The second: as deep, but 20 px away. The third looks
+    # like another feature.
+    positions = [points[0] * 1.07, points[1] + [0.2, 0, 0], points[2]]
+    view = seen_from_the_origin(positions, features)
+    assert known_features(view, landmarks, features, CONFIG).tolist() == [True, False, False]
+
+
+def test_of_doubled_landmarks_the_one_seen_less_goes():
+    features = features_at([(100, 100), (200, 100)], depth=3.0)
+    points = RIG.triangulate(features.uv_left, features.uv_right)
+    landmarks = like(features, [0, 0, 1, 1, 0], [5, 9, 4, 4, 3])
+    positions = [points[0], points[0] + 0.01, points[1], points[1] - 0.005, points[0] + [0, 0, 0.1]]
+    view = seen_from_the_origin(positions, features)
+    assert doubled_landmarks(view, landmarks, CONFIG).tolist() == [True, False, False, True, False]
+
+
+def test_hidden_landmarks_are_not_expected():
+    """Two landmarks at 6 m: one among features at 2 m, one among features as far as itself; one at the border."""
+    near = features_at([(100 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=2.0)
+    far = features_at([(220 + i, 100 + j) for i in (-6, 0, 6) for j in (-6, 6)], depth=6.0)
+    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+    both = StereoFeatures(0.0, *(np.concatenate([getattr(near, n), getattr(far, n)]) for n in names))
+    rays = np.column_stack([RIG.left.normalise(np.array([(100.0, 100), (220, 100), (5, 100)])), np.ones(3)])
+    view = MapView.of(RIG, np.eye(4), 6.0 * rays, both, 0.3)
+    size = (RIG.width, RIG.height)
+    assert expected_landmarks(view, both, size, 16.0, 12.0).tolist() == [False, True, False]
+    assert expected_landmarks(view, both, size, 0.0, 0.0).tolist() == [True, True, True]
+
+
+def test_looks_are_renewed_as_far_as_wanted():
+    rows = rows_with(seen=[1], in_view=[1], missed=[0])
+    rows = LandmarkRows(**{**vars(rows), "descriptors": np.eye(16, dtype=np.float32)[:1]})
+    features = features_at([(1, 1), (2, 2)])
+    for descriptor_update, expected in ((0.0, (1, 0)), (1.0, (0, 1)), (0.5, (0.5**0.5, 0.5**0.5))):
+        after = rows.after_frame(1, rows.ids, rows.ids, features, np.array([1]), descriptor_update)
+        np.testing.assert_allclose(after.descriptors[0, :2], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change", [{"target_in_view": 1}, {"max_landmarks": 10}, {"grid": (0, 1)}, {"max_depth_error": 2.0}]
+)
+def test_settings_out_of_range(change):
+    with pytest.raises(ConfigurationError):
+        MapConfig(**change)

@@ -1,0 +1,258 @@
+"""Maps in files, and starting in a map that is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+import slam
+from experiments.startup import STARTS, start_up, stored_map
+from slam.config import SystemConfig
+from slam.data import FrameStatus, StereoFeatures
+from slam.errors import ConfigurationError, SlamError
+from slam.geometry import se3
+from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from tests.slam.scene import RIG, Cloud, path
+
+BACKENDS = ("ekf", "smoother")
+CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5))
+
+
+def some_map(count=20, dimensions=16):
+    rng = np.random.default_rng(1)
+    d = rng.standard_normal((count, dimensions))
+    return SavedMap(
+        np.arange(count) * 2, rng.standard_normal((count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32), np.ones(count, np.int8),
+        np.arange(count), np.arange(count) + 1, "surf", "somewhere", "a test",
+    )  # fmt: skip
+
+
+def first_run(backend, frames=25, cloud=None):
+    system = StereoSlam(RIG, None, backend, config=CONFIG)
+    cloud = cloud or Cloud(150)
+    for k, T in enumerate(path(frames)):
+        system.process_features(cloud.features(T, k / 30, 0.3)[0])
+    return system
+
+
+# --- the file ---
+
+
+def test_the_same_map_byte_for_byte_after_load_and_save(tmp_path):
+    save_map(tmp_path / "one.map", some_map())
+    save_map(tmp_path / "two.map", load_map(tmp_path / "one.map"))
+    assert (tmp_path / "one.map").read_bytes() == (tmp_path / "two.map").read_bytes()
+    assert [f.name for f in sorted(tmp_path.iterdir())] == ["one.map", "two.map"]  # nothing temporary is left
+
+
+def test_everything_comes_back(tmp_path):
+    before = some_map()
+    save_map(tmp_path / "a.map", before)
+    after = load_map(tmp_path / "a.map")
+    for name in ("ids", "positions", "covariances", "descriptors", "laplacian", "seen", "in_view"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+        assert getattr(after, name).dtype == getattr(before, name).dtype
+    assert (after.frontend, after.world_frame, after.written_by) == ("surf", "somewhere", "a test")
+    assert after.source == str(tmp_path / "a.map")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_systems_map(backend, tmp_path):
+    system = first_run(backend)
+    save_map(tmp_path / "a.map", system)
+    found, estimate = load_map(tmp_path / "a.map"), system.estimate()
+    np.testing.assert_array_equal(found.ids, estimate.ids)
+    np.testing.assert_array_equal(found.positions, estimate.positions)
+    np.testing.assert_allclose(found.covariances, estimate.covariances, rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(found.descriptors, system.landmarks.descriptors)
+
+
+def test_any_altered_byte_is_found():
+    data = encode(some_map())
+    rng = np.random.default_rng(0)
+    places = [*range(120), *rng.integers(0, len(data), 300).tolist()]
+    for i in places:
+        altered = bytearray(data)
+        altered[i] ^= 1 << int(rng.integers(8))
+        with pytest.raises(SlamError, match=r"a\.map") as error:
+            decode(bytes(altered), "a.map")
+        assert "\n" not in str(error.value)
+
+
+def test_a_map_cut_short_or_longer_is_found():
+    data = encode(some_map())
+    for other in (*(data[:n] for n in (0, 5, 22, 60, 90, 500, len(data) - 1)), data + b"\0"):
+        with pytest.raises(SlamError, match=r"a\.map"):
+            decode(other, "a.map")
+
+
+def signed(body: bytes) -> bytes:
+    return b"surf-stereo-slam map 2\n" + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+def with_member(name: str, content: bytes | None) -> bytes:
+    """A map with one member of its archive exchanged or left out, and the right checksum."""
+    out = BytesIO()
+    body = encode(some_map()).split(b"\n", 2)[2]
+    with zipfile.ZipFile(BytesIO(body)) as old, zipfile.ZipFile(out, "w") as new:
+        for info in old.infolist():
+            if info.filename != name:
+                new.writestr(info, old.read(info))
+            elif content is not None:
+                new.writestr(info, content)
+    return signed(out.getvalue())
+
+
+def npy(array, allow_pickle=False):
+    buffer = BytesIO()
+    np.lib.format.write_array(buffer, np.asarray(array), allow_pickle=allow_pickle)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("ids.npy", None),
+        ("header.json", b"{}"),
+        ("header.json", b"not json"),
+        ("ids.npy", npy(np.arange(20)[::-1])),
+        ("ids.npy", npy(np.arange(19))),
+        ("ids.npy", npy(np.arange(20.0))),
+        ("positions.npy", npy(np.full((20, 3), np.nan))),
+        ("positions.npy", npy(np.zeros((20, 2)))),
+        ("covariances.npy", npy(np.zeros((20, 3, 3)))),
+        ("descriptors.npy", npy(np.full((20, 4), np.inf, np.float32))),
+        ("descriptors.npy", npy(np.zeros(20, np.float32))),
+        ("seen.npy", npy(np.array([{}] * 20, object), allow_pickle=True)),
+        ("seen_from.npy", npy(np.zeros((20, 2)))),
+        ("seen.npy", b""),
+    ],
+)
+def test_a_map_that_is_none_is_refused_though_its_checksum_is_right(name, content):
+    with pytest.raises(SlamError, match=r"a\.map") as error:
+        decode(with_member(name, content), "a.map")
+    assert "\n" not in str(error.value)
+
+
+def test_other_files_and_versions_are_refused(tmp_path):
+    with pytest.raises(SlamError, match="cannot be read"):
+        load_map(tmp_path / "none.map")
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(SlamError, match="not a saved map"):
+        load_map(tmp_path / "text")
+    data = encode(some_map()).replace(b"map 2\n", b"map 1\n", 1)
+    with pytest.raises(SlamError, match="version '1'"):
+        decode(data, "a.map")
+    with pytest.raises(SlamError, match="cannot be written"):
+        save_map(tmp_path / "no" / "folder.map", some_map())
+
+
+def test_other_programs_can_read_it(tmp_path):
+    """As docs/saved_maps.md says: two lines, then an archive."""
+    save_map(tmp_path / "a.map", some_map())
+    with (tmp_path / "a.map").open("rb") as file:
+        assert file.readline() == b"surf-stereo-slam map 2\n"
+        file.readline()
+        arrays = np.load(BytesIO(file.read()))
+    np.testing.assert_array_equal(arrays["positions"], some_map().positions)
+    with zipfile.ZipFile(tmp_path / "a.map") as archive:
+        assert json.loads(archive.read("header.json"))["frontend"] == "surf"
+
+
+# --- starting in it ---
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
+    cloud = Cloud(150)
+    known = SavedMap.of(first_run(backend, cloud=cloud))
+    start = se3.exp(np.array([0.02, -0.15, 0.05, -0.3, 0.1, 0.4]))
+    system = StereoSlam(RIG, None, backend, config=CONFIG, known_map=known)
+    assert system.unlocated_map is known and SavedMap.of(system) is known
+    dark = system.process_features(StereoFeatures.empty(0.0, 32))
+    assert dark.status is FrameStatus.LOST and not dark.located and dark.map_size == len(known)
+    errors = []
+    for k, T in enumerate(path(30), start=1):
+        truth = start @ T
+        result = system.process_features(cloud.features(truth, k / 30, 0.3)[0])
+        assert result.status is FrameStatus.TRACKED and result.located
+        errors.append(np.linalg.norm(result.estimate.T_world_left[:3, 3] - truth[:3, 3]))
+    assert max(errors) < 0.02  # of points 2 to 6 m away, 0.3 px
+    assert len(system.trajectory()) == 30  # the frame before the camera was found has no pose
+    assert system.estimate().ids.max() > known.ids.max()  # new landmarks have numbers of their own
+    assert system.unlocated_map is None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backend):
+    known = SavedMap.of(first_run(backend))
+    system, elsewhere = StereoSlam(RIG, None, backend, config=CONFIG, known_map=known), Cloud(150, seed=9)
+    for k, T in enumerate(path(8)):
+        result = system.process_features(elsewhere.features(T, k / 30, 0.3)[0])
+        assert result.status is FrameStatus.LOST and not len(result.added)
+    assert encode(SavedMap.of(system)) == encode(known)
+    assert len(system.trajectory()) == 0
+
+
+def test_descriptors_of_another_kind_are_refused():
+    known = SavedMap.of(first_run("ekf"))
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG, known_map=known)
+    with pytest.raises(SlamError, match="32 numbers, those of the front end 64"):
+        system.process_features(StereoFeatures.empty(0.0, 64))
+    with pytest.raises(SlamError, match="front end 'orb'"):
+        StereoSlam(RIG, "surf", "ekf", known_map=replace(known, frontend="orb"))
+    with pytest.raises(ConfigurationError, match="by name"):
+        StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, known_map=known)
+
+
+def test_there_is_no_map_before_the_first_frame():
+    with pytest.raises(SlamError, match="no map yet"):
+        SavedMap.of(StereoSlam(RIG, None, "ekf"))
+
+
+def slam_command(*arguments):
+    return subprocess.run([sys.executable, "-m", "slam", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_the_command_saves_and_starts_and_refuses(tmp_path):
+    kept = str(tmp_path / "desk.map")
+    run = ("run", "synthetic:desk?seed=1", "--quiet", "--out")
+    done = slam_command(*run, str(tmp_path / "one"), "--frames", "0:5", "--save-map", kept)
+    assert done.returncode == 0, done.stderr
+    done = slam_command(*run, str(tmp_path / "two"), "--frames", "3:7", "--map", kept)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "two" / "summary.json").read_text())["status"] == {"tracked": 4}
+    data = bytearray((tmp_path / "desk.map").read_bytes())
+    data[-40] ^= 1
+    (tmp_path / "desk.map").write_bytes(data)
+    done = slam_command(*run, str(tmp_path / "three"), "--map", kept)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "altered" in done.stderr
+    done = slam_command(*run, str(tmp_path / "three"), "--mono")
+    assert done.returncode == 2 and "--mono needs --map" in done.stderr
+
+
+# --- start-up from pre-stored features (paper B, 4.2) ---
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_start_up_before_the_board(backend):
+    """From three wrong starts to within a centimetre; single frames fix the place to 8 mm (one sigma)."""
+    sequence = slam.open_sequence("synthetic:startup?frames=25")
+    known = stored_map(sequence)
+    for start in STARTS:
+        run = start_up(sequence, known, backend, start, 25, "stereo")
+        assert run.errors[0] < 0.03
+        assert run.errors[10:].max() < 0.01
+        assert (run.errors[10:] < 4 * run.sigma[10:]).all()

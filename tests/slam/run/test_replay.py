@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam.data import FrameStatus, Observations
+from slam.errors import MeasurementError, SequenceError
+from slam.geometry.trajectory import Trajectory
+from slam.models import models_for
+from slam.run.recording import load_recording, save_recording
+from slam.run.replay import RecordedRows, Recording, record, replay
+from slam.run.simulated_recording import true_recording, with_mismatches
+from slam.system import StereoSlam
+from tests.backends.fixed_map import FixedMapBackend
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def desk():
+    return slam.open_sequence(f"synthetic:desk?frames={FRAMES}")
+
+
+@pytest.fixture(scope="module")
+def recording(desk):
+    return true_recording(desk)
+
+
+def online(results):
+    return np.array([r.estimate.T_world_left for r in results])
+
+
+def test_a_run_replayed_into_the_same_back_end_is_the_same_run(desk):
+    system = StereoSlam(desk.rig, None, "ekf")
+    results = [system.process_features(desk.observations(k)) for k in range(FRAMES)]
+    recorded = record(results, desk.rig, system.config.models, desk.name, desk.ground_truth)
+    again = list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))
+    # Not the last bit: the pose on which all agree was found there among more candidates.
+    np.testing.assert_allclose(online(again), online(results), atol=1e-9)
+    for ours, theirs in zip(again, results):
+        assert (ours.status, ours.map_size) == (theirs.status, theirs.map_size)
+        assert (ours.predicted, ours.index) == (theirs.predicted, theirs.index)
+        for name in ("matched", "added", "erased"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+        np.testing.assert_array_equal(ours.report.used, theirs.report.used)
+    assert again[0].status is FrameStatus.STARTED and again[-1].status is FrameStatus.TRACKED
+    twice = record(again, desk.rig, system.config.models)
+    np.testing.assert_array_equal(twice.observed.uv_right, recorded.observed.uv_right)
+    np.testing.assert_array_equal(twice.removed, recorded.removed)
+
+
+def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkeypatch):
+    offsets = {8: 0.3, 11: 0.2}  # what the self-calibration believes from a frame on
+    system = StereoSlam(desk.rig, None, "smoother")
+    results = []
+    for k in range(FRAMES):
+        system.calibration._mean = offsets.get(k, system.calibration._mean)
+        system.calibration._information = 1e4
+        results.append(system.process_features(desk.observations(k)))
+    shifts = [r.shift for r in results]
+    assert np.flatnonzero(shifts).tolist() == [8, 11]
+    assert sum(shifts) == pytest.approx(system.calibration.applied)
+    save_recording(record(results, desk.rig, system.config.models), tmp_path / "run.npz")
+    recorded = load_recording(tmp_path / "run.npz")
+    backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
+    monkeypatch.setattr(backend, "shift_right", lambda shift: given.append((len(backend.records.path.stamps), shift)))
+    assert [r.shift for r in replay(recorded, backend)] == shifts
+    assert given == [(8, shifts[8]), (11, shifts[11])]
+    assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
+
+
+def test_a_third_party_back_end_can_be_given_a_recording(recording, desk):
+    results = list(replay(recording, FixedMapBackend(recording.rig, recording.models)))
+    assert len(results) == FRAMES
+    truth = desk.ground_truth.poses
+    np.testing.assert_allclose(
+        online(results)[:, :3, 3], (np.linalg.inv(truth[0]) @ truth)[:, :3, 3], atol=0.02
+    )  # a fixed map of 0.7 px
+
+
+def test_true_recordings_hold_true_matches_only(recording, desk):
+    assert recording.models.pixel_sigma == desk.values["sigma"]
+    T_left_world = np.linalg.inv(desk.ground_truth.poses)
+    count = 0
+    for k, frame in enumerate(recording):
+        for seen in (frame.observed, frame.added):
+            points = desk.world.landmarks.world_positions(desk.world.T_world_body(k))[seen.ids]
+            left, right = desk.rig.project(points @ T_left_world[k, :3, :3].T + T_left_world[k, :3, 3])
+            assert np.abs(left - seen.uv_left).max(initial=0) < 5 * desk.values["sigma"]
+            both = seen.has_stereo
+            assert np.abs(right - seen.uv_right)[both, 0].max(initial=0) < 5 * desk.values["sigma"]
+            count += len(seen)
+        assert frame.added.has_stereo.all()
+    assert count > 50 * FRAMES
+
+
+def test_landmarks_not_seen_for_long_may_leave(desk):
+    recording = true_recording(desk, keep=0)  # whatever misses a frame
+    assert len(recording.removed) > 10
+    for k, frame in enumerate(recording):
+        assert not np.isin(frame.removed, frame.observed.ids).any()
+        assert recording.map_size(k) == len(recording.landmarks(k + 1))
+    assert len(list(replay(recording, FixedMapBackend(recording.rig, recording.models)))) == FRAMES
+
+
+def test_mismatches_exchange_pixels(recording):
+    spoilt = with_mismatches(recording, 0.1, seed=1)
+    moved = (spoilt.observed.uv_left != recording.observed.uv_left).any(axis=1)
+    assert 0.07 < moved.mean() < 0.13
+    np.testing.assert_array_equal(spoilt.observed.ids, recording.observed.ids)
+    k = int(recording.observed.frame[np.flatnonzero(moved)[0]])
+    pixels = [np.sort(r.observed.at(k).uv_left[:, 0]) for r in (recording, spoilt)]
+    np.testing.assert_array_equal(*pixels)
+
+
+def test_a_file_holds_it_all(recording, tmp_path):
+    save_recording(recording, tmp_path / "run.npz")
+    assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
+    again = load_recording(tmp_path / "run.npz")
+    assert (again.name, again.models) == (recording.name, recording.models)
+    assert (again.rig.left, again.rig.right) == (recording.rig.left, recording.rig.right)
+    np.testing.assert_array_equal(again.rig.b, recording.rig.b)
+    for name in ("numbers", "stamps", "removed_frame", "removed"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(recording, name))
+    for name in ("frame", "ids", "uv_left", "uv_right"):
+        np.testing.assert_array_equal(getattr(again.observed, name), getattr(recording.observed, name))
+        np.testing.assert_array_equal(getattr(again.added, name), getattr(recording.added, name))
+    np.testing.assert_array_equal(again.ground_truth.poses, recording.ground_truth.poses)
+
+
+def test_truth_may_be_unknown_and_nothing_seen(recording, tmp_path):
+    none = np.zeros(0, np.int64)
+    rows = RecordedRows.of([Observations.empty()] * 2)
+    empty = Recording(
+        "", recording.rig, models_for("driving"), np.arange(2), np.array([0.0, 0.1]), rows, rows, none, none
+    )
+    save_recording(empty, tmp_path / "empty.npz")
+    again = load_recording(tmp_path / "empty.npz")
+    assert again.ground_truth is None and again.models == models_for("driving")
+    results = list(replay(again, FixedMapBackend(again.rig, again.models)))
+    assert [r.status for r in results] == [FrameStatus.PREDICTED] * 2
+
+
+def arrays_of(recording, folder):
+    save_recording(recording, folder / "good.npz")
+    with np.load(folder / "good.npz") as file:
+        return {key: file[key] for key in file.files}
+
+
+def reordered(ids):
+    """The first id of the second frame with observations takes the place of the one before it."""
+    return np.concatenate([ids[:1] + 100_000, ids[1:]])
+
+
+FAULTS = {
+    "another format": (lambda a: {**a, "format": "something"}, "is no recording"),
+    "a later version": (lambda a: {**a, "version": 2}, "version 2"),
+    "a missing array": (lambda a: {k: v for k, v in a.items() if k != "stamps"}, "lacks 'stamps'"),
+    "time runs back": (lambda a: {**a, "stamps": a["stamps"][::-1]}, "stamps must be finite and increase"),
+    "pixels of another length": (lambda a: {**a, "observed_uv_left": a["observed_uv_left"][1:]}, "differ in length"),
+    "a pixel that is none": (lambda a: {**a, "added_uv_left": a["added_uv_left"] * np.nan}, "not finite"),
+    "frames that are not there": (lambda a: {**a, "added_frame": a["added_frame"] + 99}, "frames of added"),
+    "ids of another type": (lambda a: {**a, "observed_ids": a["observed_ids"] + 0.5}, "observed_ids is of type"),
+    "an unknown landmark": (lambda a: {**a, "observed_ids": reordered(a["observed_ids"])}, "not in the map"),
+    "a landmark twice": (lambda a: {**a, "added_ids": a["added_ids"] * 0}, "stands twice"),
+    "a rig that is none": (lambda a: {**a, "rig": '{"left": {}}'}, "lacks 'distortion'"),
+    "JSON that is none": (lambda a: {**a, "models": "{"}, "Expecting"),
+    "an unknown setting": (lambda a: {**a, "models": '{"motion": {}, "haste": 1}'}, "haste"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_damaged_files_are_refused_in_one_line(recording, tmp_path, fault):
+    spoil, words = FAULTS[fault]
+    np.savez(tmp_path / "bad.npz", **spoil(arrays_of(recording, tmp_path)))
+    with pytest.raises(SequenceError, match=words) as caught:
+        load_recording(tmp_path / "bad.npz")
+    assert "bad.npz" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"text", b"PK\x03\x04 cut short"])
+def test_what_is_no_archive_is_refused(tmp_path, content):
+    if content is not None:
+        (tmp_path / "bad.npz").write_bytes(content)
+    with pytest.raises(SequenceError, match=r"bad\.npz"):
+        load_recording(tmp_path / "bad.npz")
+
+
+def test_pickled_objects_are_not_read(recording, tmp_path):
+    arrays = arrays_of(recording, tmp_path)
+    np.savez(tmp_path / "bad.npz", **{**arrays, "removed": np.array([{}], object)})
+    with pytest.raises(SequenceError, match=r"bad\.npz"):
+        load_recording(tmp_path / "bad.npz")
+
+
+def test_a_cut_archive_is_refused(recording, tmp_path):
+    save_recording(recording, tmp_path / "good.npz")
+    content = bytearray((tmp_path / "good.npz").read_bytes())
+    content[len(content) // 3 : len(content) // 3 + 50] = bytes(50)
+    (tmp_path / "bad.npz").write_bytes(content)
+    with pytest.raises(SequenceError, match=r"bad\.npz"):
+        load_recording(tmp_path / "bad.npz")
+
+
+def test_a_file_that_cannot_be_written(recording, tmp_path):
+    with pytest.raises(SequenceError, match="cannot be written"):
+        save_recording(recording, tmp_path / "nowhere" / "run.npz")
+
+
+def test_recordings_are_checked_when_made(recording):
+    with pytest.raises(MeasurementError, match="removed"):
+        replace(recording, removed=np.arange(3))
+
+
+def test_the_command_records_and_replays(tmp_path):
+    def run(*arguments):
+        command = [sys.executable, "-m", "slam", *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    file = tmp_path / "run.npz"
+    done = run("run", "synthetic:aisle?frames=4", "--record", file, "--out", tmp_path / "first", "--quiet")
+    assert done.returncode == 0, done.stderr
+    done = run("replay", file, "--backend", "smoother", "--out", tmp_path / "second")
+    assert done.returncode == 0, done.stderr
+    assert "smoother" in done.stdout
+    names = [{p.name for p in (tmp_path / each).iterdir()} for each in ("first", "second")]
+    assert names[0] == names[1]
+    paths = [Trajectory.read_tum(tmp_path / each / "trajectory.txt") for each in ("first", "second")]
+    np.testing.assert_allclose(paths[0].positions, paths[1].positions, atol=0.01)
+    done = run("run", "synthetic:aisle", "--record", tmp_path / "no" / "run.npz", "--out", tmp_path / "third")
+    assert done.returncode == 2 and "there is no folder" in done.stderr
+    done = run("replay", tmp_path / "nothing.npz", "--out", tmp_path / "third")
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from slam.config import SystemConfig
+from slam.data import StereoFrame
+from slam.errors import SequenceError, SlamError
+from slam.geometry.rig import StereoRig
+from slam.geometry.trajectory import Trajectory
+from slam.run.figures import RunData
+from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
+from slam.run.runner import RunOptions, parse_frames, run
+from slam.sequences import open_sequence
+
+WORLD = "synthetic:aisle?frames=12"
+TABLES = {"landmarks.csv", "objects.csv", "frames.csv"}
+FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json"} | TABLES
+
+
+def options(out, backend="ekf", **more):
+    return RunOptions(backend, "surf", SystemConfig.for_kind("handheld"), out, **more)
+
+
+@dataclass
+class Broken:
+    """A sequence that breaks after some frames."""
+
+    good: int
+    rig: StereoRig = field(default_factory=lambda: open_sequence(WORLD).rig)
+    name = "broken"
+    format = "test"
+    kind = "handheld"
+    ground_truth = None
+    warnings: list = field(default_factory=list)
+
+    def __len__(self):
+        return 12
+
+    def frames(self, start=0, stop=None):
+        yield from open_sequence(WORLD).frames(0, self.good)
+        raise SequenceError("disk gone")
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_a_run_leaves_its_files(tmp_path, backend):
+    seen = []
+    summary = run(open_sequence(WORLD), options(tmp_path, backend), seen.append)
+    assert {p.name for p in tmp_path.iterdir()} == FILES
+    assert len(seen) == 12
+    online = Trajectory.read_tum(tmp_path / "trajectory.txt")
+    assert len(online) == len(Trajectory.read_tum(tmp_path / "trajectory_final.txt")) == 12
+    with (tmp_path / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == FRAME_COLUMNS
+    assert [r["status"] for r in rows] == ["started"] + ["tracked"] * 11
+    assert [int(r["frame"]) for r in rows] == list(range(12))
+    with (tmp_path / "landmarks.csv").open() as file:
+        landmarks = list(csv.DictReader(file))
+    assert tuple(landmarks[0]) == LANDMARK_COLUMNS
+    assert len(landmarks) == summary["landmarks"] == int(rows[-1]["map_size"])
+    assert all(float(r["cxx"]) > 0 for r in landmarks)
+    assert (tmp_path / "objects.csv").read_text().strip() == ",".join(OBJECT_COLUMNS)
+    assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
+    assert summary["ended"] == "completed"
+    assert summary["accuracy"]["online"]["ATE RMSE [m]"] < 0.01
+    assert "NIS per degree of freedom" in summary["consistency"]
+    assert summary["versions"]["numpy"] == np.__version__
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["backend"] == backend
+    assert config["in_force"]["frontend"]["octaves"] == 2  # left at its default, said all the same
+    assert config["in_force"]["backend"]
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_the_same_run_twice_gives_the_same_bytes(tmp_path, backend):
+    for name in ("a", "b"):
+        run(open_sequence(WORLD), options(tmp_path / name, backend))
+    for file in ("trajectory.txt", "trajectory_final.txt", "landmarks.csv"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_frames_are_chosen(tmp_path):
+    summary = run(open_sequence(WORLD), options(tmp_path, start=3, stop=7))
+    assert summary["frames"] == 4
+    with (tmp_path / "frames.csv").open() as file:
+        assert [int(r["frame"]) for r in csv.DictReader(file)] == [3, 4, 5, 6]
+
+
+def test_a_fault_half_way_keeps_what_was_done(tmp_path):
+    with pytest.raises(SequenceError, match="disk gone"):
+        run(Broken(5), options(tmp_path))
+    assert {p.name for p in tmp_path.iterdir()} == FILES
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.txt")) == 5
+    assert "disk gone" in json.loads((tmp_path / "summary.json").read_text())["ended"]
+
+
+def test_a_fault_before_the_first_frame(tmp_path):
+    with pytest.raises(SequenceError):
+        run(Broken(0), options(tmp_path))
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
+    command = [sys.executable, "-m", "slam", "run", "synthetic:aisle?frames=1000", "--out", str(tmp_path), "--quiet"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.time() + 120
+    path = tmp_path / "trajectory.txt"
+    while time.time() < deadline and (not path.exists() or path.read_text().count("\n") < 5):
+        time.sleep(0.05)
+    process.send_signal(kill)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[kill], errors
+    assert len(Trajectory.read_tum(path)) >= 5
+    if kill is not signal.SIGKILL:
+        assert f"stopped by {kill.name}" in errors
+        assert "stopped" in json.loads((tmp_path / "summary.json").read_text())["ended"]
+        assert (tmp_path / "landmarks.csv").exists()
+
+
+@pytest.mark.parametrize("world", ["synthetic:desk?frames=1", "synthetic:desk?frames=3&black=0:3"])
+def test_pictures_of_short_and_empty_runs(tmp_path, world):
+    run(open_sequence(world), options(tmp_path))
+    data = RunData.read(tmp_path, "short")
+    assert len(data.online) == len(data.status) == len(data.deviations)
+    assert data.positions.shape == (len(data.covariances), 3)
+
+
+def test_a_missing_right_image_is_no_error(tmp_path):
+    class OneEyed(Broken):
+        def frames(self, start=0, stop=None):
+            for frame in open_sequence(WORLD).frames():
+                yield StereoFrame(frame.index, frame.stamp, frame.left, None) if frame.index == 6 else frame
+
+    summary = run(OneEyed(0), options(tmp_path))
+    assert summary["frames"] == 12
+
+
+def test_out_that_is_a_file(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(SlamError, match="out"):
+        run(open_sequence(WORLD), options(tmp_path / "out"))
+
+
+@pytest.mark.parametrize(("text", "range_"), [(None, (0, None)), ("3:9", (3, 9)), (":9", (0, 9)), ("3:", (3, None))])
+def test_ranges_of_frames(text, range_):
+    assert parse_frames(text) == range_
+
+
+@pytest.mark.parametrize("text", ["", "3", "a:b", "1:2:3"])
+def test_bad_ranges_of_frames(text):
+    with pytest.raises(SlamError, match="A:B"):
+        parse_frames(text)

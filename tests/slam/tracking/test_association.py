@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.data import Prediction, StereoFeatures
+from slam.errors import ConfigurationError
+from slam.geometry import se3
+from slam.tracking.association import (
+    AssociationConfig,
+    crowded,
+    match_everywhere,
+    match_in_windows,
+    pairs_in_boxes,
+    search_windows,
+)
+from tests.slam.scene import RIG, Cloud
+
+CONFIG = AssociationConfig()
+
+
+def predicted(cloud, T, offset=(0.0, 0.0), sigma=2.0):
+    """A prediction of all points in view, off by some pixels."""
+    left, right = RIG.project(se3.transform(se3.inverse(T), cloud.points))
+    ids = np.flatnonzero(RIG.left.in_image(left))
+    S = np.tile(np.eye(2) * sigma**2, (len(ids), 1, 1))
+    return Prediction(0.0, T, np.eye(6), ids, left[ids] + offset, right[ids], S)
+
+
+def found(cloud, prediction, features, config=CONFIG):
+    ids = prediction.ids
+    return match_in_windows(prediction, cloud.descriptors[ids], cloud.laplacian[ids], features, config)
+
+
+def test_every_landmark_finds_its_own_feature():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0, noise=0.5)
+    prediction = predicted(cloud, np.eye(4))
+    matches = found(cloud, prediction, features)
+    assert len(matches) == len(ids)
+    np.testing.assert_array_equal(prediction.ids[matches.landmarks], ids[matches.features])
+
+
+def test_larger_window_finds_what_the_smallest_does_not():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    prediction = predicted(cloud, np.eye(4), offset=(8.0, 0.0))  # 4 sigmas: outside of 2.5, inside of 5
+    assert len(found(cloud, prediction, features)) == len(ids)
+    small = AssociationConfig(window_sigmas=(2.5,), d_match=(0.55,))
+    assert len(found(cloud, prediction, features, small)) == 0
+
+
+def test_fixed_windows_do_not_care_for_the_covariance():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    fixed = AssociationConfig(windows="fixed", window_sizes=(6.0, 12.0))
+    for sigma in (0.1, 50.0):
+        assert len(found(cloud, predicted(cloud, np.eye(4), (11.0, 11.0), sigma), features, fixed)) == len(ids)
+        assert len(found(cloud, predicted(cloud, np.eye(4), (13.0, 0.0), sigma), features, fixed)) < 0.1 * len(ids)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 4.0, 30.0, 300.0])
+def test_windows_are_the_innovations_ellipses(sigma):
+    """The same candidates as by looking at every pair, whatever the size and shape of the windows."""
+    rng = np.random.default_rng(int(sigma))
+    uv = rng.uniform((0, 0), (320, 240), (150, 2))
+    centres = rng.uniform((-20, -20), (340, 260), (200, 2))
+    A = sigma * rng.normal(size=(200, 2, 2))
+    S = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(2)
+    none = np.zeros(200, np.int64)
+    config = AssociationConfig(window_min=1e-3, window_max=1e4)
+    windows = search_windows(Prediction(0.0, np.eye(4), np.eye(6), none, centres, centres, S), config)
+    rows, columns = pairs_in_boxes(centres, windows.reach, uv)
+    level = windows.level(rows, (uv[columns] - centres[rows]).astype(np.float32))
+    offset = uv[None] - centres[:, None]
+    squared = np.einsum("mni,mij,mnj->mn", offset, np.linalg.inv(S), offset)
+    clear = np.abs(np.sqrt(squared) - 5.0) > 1e-3  # float32 at the very edge
+    inside = np.zeros_like(squared, bool)
+    inside[rows[level < 2], columns[level < 2]] = True
+    np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
+
+
+def test_larger_window_asks_for_a_better_descriptor():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    prediction = predicted(cloud, np.eye(4), offset=(8.0, 0.0))
+    # Descriptors 0.5 away: good enough for the smallest window (0.55), not for the larger one (0.4).
+    blurred = features.descriptors + 0.5 * np.roll(cloud.descriptors[ids], 1, axis=1)
+    distance = np.linalg.norm(blurred / np.linalg.norm(blurred, axis=1, keepdims=True) - cloud.descriptors[ids], axis=1)
+    blurred = blurred[(distance > 0.4) & (distance < 0.55)]
+    keep = np.flatnonzero((distance > 0.4) & (distance < 0.55))
+    assert len(keep) > 20
+    worse = _select(features, keep)
+    worse = replace(worse, descriptors=(blurred / np.linalg.norm(blurred, axis=1, keepdims=True)).astype(np.float32))
+    assert len(found(cloud, prediction, worse)) == 0
+    assert len(found(cloud, predicted(cloud, np.eye(4)), worse)) == len(keep)
+
+
+def test_no_greedy_theft():
+    """Two landmarks want one feature: it goes to the one that it fits better, wherever that stands in the list."""
+    cloud = Cloud(2)
+    cloud.points[:] = [[0, 0, 3], [0.01, 0, 3]]
+    cloud.descriptors[1] = cloud.descriptors[0] + 0.2 * cloud.descriptors[1]
+    cloud.descriptors[1] /= np.linalg.norm(cloud.descriptors[1])
+    cloud.laplacian[:] = 1
+    features, ids = cloud.features(np.eye(4), 0.0)
+    only_second = _select(features, np.flatnonzero(ids == 1))
+    matches = found(cloud, predicted(cloud, np.eye(4)), only_second)
+    assert matches.landmarks.tolist() == [1]
+
+
+def test_ambiguous_features_are_left_alone():
+    cloud = Cloud(1)
+    features, _ = cloud.features(np.eye(4), 0.0)
+    twice = _select(features, np.array([0, 0]))
+    assert len(found(cloud, predicted(cloud, np.eye(4)), twice)) == 0
+
+
+def test_laplacian_signs_must_agree():
+    cloud = Cloud()
+    features, _ = cloud.features(np.eye(4), 0.0)
+    flipped = replace(features, laplacian=(-features.laplacian).astype(np.int8))
+    assert len(found(cloud, predicted(cloud, np.eye(4)), flipped)) == 0
+
+
+def test_everywhere_needs_no_prediction():
+    cloud = Cloud()
+    features, ids = cloud.features(se3.exp(np.array([0, 0.2, 0, 0.5, 0, 0.3])), 0.0)
+    matches = match_everywhere(cloud.descriptors, cloud.laplacian, features, CONFIG)
+    assert len(matches) == len(ids)
+    np.testing.assert_array_equal(matches.landmarks, ids[matches.features])
+
+
+def test_nothing_to_match():
+    cloud = Cloud()
+    nothing = StereoFeatures.empty(0.0, 32)
+    assert len(found(cloud, predicted(cloud, np.eye(4)), nothing)) == 0
+    assert len(match_everywhere(cloud.descriptors, cloud.laplacian, nothing, CONFIG)) == 0
+    features, _ = cloud.features(np.eye(4), 0.0)
+    assert len(match_everywhere(cloud.descriptors[:0], cloud.laplacian[:0], features, CONFIG)) == 0
+
+
+def test_crowded():
+    uv = np.array([[0.0, 0], [10, 0], [20, 0]])
+    assert crowded(uv, np.array([[1.0, 1.0], [19.0, 0.0]]), 3).tolist() == [True, False, True]
+    assert not crowded(uv, np.zeros((0, 2)), 3).any()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"window_sigmas": (2.0,)},
+        {"window_sigmas": (5.0, 2.5)},
+        {"window_min": 0.0},
+        {"ratio": 1.5},
+        {"hypotheses": 0},
+        {"windows": "round"},
+        {"windows": "fixed", "window_sizes": (30.0, 10.0)},
+    ],
+)
+def test_settings_out_of_range(change):
+    with pytest.raises(ConfigurationError):
+        AssociationConfig(**change)
+
+
+def _select(features, rows):
+    names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+    return StereoFeatures(features.stamp, *(getattr(features, n)[rows] for n in names))

@@ -1,0 +1,150 @@
+"""Losing the map and finding it again: states, and what joins the map meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+import pytest
+
+from slam.config import SystemConfig
+from slam.data import FrameStatus, StereoFeatures
+from slam.geometry import se3
+from slam.mapping.selection import MapConfig
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from slam.tracking.relocalization import PoseHypotheses
+from slam.tracking.state import Tracking
+from tests.slam.scene import RIG, Cloud, path
+
+BACKENDS = ("ekf", "smoother")
+MAP = MapConfig(target_in_view=40, max_depth_error=0.3, restart_after=12)
+CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MAP)
+
+
+def run(backend, poses, change=lambda k, features: features, cloud=None, config=CONFIG):
+    cloud = cloud or Cloud(150)
+    system = StereoSlam(RIG, None, backend, config=config)
+    results, points = [], []
+    for k, T in enumerate(poses):
+        if T is None:
+            continue
+        features, ids = cloud.features(T, k / 30, 0.3)
+        changed = change(k, features)
+        results.append(system.process_features(changed))
+        points.append(ids if len(changed) else ids[:0])
+    return system, results, points
+
+
+def states(results):
+    return [(name, len(list(group))) for name, group in groupby(r.status.value for r in results)]
+
+
+def right_share(results, points):
+    """Share of associations with the point that the landmark was made of."""
+    owner, right, total = {}, 0, 0
+    for result, ids in zip(results, points):
+        right += sum(owner[i] == ids[row] for i, row in zip(result.matched.tolist(), result.matched_features))
+        total += len(result.matched)
+        owner.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
+    return right / total
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_seconds_of_blackout(backend):
+    poses = path(95)
+    dark = lambda k, f: StereoFeatures.empty(f.stamp, 32) if 20 <= k < 80 else f  # noqa: E731
+    system, results, points = run(backend, poses, dark)
+    lost = CONFIG.map.lost_after - 1
+    assert states(results)[:4] == [("started", 1), ("tracked", 19), ("predicted", lost), ("lost", 60 - lost)]
+    assert states(results)[4] == ("tracked", 15)
+    assert not any(len(r.added) for r in results[20:80])
+    assert right_share(results, points) == 1
+    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_third_of_the_frames_dropped(backend):
+    rng = np.random.default_rng(1)
+    poses = [T if k == 0 or rng.random() > 0.3 else None for k, T in enumerate(path(60))]
+    system, results, points = run(backend, poses)
+    assert states(results) == [("started", 1), ("tracked", len(results) - 1)]
+    assert right_share(results, points) == 1
+    last = next(T for T in reversed(poses) if T is not None)
+    assert np.linalg.norm(system.trajectory().positions[-1] - last[:3, 3]) < 0.012
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_third_of_the_right_images_dropped(backend):
+    rng = np.random.default_rng(2)
+    no_right = lambda k, f: replace(f, uv_right=f.uv_right * np.nan) if k and rng.random() < 0.3 else f  # noqa: E731
+    poses = path(50)
+    system, results, points = run(backend, poses, no_right)
+    assert states(results) == [("started", 1), ("tracked", 49)]
+    assert right_share(results, points) == 1
+    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_carried_off_to_a_known_place(backend):
+    """The camera jumps by half a metre and a turn within the map; it is found again, and the map does not double."""
+    jump = se3.exp(np.array([0, 0.3, 0, 0.4, 0, 0.2]))
+    poses = [*path(25), *(T @ jump for T in path(80)[25:])]
+    system, results, points = run(backend, poses)
+    tracked = [k for k, r in enumerate(results) if k > 25 and r.status is FrameStatus.TRACKED]
+    assert tracked[0] < 60
+    assert all(r.status is FrameStatus.TRACKED for r in results[tracked[0] :])
+    assert right_share(results, points) == 1
+    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.02
+    assert not any(len(r.added) for r in results[25 : tracked[0]])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
+    """The way it was carried is no motion: the back end begins anew in the map, and the path keeps every frame."""
+    jump = se3.exp(np.array([0, 0.3, 0, 0.4, 0, 0.2]))
+    poses = [*path(25), *(T @ jump for T in path(60)[25:])]
+    system, results, points = run(backend, poses)
+    needed = CONFIG.association.kidnapped_after - 1
+    assert states(results) == [("started", 1), ("tracked", 24), ("predicted", needed), ("tracked", 35 - needed)]
+    errors = np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1)
+    assert len(errors) == 60
+    assert errors[25 + needed :].max() < 0.02  # as before
+    steps = np.diff([r.estimate.T_world_left[:3, 3] for r in results[25 + needed :]], axis=0)
+    assert np.linalg.norm(steps, axis=1).max() < 0.03  # the jump has left no velocity behind
+    assert right_share(results, points) == 1
+
+
+def test_poses_that_do_not_agree_with_each_other_prove_nothing():
+    models = EstimatorModels()
+    here, there = se3.exp(np.array([0, 0, 0, 1.0, 0, 0])), se3.exp(np.array([0, 0, 0, 1.5, 0, 0]))
+    once = PoseHypotheses().after(here, 1.0, models)
+    assert [once.count, once.after(here, 1.1, models).count, once.after(there, 1.1, models).count] == [1, 2, 1]
+    assert once.after(there, 1.2, models).count == 2  # it may have moved by 0.65 m
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_carried_off_to_an_unknown_place_the_map_begins_anew(backend):
+    other = Cloud(150, seed=9)
+    cloud = Cloud(150)
+    system = StereoSlam(RIG, None, backend, config=CONFIG)
+    results = [
+        system.process_features((cloud if k < 20 else other).features(T, k / 30, 0.3)[0])
+        for k, T in enumerate(path(50))
+    ]
+    names = [name for name, _ in states(results)]
+    assert names == ["started", "tracked", "predicted", "lost", "tracked"]
+    first = next(k for k in range(20, 50) if len(results[k].added))
+    assert first == 20 + MAP.restart_after - 1
+    assert all(r.status is FrameStatus.TRACKED for r in results[first + 1 :])
+
+
+def test_what_counts_as_lost():
+    config = MapConfig(lost_after=3, restart_after=4)
+    steps = [Tracking()]
+    for vague, features in ((False, 50), (False, 50), (False, 0), (True, 50), (True, 50)):
+        steps.append(steps[-1].after(False, vague, features, config))
+    assert [s.lost for s in steps] == [False, False, False, False, True, True]
+    assert [s.may_add(config) for s in steps] == [True, False, False, False, False, True]
+    assert steps[-1].after(True, True, 50, config) == Tracking()
