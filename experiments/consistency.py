@@ -2,8 +2,8 @@
 
     python experiments/consistency.py [--quick] [--seeds N] [--frames N] [--resume] [--out DIR]
 
-Every run simulates a world's observations, gives the same to every back end (`slam.run.replay`), and starts it at a pose
-drawn from the prior about the true one. Reported, over the runs:
+Every run simulates a world's observations, gives the same to every back end (`slam.run.replay`), and starts it at a
+pose drawn from the prior about the true one. Reported, over the runs:
 
 - RMSE of the poses against the posterior Cramér-Rao bound, online (newest pose) and final (whole path);
 - average NEES of the online pose, with its 95 % chi-square band, and the frame at which it leaves the band for good;

@@ -11,19 +11,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
-
-if TYPE_CHECKING:
-    from slam.object_data import MovingObject
-
-IdArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from slam.geometry.arrays import Array
+from slam.geometry.arrays import BoolArray as BoolArray
+from slam.geometry.arrays import IdArray as IdArray
+from slam.object_data import MovingObject
 
 
 @dataclass(frozen=True)

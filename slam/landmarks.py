@@ -70,9 +70,9 @@ class LandmarkRows:
     ) -> LandmarkRows:
         """Count what one frame showed: which ids were in view, which were measured, by which features.
 
-        `descriptor_update` is the weight of the measured features' descriptors against the landmarks': 1 for the last look, 0 for
-        the first. `in_image` says which landmarks (N,) lie inside the image. Where the place of the camera (3,) is
-        given, those that are seen again after `rematch_after` frames outside of it count as first seen now, from there.
+        `descriptor_update` is the weight of the new descriptors against the landmarks' own: 1 keeps the newest, 0 the
+        first. `in_image` says which landmarks (N,) lie inside the image. Where the camera's position (3,) is given,
+        landmarks seen again after `rematch_after` frames outside the image count as first seen now, from there.
         """
         view, hit = self.rows(in_view), self.rows(measured)
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))

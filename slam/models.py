@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
+from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
 
@@ -27,10 +28,6 @@ def require_not_negative(config: object) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, (int, float)) and not (np.isfinite(number) and number >= 0):
                 raise ConfigurationError(f"{f.name} must be finite and not negative, got {value}")
-
-
-#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
-FORBID_UNKNOWN = {"extra": "forbid"}
 
 
 @dataclass(frozen=True)

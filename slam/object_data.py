@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
+from slam.geometry.arrays import Array, BoolArray, IdArray
 
 
 @dataclass(frozen=True)

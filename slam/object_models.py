@@ -8,8 +8,8 @@ import numpy as np
 
 from slam.errors import ConfigurationError
 
-#: As `slam.models.FORBID_UNKNOWN`, which imports this module.
-_FORBID_UNKNOWN = {"extra": "forbid"}
+#: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
+FORBID_UNKNOWN = {"extra": "forbid"}
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ObjectModels:
     initial_angular_velocity_sigma: float = 1.0
     points: int = 40
 
-    __pydantic_config__ = _FORBID_UNKNOWN
+    __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
         for f in fields(self):

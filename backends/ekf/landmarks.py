@@ -94,8 +94,8 @@ class Landmarks:
         anchors: (N, 3, 4), constants.
         state: coordinates (N, 3).
         points: positions (N, 3) [m] in the world, which follow from the two.
-        gauge_jacobian: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t, turned by
-            δ about the origin) where the covariance was last referred to.
+        gauge_jacobian: derivatives (N, 3, 6) of the coordinates by a displacement of the whole world (shifted by t,
+            turned by δ about the origin), at the state to which the covariance was last transported.
     """
 
     def __init__(self, coordinates: Coordinates) -> None:

@@ -88,6 +88,6 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
     robust = used is None
     counted = np.ones(len(problem.points), bool) if used is None else used
     return np.asarray(kernels.gauss_newton(
-        stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted, problem.information,
-        prior, start, _HUBER if robust else np.inf, _STEPS, _ROUGH if robust else _CONVERGED,
+        stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted,
+        problem.information, prior, start, _HUBER if robust else np.inf, _STEPS, _ROUGH if robust else _CONVERGED,
     ))  # fmt: skip

@@ -10,8 +10,8 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.sequences.base import frame_range
 from slam.worlds import WorldSequence
 from slam.worlds.sequence import ObjectPoses
 from slam.worlds.world import World

@@ -1,4 +1,4 @@
-"""How good a path is where the sequence brings truth: the figures of a run's summary. Definitions: `slam.evaluation.metrics`."""
+"""Accuracy of a path against ground truth: the figures of a run's summary, defined in `slam.evaluation.metrics`."""
 
 from __future__ import annotations
 

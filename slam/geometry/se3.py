@@ -12,13 +12,10 @@ operations on arrays of three numbers.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-#: An array of real numbers; computed in float64.
-Array = NDArray[np.floating[Any]]
+from slam.geometry.arrays import Array as Array
 
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision
 _SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken

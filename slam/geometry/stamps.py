@@ -1,4 +1,4 @@
-"""Which left image goes with which right one, and which rows of a list are in order of time."""
+"""Stamps of two lists paired, rows put in order of time, and checked ranges of frames."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slam.errors import SequenceError
 
 IntArray = NDArray[np.int64]
 
@@ -60,3 +62,16 @@ def trim(partner: IntArray) -> slice:
     """The rows between the first and the last that have a partner; empty if none has one."""
     paired = np.flatnonzero(partner >= 0)
     return slice(int(paired[0]), int(paired[-1]) + 1) if len(paired) else slice(0, 0)
+
+
+def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
+    """A checked range of frames: `stop` None or beyond the end means the end.
+
+    Raises:
+        SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
+    """
+    end = length if stop is None else min(stop, length)
+    if start < 0 or start >= length or end <= start:
+        asked = f"{start}:{'' if stop is None else stop}"
+        raise SequenceError(f"frames {asked} asked for, but the sequence has frames 0:{length}")
+    return start, end

@@ -1,4 +1,4 @@
-"""Run a sequence through the system and leave the files of `slam.run.outputs`; the algorithm itself is in `slam.system`."""
+"""Run a sequence through the system and write the files of `slam.run.outputs`; the algorithm is in `slam.system`."""
 
 from __future__ import annotations
 

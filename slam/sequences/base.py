@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from slam.data import StereoFrame
-from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
 
@@ -120,16 +120,3 @@ class RecordedSequence:
         """Decode lazily and sum up repeated faults at the end, also where the caller stops early."""
         with FaultLog(self.warnings) as faults:
             yield from self.source.read(start, stop, faults)
-
-
-def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
-    """A checked range of frames: `stop` None or beyond the end means the end.
-
-    Raises:
-        SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
-    """
-    end = length if stop is None else min(stop, length)
-    if start < 0 or start >= length or end <= start:
-        asked = f"{start}:{'' if stop is None else stop}"
-        raise SequenceError(f"frames {asked} asked for, but the sequence has frames 0:{length}")
-    return start, end

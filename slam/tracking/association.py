@@ -48,8 +48,8 @@ class AssociationConfig:
         max_jump, lost_jump: landmarks that agree on a pose further than this from the prediction, in its standard
             deviations, are not believed at once: while landmarks are recognised in every frame, and after frames in
             which none was. The prediction allows for what the motion model knows; what is further off was carried.
-        kidnapped_after: where such poses agree with each other in so many successive frames, the camera was carried off,
-            and the back end begins anew at that place in the map.
+        kidnapped_after: where such poses agree with each other in so many successive frames, the camera was kidnapped
+            (moved while it saw nothing), and a new back end starts at that place in the map.
         view_angle, view_ratio: landmarks are looked for where the line of sight has turned by no more than this since
             they were first seen [degrees], and where the distance has not changed by more than this factor: beyond,
             what is found is not the same point any more. 180 and a large factor for never mind.

@@ -14,8 +14,8 @@ from slam.errors import SequenceError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.sequences.base import frame_range
 from slam.worlds.sequence import WorldSequence
 
 #: Steps per metre of the depth images, by kind of motion: 16 bits then reach 32 m or 256 m.

@@ -13,8 +13,8 @@ from slam.data import IdArray, StereoFeatures, StereoFrame
 from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.sequences.base import frame_range
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import Appearance, ObservationModel, SimulatedFeatures, appearance, simulate

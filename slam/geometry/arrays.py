@@ -1,0 +1,13 @@
+"""Names of the array types that signatures use; shapes and units are in the docstrings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Real numbers; computed in float64.
+Array = NDArray[np.floating[Any]]
+IdArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
