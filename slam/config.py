@@ -6,9 +6,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from slam.calibration.disparity_offset import SelfCalibrationConfig
+from slam.errors import ConfigurationError
 from slam.mapping.selection import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
 from slam.objects.config import ObjectsConfig
+from slam.settings import apply_settings
 from slam.tracking.association import AssociationConfig
 
 #: Map management of a kind of motion: a car does not come back soon to what lies behind it, and comes so much nearer to
@@ -88,6 +90,22 @@ class SystemConfig:
         """The tree as plain types."""
         return asdict(self)
 
+    @classmethod
+    def from_json(cls, tree: dict[str, Any]) -> SystemConfig:
+        """The configuration of a tree of plain types, as `to_json` writes it; what is left out has its default.
+
+        Raises:
+            ConfigurationError: a key is unknown or a value of the wrong type or out of range.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        try:
+            return TypeAdapter(cls).validate_python(tree)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ConfigurationError(f"setting {where}: {first['msg']}") from None
+
     def with_settings(self, settings: list[str]) -> SystemConfig:
         """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
 
@@ -96,6 +114,6 @@ class SystemConfig:
         Raises:
             ConfigurationError: not of that form, an unknown key, a value of the wrong type or out of range.
         """
-        from slam.settings import apply_settings
-
-        return apply_settings(self, settings)
+        tree = self.to_json()
+        apply_settings(tree, settings)
+        return self.from_json(tree)

@@ -1,41 +1,31 @@
-"""``section.key=value`` settings from a command line, applied to the configuration tree and checked by pydantic."""
+"""``section.key=value`` settings, as a command line gives them, put into a tree of plain types."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
 
-def apply_settings(config: SystemConfig, settings: list[str]) -> SystemConfig:
-    """A copy of `config` with settings applied; see `SystemConfig.with_settings`."""
-    tree = config.to_json()
+def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
+    """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
+
+    Args:
+        tree: as `slam.config.SystemConfig.to_json` writes it.
+        settings: texts such as ``"map.max_landmarks=300"``; values are JSON or plain words.
+
+    Raises:
+        ConfigurationError: a text is not of that form, or its section or key is unknown.
+    """
     for setting in settings:
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
         _set(tree, path.strip().split("."), _value(text.strip()), setting)
-    return from_json(tree)
-
-
-def from_json(tree: dict[str, Any]) -> SystemConfig:
-    """The configuration of a tree of plain types, as `SystemConfig.to_json` writes it.
-
-    Raises:
-        ConfigurationError: a key is unknown or a value of the wrong type or out of range.
-    """
-    try:
-        return TypeAdapter(SystemConfig).validate_python(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigurationError(f"setting {where}: {first['msg']}") from None
 
 
 def _value(text: str) -> Any:

@@ -6,7 +6,6 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
-from slam.settings import from_json
 
 
 def test_settings_reach_their_place():
@@ -28,7 +27,7 @@ def test_settings_reach_their_place():
 @pytest.mark.parametrize("kind", ["driving", "handheld"])
 def test_json_and_back(kind):
     config = SystemConfig.for_kind(kind).with_settings(["backend.iterations=3"])
-    assert from_json(json.loads(json.dumps(config.to_json()))) == config
+    assert SystemConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
 @pytest.mark.parametrize(
@@ -58,7 +57,7 @@ def test_a_first_pose_comes_through():
     pose = "[[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
     config = SystemConfig.for_kind("handheld").with_settings([f"models.T_world_left={pose}"])
     assert config.models.initial_pose[0, 3] == 2
-    assert from_json(json.loads(json.dumps(config.to_json()))) == config
+    assert SystemConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
 def test_unknown_kind():
@@ -70,4 +69,4 @@ def test_unknown_key_in_a_file():
     tree = SystemConfig().to_json()
     tree["map"]["colour"] = 1
     with pytest.raises(ConfigurationError, match=r"map\.colour"):
-        from_json(tree)
+        SystemConfig.from_json(tree)
