@@ -1,3 +1,5 @@
-"""Moving objects: found without being told, measured with covariance."""
+"""Moving objects: found without being told, measured with covariance.
 
-from __future__ import annotations
+`detector` is the step: it follows features, classifies them as still or moving, and keeps the bodies that they make up.
+`procedure1` is paper B's own method. May import `slam.tracking`, `slam.geometry`, `slam.runtime` and the data.
+"""

@@ -1,6 +1,7 @@
 """Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, and the synthetic worlds.
 
-`open_sequence` finds the format out by itself. Layouts, options and faults are described in ``docs/sequences.md``.
+`open_sequence` finds the format out by itself. Layouts, options and faults are described in
+``docs/sequences.md``. May import `slam.worlds`, `slam.geometry` and the data.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ With pytest, one test a check::
 
 or all at once: ``check_backend(MyBackend)``. The factory is called as ``factory(rig, models=EstimatorModels(...))``.
 Nothing here needs pytest. Tolerances are some ten times what a good estimator reaches on the scene: they find what is
-broken, not what is mediocre.
+broken, not what is mediocre. May import everything but `slam.run`, `slam.compare` and `slam.commands`.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 >>> from slam.worlds import open_world
 >>> sequence = open_world("aisle?frames=200&seed=3")
 >>> features = sequence.observations(0)  # no image is made
+
+May import `slam.geometry` and the data.
 """
 
 from __future__ import annotations

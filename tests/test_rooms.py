@@ -1,0 +1,98 @@
+"""Imports between the rooms of `slam` run one way, and nowhere in a circle."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+SLAM = ROOT / "slam"
+
+#: What a room may import, besides itself. Modules at the root of `slam` are two rooms: "data" and "system".
+MAY_IMPORT = {
+    "runtime": set(),
+    "geometry": {"runtime", "data"},
+    "data": {"geometry"},
+    "tracking": {"data", "geometry", "runtime"},
+    "calibration": {"data", "geometry", "runtime"},
+    "mapping": {"tracking", "data", "geometry"},
+    "objects": {"tracking", "data", "geometry", "runtime"},
+    "worlds": {"data", "geometry"},
+    "sequences": {"worlds", "data", "geometry"},
+    "evaluation": {"data", "geometry"},
+    "system": {"objects", "mapping", "tracking", "calibration", "data", "geometry"},
+    "run": {"system", "objects", "mapping", "tracking", "sequences", "worlds", "evaluation", "data", "geometry"},
+    "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
+    "testing": {"system", "worlds", "data", "geometry"},
+    "commands": {"compare", "run", "system", "sequences", "worlds", "data", "geometry"},
+}
+
+#: The root's modules that make up the room "system"; all others belong to "data", what everybody needs.
+SYSTEM = {"system", "config", "__init__"}
+
+
+def room_of(module: str) -> str:
+    """The room of a module such as ``slam.geometry.se3``."""
+    name = module.split(".")[1] if "." in module else "__init__"
+    if (SLAM / name).is_dir():
+        return name
+    return "commands" if name == "__main__" else "system" if name in SYSTEM else "data"
+
+
+def modules() -> dict[str, Path]:
+    """All modules of `slam` by dotted name."""
+    found = {}
+    for file in sorted(SLAM.rglob("*.py")):
+        name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        found[name.removesuffix(".__init__")] = file
+    return found
+
+
+def imports(known: dict[str, Path]) -> dict[str, set[str]]:
+    """For every module of `slam` the modules of `slam` that it imports, also inside functions and for types."""
+    found: dict[str, set[str]] = {}
+    for name, file in known.items():
+        found[name] = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found[name] |= {alias.name for alias in node.names if alias.name in known}
+            elif isinstance(node, ast.ImportFrom) and node.module in known:
+                whole = {f"{node.module}.{alias.name}" for alias in node.names}
+                inside = whole & set(known)
+                found[name] |= inside if len(inside) == len(whole) else {node.module, *inside}
+    return found
+
+
+def test_no_room_imports_from_a_wrong_one():
+    wrong = [
+        f"{name} ({room_of(name)}) imports {target} ({room_of(target)})"
+        for name, targets in imports(modules()).items()
+        for target in sorted(targets)
+        if room_of(target) not in {room_of(name), *MAY_IMPORT[room_of(name)]}
+        and name != "slam"  # its public names are loaded from everywhere when they are asked for
+        and target not in {"slam", "slam.errors"}
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_circle_of_imports():
+    graph = imports(modules())
+    graph.pop("slam")  # as above
+    done: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, " -> ".join([*path[path.index(name) :], name])
+        if name not in done and name in graph:
+            for target in sorted(graph[name] - {name}):
+                visit(target, (*path, name))
+            done.add(name)
+
+    for name in sorted(graph):
+        visit(name, ())
+
+
+def test_every_room_says_what_it_is_for():
+    for room in MAY_IMPORT:
+        if (SLAM / room).is_dir():
+            lines = ast.get_docstring(ast.parse((SLAM / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+            assert len(lines.splitlines()) >= 2 and "import" in lines.lower(), f"slam/{room}/__init__.py"
