@@ -15,6 +15,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from slam.data import FrameResult
+from slam.evaluation.consistency import verdict
 
 _console = Console()
 
@@ -87,6 +88,10 @@ def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:
     for label, values in _summary_rows(summaries):
         table.add_row(escape(label), *values)
     _console.print(table)
+    for summary in summaries:
+        words = verdict(summary.get("consistency", {}))
+        if words:
+            _console.print(f"{summary['backend']}: {words}")
     _console.print(f"Files: {out}")
 
 
@@ -104,6 +109,12 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
             if key == "poses with truth" or (wanted and key not in wanted):
                 continue
             rows.append((f"{when} {key}", [_figure(s["accuracy"][when].get(key)) for s in summaries]))
+    if any(s.get("accuracy", {}).get("poses left out") for s in summaries):
+        rows.append(("poses not measured, left out", [str(s["accuracy"]["poses left out"]) for s in summaries]))
+    for key in ("NEES over 10 m", "NEES over 100 m", "scale error [%]", "scale sigma [%]"):
+        if any(key in s.get("consistency", {}) for s in summaries):
+            name = f"{key} (6 is right)" if key.startswith("NEES") else key
+            rows.append((name, [_figure(s.get("consistency", {}).get(key)) for s in summaries]))
     rows.append(("median per frame [ms]", [_figure(s.get("milliseconds", {}).get("median_total")) for s in summaries]))
     rows.append(("frames per second", [_figure(s.get("frames_per_second")) for s in summaries]))
     return rows

@@ -7,18 +7,16 @@ from typing import Protocol
 import numpy as np
 
 from slam.errors import TrajectoryError
+from slam.evaluation.consistency import consistency_figures
 from slam.evaluation.metrics import (
     absolute_errors,
     associate,
-    chi_square_band,
-    nees,
     plane_errors,
-    pose_residuals,
     relative_errors,
     segment_errors,
 )
 from slam.geometry.se3 import Array, inverse, rotation_angle
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 
@@ -83,26 +81,16 @@ def _against_truth(own: Trajectory, true: Trajectory) -> dict[str, float]:
 
 
 def consistency(estimate: Trajectory, covariances: Array, sequence: WithTruth) -> dict[str, float]:
-    """How honest the pose covariances are: mean NEES over the path and its 95 % band; empty without truth.
-
-    The estimate's world is the first left camera, so the truth is taken relative to its first pose. One run's errors
-    are correlated over time: its mean may leave the band, which holds for independent ones, without a fault. The first
-    pose, which defines the world, is left out.
+    """How honest the pose covariances are, see `slam.evaluation.consistency`; empty without truth for the first pose.
 
     Args:
         estimate: the online path.
         covariances: of its poses (N, 6, 6).
-        sequence: with ground truth or without.
+        sequence: with ground truth or without; its `truth_noise`, where it has one, is that of the truth.
     """
     pairs = _common(estimate, sequence.ground_truth)
     if pairs is None or pairs[0].stamps[0] != estimate.stamps[0]:
         return {}
-    own, true = pairs
-    rows = np.searchsorted(estimate.stamps, own.stamps)
-    relative = own.poses[0] @ inverse(true.poses[0]) @ true.poses
-    try:
-        values = nees(pose_residuals(own.poses, relative)[1:], covariances[rows][1:])
-    except TrajectoryError:  # a covariance that is none: the figure is not a number, and is shown as such
-        values = np.array([np.nan])
-    low, high = chi_square_band(6, len(values))
-    return {"mean NEES": float(np.mean(values)), "band low": low, "band high": high, "dof": 6.0}
+    rows = np.searchsorted(estimate.stamps, pairs[0].stamps)
+    noise = getattr(sequence, "truth_noise", TruthNoise())
+    return consistency_figures(*pairs, covariances[rows], noise)

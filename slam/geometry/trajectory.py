@@ -50,6 +50,10 @@ class Trajectory:
         """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    def select(self, rows: np.ndarray) -> Trajectory:
+        """The poses of these rows (a mask or indices)."""
+        return Trajectory(self.stamps[rows], self.poses[rows])
+
     @classmethod
     def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
         """Paths that follow each other in time, as one."""
@@ -131,3 +135,16 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
     if not np.isfinite(rows[:, :columns]).all():
         raise TrajectoryError(f"{path}: a value is not finite")
     return rows
+
+
+@dataclass(frozen=True)
+class TruthNoise:
+    """Standard deviations of a sequence's true poses: of each rotation axis [rad] and of each coordinate [m]."""
+
+    rotation: float = 0.0
+    translation: float = 0.0
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6) of one true pose, [rotation, translation], in its own axes."""
+        return np.diag(np.repeat(np.square([self.rotation, self.translation]), 3))

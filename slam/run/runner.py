@@ -14,7 +14,7 @@ import numpy as np
 
 from slam import registry
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, StereoFrame
+from slam.data import Estimate, FrameResult, FrameStatus, StereoFrame
 from slam.errors import SlamError
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
@@ -30,6 +30,9 @@ from slam.sequences import Sequence
 from slam.system import StereoSlam
 
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
+
+#: Frames whose pose was measured; accuracy is that of these alone.
+_MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 #: Is shown each step: its images, what came of it, and the system after it.
 Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
@@ -71,6 +74,7 @@ class RunRecord:
     poses: list[Array] = field(default_factory=list)
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
+    measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     rejected: int = 0
     used: int = 0
@@ -87,6 +91,7 @@ class RunRecord:
         self.stamps.append(result.estimate.stamp)
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
+        self.measured.append(result.status in _MEASURED)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
         if result.report.dof:
@@ -281,13 +286,15 @@ def _finish(
         summary["path_length_m"] = record.trajectory.length
         summary["landmarks"] = 0 if system.landmarks is None else len(system.landmarks)
         summary["observations"] = {"used": record.used, "rejected": record.rejected}
+        measured = np.array(record.measured)
         summary["accuracy"] = {
-            "online": evaluate(record.trajectory, sequence),
-            "final": evaluate(final, sequence),
+            "online": evaluate(record.trajectory.select(measured), sequence),
+            "final": evaluate(final.select(np.isin(final.stamps, record.trajectory.stamps[measured])), sequence),
+            "poses left out": int((~measured).sum()),
         }
         summary["consistency"] = {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(record.trajectory, np.array(record.covariances), sequence),
+            **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
         }
         if isinstance(system, StereoSlam):
             summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}

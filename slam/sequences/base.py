@@ -10,7 +10,7 @@ from slam.data import StereoFrame
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.faults import FaultLog
 
 
@@ -89,6 +89,7 @@ class RecordedSequence:
         source: where the images come from.
         gps: a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only;
             None where there is none. It is no pose and in no camera's axes: compare positions after alignment.
+        truth_noise: how well the ground truth is known.
     """
 
     name: str
@@ -99,6 +100,7 @@ class RecordedSequence:
     ground_truth: Trajectory | None = None
     gps: Array | None = None
     warnings: list[str] = field(default_factory=list)
+    truth_noise: TruthNoise = field(default_factory=TruthNoise)
 
     @property
     def stamps(self) -> Array:

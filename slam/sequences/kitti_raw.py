@@ -19,7 +19,7 @@ from slam.sequences.calibration import (
     rig_from_projections,
 )
 from slam.sequences.faults import FaultLog
-from slam.sequences.kitti import RATE, choose_pair
+from slam.sequences.kitti import OXTS_NOISE, RATE, choose_pair, read_poses
 from slam.sequences.oxts import read_oxts
 from slam.sequences.source import ImagePairs, Listing, Size, numbered, pair_listings, stamped
 from slam.sequences.tables import date_time, read_rows, shorten
@@ -56,7 +56,7 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         truth = _ground_truth(folder, day, origin, T_left_reference, left, stamps, faults)
     source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
     kind = options.get("kind", "driving")
-    return RecordedSequence(folder.name, "kitti-raw", kind, rig, source, truth, gps, warnings)
+    return RecordedSequence(folder.name, "kitti-raw", kind, rig, source, truth, gps, warnings, OXTS_NOISE)
 
 
 def _day(folder: Path) -> Path:
@@ -129,9 +129,14 @@ def _ground_truth(
     stamps: Array,
     faults: FaultLog,
 ) -> Trajectory | None:
-    """The left camera's path by the drive's OXTS records; the world is the left camera's first frame there."""
+    """The left camera's path by the drive's OXTS records; the world is the left camera's first frame there.
+
+    Without them ``poses_cam0_oxts.txt`` serves: poses of camera 0, rows of 12 as in KITTI odometry, one a frame.
+    """
     if not (folder / "oxts").is_dir():
-        return None
+        path = folder / "poses_cam0_oxts.txt"
+        known = path.is_file() and left.folder.parent.name == "image_00"
+        return read_poses(path, left, stamps, np.eye(4), faults) if known else None
     try:
         T_left_imu = T_left_camera0 @ _extrinsics(day / "calib_velo_to_cam.txt")
         T_left_imu = T_left_imu @ _extrinsics(day / "calib_imu_to_velo.txt")

@@ -1,0 +1,74 @@
+"""NEES of relative poses and of scale, against simulated odometry whose covariances are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.evaluation.consistency import consistency_figures, stretch_nees, verdict
+from slam.geometry.se3 import adjoint, exp, inverse
+from slam.geometry.trajectory import Trajectory, TruthNoise
+
+STEP = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 1.0])  # a turn of 0.02 rad and 1 m forward
+SIGMA = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.02])
+NONE = TruthNoise()
+
+
+def odometry(seed: int, frames: int = 60, noise: TruthNoise = NONE, claimed: float = 1.0):
+    """Estimated and true path, and the covariances that the estimate claims."""
+    rng = np.random.default_rng(seed)
+    true, own, P = [np.eye(4)], [np.eye(4)], [1e-12 * np.eye(6)]
+    for _ in range(frames - 1):
+        A = adjoint(inverse(exp(STEP)))
+        true.append(true[-1] @ exp(STEP))
+        own.append(own[-1] @ exp(STEP) @ exp(SIGMA * rng.normal(size=6)))
+        P.append(A @ P[-1] @ A.T + claimed**2 * np.diag(SIGMA**2))
+    scale = np.repeat([noise.rotation, noise.translation], 3)
+    seen = np.array([T @ exp(scale * rng.normal(size=6)) for T in true])
+    stamps = np.arange(frames) * 0.1
+    return Trajectory(stamps, np.array(own)), Trajectory(stamps, seen), np.array(P)
+
+
+def mean_over_seeds(noise: TruthNoise = NONE, claimed: float = 1.0) -> dict[str, float]:
+    runs = [consistency_figures(*odometry(seed, noise=noise, claimed=claimed), noise) for seed in range(40)]
+    return {key: float(np.mean([run[key] for run in runs])) for key in runs[0]}
+
+
+def test_relative_nees_of_honest_odometry_is_six():
+    figures = mean_over_seeds()
+    for key in ("mean NEES", "NEES over 1 m", "NEES over 10 m"):
+        assert 5.0 < figures[key] < 7.0, key
+    assert "NEES over 100 m" not in figures
+
+
+def test_noise_of_the_truth_is_counted_once_and_at_both_ends():
+    noise = TruthNoise(rotation=2e-3, translation=0.03)
+    figures = mean_over_seeds(noise)
+    for key in ("mean NEES", "NEES over 10 m"):
+        assert 5.0 < figures[key] < 7.0, key
+    ignored = [consistency_figures(*odometry(seed, noise=noise), NONE)["NEES over 10 m"] for seed in range(20)]
+    assert np.mean(ignored) > 10
+
+
+def test_covariances_that_are_too_small_are_said_to_be():
+    figures = mean_over_seeds(claimed=0.2)
+    assert figures["NEES over 10 m"] > 60
+    assert "too small" in verdict(figures)
+    assert "hold" in verdict(mean_over_seeds())
+    assert "too large" in verdict(mean_over_seeds(claimed=5.0))
+    assert verdict({}) == ""
+
+
+def test_scale_error_and_its_sigma():
+    own, true, P = odometry(0)
+    longer = Trajectory(own.stamps, own.poses.copy())
+    longer.poses[:, :3, 3] = true.poses[:, :3, 3] * 1.02
+    figures = consistency_figures(longer, true, P, NONE)
+    assert abs(figures["scale error [%]"] - 2.0) < 0.01
+    assert 0.05 < figures["scale sigma [%]"] < 1.0
+
+
+def test_stretches_without_a_usable_covariance_are_left_out():
+    own, true, P = odometry(0)
+    P[30] = 1e-9 * np.eye(6)  # as after a loop: smaller than before it
+    first = np.arange(20, 30)
+    assert len(stretch_nees(own, true, P, NONE, first, np.full(10, 30))) == 0
