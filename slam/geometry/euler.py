@@ -23,19 +23,6 @@ def rotation(phi: Array) -> Array:
     )
 
 
-def rotation_derivatives(phi: Array) -> Array:
-    """``∂R/∂φ``, (3, 3, 3): entry [i] is the derivative of `rotation` by angle i."""
-    sx, sy, sz = np.sin(phi)
-    cx, cy, cz = np.cos(phi)
-    Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    Ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1.0]])
-    dRx = np.array([[0, 0, 0], [0, -sx, -cx], [0, cx, -sx]])
-    dRy = np.array([[-sy, 0, cy], [0, 0, 0], [-cy, 0, -sy]])
-    dRz = np.array([[-sz, -cz, 0], [cz, -sz, 0], [0, 0, 0.0]])
-    return np.stack([Rz @ Ry @ dRx, Rz @ dRy @ Rx, dRz @ Ry @ Rx])
-
-
 def angles(R: Array) -> Array:
     """Angles (3,) [rad] of a rotation matrix, φy in [−π/2, π/2] (paper B, step d, the printed atan2 formulas).
 

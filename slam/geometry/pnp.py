@@ -149,11 +149,6 @@ def _median(values: Array) -> float:
     return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
 
 
-def refine_pose(rig: StereoRig, points: Array, measured: Array, T_left_world: Array, steps: int = _STEPS) -> Array:
-    """Least-squares pose T_left_world (4, 4) on reprojection errors, by Gauss-Newton; NaN entries are ignored."""
-    return _refined(rig, points, measured, np.arange(len(points))[None], T_left_world[None], steps)[0]
-
-
 def _refined(
     rig: StereoRig, points: Array, measured: Array, rows: NDArray[np.intp], T_left_world: Array, steps: int
 ) -> Array:

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam import euler, se3
-from tests.slam.numeric import jacobian
+from slam.geometry import euler, se3
 
 angles = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1)).map(np.array)
 
@@ -20,12 +19,6 @@ def test_rotation_is_rz_ry_rx(phi):
 @given(angles)
 def test_angles_invert_rotation(phi):
     np.testing.assert_allclose(euler.angles(euler.rotation(phi)), phi, atol=1e-9)
-
-
-@given(angles)
-def test_derivatives_against_finite_differences(phi):
-    numeric = jacobian(euler.rotation, phi).T.reshape(3, 3, 3)
-    np.testing.assert_allclose(euler.rotation_derivatives(phi), numeric, atol=1e-8)
 
 
 @given(angles)
