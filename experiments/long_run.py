@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import os
 import sys
 import time
@@ -302,14 +303,12 @@ def draw(path: Path, runs: dict[str, list[Checkpoint]]) -> None:
 
 
 def setting(text: str) -> tuple[str, object]:
-    """``key=value`` with a whole number, a number or a text."""
+    """``key=value``; the value is JSON (``true``, ``50``) or a plain word, as with ``slam run --set``."""
     key, _, value = text.partition("=")
-    for kind in (int, float):
-        try:
-            return key, kind(value)
-        except ValueError:
-            pass
-    return key, value
+    try:
+        return key, json.loads(value)
+    except json.JSONDecodeError:
+        return key, value
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import backends
-from experiments.long_run import RIG, Corridor, Loop, has_cholesky, measured, run, table
+from experiments.long_run import RIG, Corridor, Loop, has_cholesky, measured, run, setting, table
 from slam.data import Observations
 
 
@@ -29,6 +29,12 @@ def test_rounds_past_the_same_landmarks(name):
     last = list(run(name, 220, 110, Loop(count=150, speed=3.0)))
     assert last[1].landmarks <= 150 and last[1].landmarks - last[0].landmarks < 10
     assert last[1].failed == 0 and last[1].error < 0.2  # of 66 m
+
+
+def test_options_are_given_as_to_the_command():
+    assert setting("lag=100") == ("lag", 100)
+    assert setting("consistent=false") == ("consistent", False)
+    assert setting("landmarks=euclidean") == ("landmarks", "euclidean")
 
 
 def test_what_has_no_cholesky_factor():
