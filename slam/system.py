@@ -134,7 +134,8 @@ class StereoSlam:
         clock.lap("predict")
         measured, features = features, self.calibration.correct(features)
         prediction, found = self._localize(prediction, landmarks, features)
-        found = found.without(self.objects.suspects)
+        held = self.objects.suspects
+        found = found.without(held)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
         report = self.backend.update(observations_of(features, found), found.T_world_left)
@@ -145,7 +146,7 @@ class StereoSlam:
         judged = self.objects.classify(features, estimate, _landmark_ids(features, found))
         objects = self.objects.update(self.backend, features)
         clock.lap("objects")
-        step = Step(self._index, features, estimate, found, report, judged, self._tracking)
+        step = Step(self._index, features, estimate, found, report, judged, self._tracking, held)
         landmarks, added, erased = self._keeper.keep(self.backend, landmarks, step)
         self.landmarks = landmarks
         status, reason = self._status(report, len(added))

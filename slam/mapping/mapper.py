@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class Step:
         report: of the update.
         judged: which features move.
         tracking: whether the pose is known.
+        held: ids of the landmarks that were not to be measured, because they may move.
     """
 
     index: int
@@ -50,6 +51,7 @@ class Step:
     report: UpdateReport
     judged: MotionLabels
     tracking: Tracking
+    held: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class Mapper:
@@ -113,7 +115,9 @@ class Mapper:
             expected = landmarks.ids[shown]
         ids, rows = found.ids[measured], found.rows[measured]
         place = view.T_world_left[:3, 3], view.in_image, self.config.association.rematch_after
-        return landmarks.after_frame(step.index, expected, ids, step.features, rows, m.descriptor_update, *place)
+        return landmarks.after_frame(
+            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.held
+        )
 
     def _add(
         self, backend: Backend, landmarks: LandmarkRows, step: Step, known: BoolArray
