@@ -41,14 +41,14 @@ class MovingObjectDetector:
     Args:
         rig: the cameras.
         config: settings.
-        models: pixel noise and motion model of the estimators.
+        models: pixel noise of the estimators, and how they assume that bodies move.
     """
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
         self.rig = rig
         self.config = config
         self.sigma = models.pixel_sigma
-        self.acceleration = models.motion.acceleration
+        self.models = models.objects
         self.bodies: dict[int, Body] = {}
         self.tracks: Tracks | None = None
         self._stamps = np.full(config.window, np.nan)
@@ -113,7 +113,7 @@ class MovingObjectDetector:
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
-                self.bodies[body.id] = advanced(body, dt, self.slot, self.acceleration)
+                self.bodies[body.id] = advanced(body, dt, self.slot, self.models)
 
     def _forget(self, id: int) -> None:
         assert self.tracks is not None
