@@ -86,8 +86,9 @@ class MovingObjectDetector:
 
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
-        if self.tracks is None:
-            self.tracks = Tracks.empty(features.descriptors.shape[1], self.config.window)
+        dimensions = features.descriptors.shape[1]
+        if self.tracks is None or self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
+            self.tracks = Tracks.empty(dimensions, self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
         return self._times(features)
@@ -284,6 +285,10 @@ class MovingObjectDetector:
         observations = [self._observations(body, features) for body in told]
         fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= 3]
         estimates = backend.update_objects(fit_to_start)
+        strangers = [e.id for e in estimates if e.id not in self.bodies]  # of before `restart`
+        if strangers:
+            backend.remove_objects(strangers)
+            estimates = [e for e in estimates if e.id in self.bodies]
         self._estimated = {e.id for e in estimates}
         reported = []
         for estimate in estimates:
