@@ -45,7 +45,10 @@ def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, aft
     if not np.isfinite(stamp):
         raise MeasurementError(f"features: the stamp must be finite, got {stamp}")
     if stamp <= after:
-        raise MeasurementError(f"features: the stamp {stamp} s is not later than that of the frame before, {after} s")
+        raise MeasurementError(
+            f"features: the stamp {stamp} s is not later than {after} s, the last frame's (a frame whose step was "
+            "interrupted counts too): go on with a later one"
+        )
     threshold = _number("threshold", features.threshold)
     columns: dict[str, Any] = {name: _column(name, getattr(features, name)) for name in _COLUMNS}
     _require_rows(columns)
