@@ -263,8 +263,7 @@ class StereoSlam:
         self._search = MapSearch(known_map, self.rig, self._localizer, self.config.models.initial_pose)
         self._search.fill(self.backend)
         self.landmarks = known_map.rows
-        dimensions = known_map.dimensions if len(known_map) else None
-        self._done = _Done(dimensions=dimensions, mapped=len(known_map) > 0)
+        self._done = _Done(mapped=len(known_map) > 0)
         self.world_frame = known_map.world_frame
 
     def _located(self, search: MapSearch, features: StereoFeatures) -> bool:
