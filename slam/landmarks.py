@@ -25,6 +25,8 @@ class LandmarkRows:
         last_seen: frame index (N,).
         seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
         out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
+        unseen: number of frames since it was last measured (N,), of those in which any landmark was measured and this
+            one was not held back.
     """
 
     ids: IdArray
@@ -36,10 +38,12 @@ class LandmarkRows:
     last_seen: IdArray
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
     out_of_view: IdArray = field(default=None)  # type: ignore[arg-type]
+    unseen: IdArray = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
-        if self.out_of_view is None:
-            object.__setattr__(self, "out_of_view", np.zeros(len(self.ids), np.int64))
+        for name in ("out_of_view", "unseen"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(len(self.ids), np.int64))
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((len(self.ids), 3), np.nan))
 
@@ -67,14 +71,18 @@ class LandmarkRows:
         camera: Array | None = None,
         in_image: BoolArray | None = None,
         rematch_after: int = 0,
+        held: IdArray | None = None,
     ) -> LandmarkRows:
         """Count what one frame showed: which ids were in view, which were measured, by which features.
 
         `descriptor_update` is the weight of the new descriptors against the landmarks' own: 1 keeps the newest, 0 the
         first. `in_image` says which landmarks (N,) lie inside the image. Where the camera's position (3,) is given,
         landmarks seen again after `rematch_after` frames outside the image count as first seen now, from there.
+        A frame counts as neither missed nor seen for the landmarks `held`, which were not to be measured.
         """
+        back = np.zeros(len(self), bool) if held is None else np.isin(self.ids, held)
         view, hit = self.rows(in_view), self.rows(measured)
+        view = view[~back[view]]
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
         views[view] += 1
         missed[view] += 1
@@ -91,9 +99,10 @@ class LandmarkRows:
             seen_from[hit[again]] = camera
             descriptors[hit[again]] = features.descriptors[feature_rows[again]]
         out_of_view = self.out_of_view + (0 if in_image is None else ~in_image)
-        out_of_view[hit] = 0
+        unseen = self.unseen + (~back if len(hit) else 0)
+        out_of_view[hit] = unseen[hit] = 0
         return LandmarkRows(
-            self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, out_of_view
+            self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, out_of_view, unseen
         )
 
     def long_out_of_view(self, after: int) -> BoolArray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 
@@ -31,12 +32,40 @@ from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.map_search import MapSearch, models_at
 from slam.mapping.mapper import Mapper, Step, observations_of
 from slam.objects.modes import ObjectDetector, detector_for
+from slam.tracking.feature_check import usable
 from slam.tracking.localizer import LandmarkMatches, Localizer, jump, median_deviation
 from slam.tracking.relocalization import PoseHypotheses, transfer_landmarks
 from slam.tracking.state import Tracking
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
 _COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
+
+
+class _Part(Enum):
+    """The part of a step that is in work; it tells what an exception has left undone."""
+
+    NONE = 0  #: between steps
+    PREDICTION = 1
+    MEASUREMENT = 2
+    OBJECTS = 3
+    MAP = 4
+
+
+@dataclass(frozen=True)
+class _Done:
+    """What completed steps leave for the next one, besides the map.
+
+    Attributes:
+        index: of the last one.
+        tracking: how recognition has gone.
+        dimensions: length of the descriptors; None before the first feature.
+        mapped: whether there ever was a landmark.
+    """
+
+    index: int = -1
+    tracking: Tracking = field(default_factory=Tracking)
+    dimensions: int | None = None
+    mapped: bool = False
 
 
 class StereoSlam:
@@ -87,12 +116,14 @@ class StereoSlam:
             if isinstance(backend, str)
             else backend
         )
-        self.landmarks: LandmarkRows | None = None
+        self.landmarks: LandmarkRows | None = None  # of the last step that was completed
         self.calibration = SelfCalibration(rig, c.self_calibration)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self._localizer = Localizer(rig, c.association, c.models.pixel_sigma)
-        self._index = -1
-        self._tracking = Tracking()
+        self._done = _Done()
+        self._part = _Part.NONE
+        self._stamp = -np.inf  # that the back end was last advanced to [s]
+        self._shifted = 0.0  # by how much the back end has moved its right pixels [px]
         self.frontend_name = frontend if isinstance(frontend, str) else ""
         self.world_frame = FIRST_FRAME
         self._keeper = Mapper(rig, c, self._localizer, self.backend)
@@ -118,40 +149,48 @@ class StereoSlam:
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 
-        A frame with nothing to see is no error: the state is predicted and the status says so.
+        A frame with nothing to see is no error: the state is predicted and the status says so. A step that an exception
+        ends, an interrupt for instance, did not happen, but for the back end's belief, which stands at its stamp: the
+        next step goes on with a later frame; see `settle`.
 
         Raises:
-            MeasurementError: time does not increase.
+            MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
         """
         clock = _Clock()
+        features = usable(features, self.rig, self._done.dimensions, self._stamp)
+        self.settle()
+        index = self._done.index + 1
         if self._search is not None and not self._located(self._search, features):
-            self._index += 1
-            return self._search.lost(self._index, features)
+            self._done = replace(self._done, index=index)
+            return self._search.lost(index, features)
+        self._part = _Part.PREDICTION
         shift = self._revise()
         prediction = self.backend.predict(features.stamp)
-        self._index += 1
+        self._stamp, self._part = features.stamp, _Part.MEASUREMENT
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         clock.lap("predict")
         measured, features = features, self.calibration.correct(features)
         prediction, found = self._localize(prediction, landmarks, features)
-        found = found.without(self.objects.suspects)
+        held = self.objects.suspects
+        found = found.without(held)
         self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
         clock.lap("associate")
         report = self.backend.update(observations_of(features, found), found.T_world_left)
         clock.lap("update")
-        self._tracking = self._tracked(prediction, features, found, report)
+        tracking = self._tracked(prediction, features, found, report)
         estimate = self.backend.estimate(landmarks=False)
         clock.lap("estimate")
+        self._part = _Part.OBJECTS
         judged = self.objects.classify(features, estimate, _landmark_ids(features, found))
         objects = self.objects.update(self.backend, features)
+        self._part = _Part.MAP
         clock.lap("objects")
-        step = Step(self._index, features, estimate, found, report, judged, self._tracking)
+        step = Step(index, features, estimate, found, report, judged, tracking, held)
         landmarks, added, erased = self._keeper.keep(self.backend, landmarks, step)
-        self.landmarks = landmarks
-        status, reason = self._status(report, len(added))
+        status, reason = self._status(tracking, report, len(added))
         clock.lap("manage")
-        return FrameResult(
-            index=self._index,
+        result = FrameResult(
+            index=index,
             status=status,
             reason=reason,
             estimate=estimate,
@@ -169,6 +208,23 @@ class StereoSlam:
             objects=objects,
             shift=shift,
         )
+        dimensions = features.descriptors.shape[1] if len(features) else self._done.dimensions
+        done = _Done(index, tracking, dimensions, self._done.mapped or len(added) > 0)
+        self._done, self.landmarks, self._part = done, landmarks, _Part.NONE  # all of it, or nothing
+        return result
+
+    def settle(self) -> None:
+        """After a step that an exception ended: take back what it did to the map, in the back end as well.
+
+        Landmarks that it added are removed, and those that it had removed leave the map. The belief about the camera
+        stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step and
+        `estimate` do this by themselves; without such an exception there is nothing to do.
+        """
+        if self._part is _Part.OBJECTS:
+            self.objects.restart()
+        if self._part not in (_Part.NONE, _Part.PREDICTION):
+            self.landmarks = self._keeper.reconcile(self.backend, self.landmarks)
+        self._part = _Part.NONE
 
     def _revise(self) -> float:
         """Take what has become known of the disparity's error into use, for what was given to the back end as well.
@@ -178,9 +234,11 @@ class StereoSlam:
         if not isinstance(self.backend, RevisingBackend):
             self.calibration.apply()
             return 0.0
-        shift = self.calibration.apply(_COUNTS)
+        self.calibration.apply(_COUNTS)
+        shift = self.calibration.applied - self._shifted
         if shift:
             self.backend.shift_right(shift)
+            self._shifted = self.calibration.applied
         return shift
 
     @property
@@ -194,6 +252,7 @@ class StereoSlam:
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
+        self.settle()
         return self.backend.estimate() if self._search is None else self._search.estimate(float("nan"))
 
     def _search_in(self, known_map: SavedMap, backend: str | Backend) -> None:
@@ -204,17 +263,18 @@ class StereoSlam:
         self._search = MapSearch(known_map, self.rig, self._localizer, self.config.models.initial_pose)
         self._search.fill(self.backend)
         self.landmarks = known_map.rows
+        self._done = _Done(mapped=len(known_map) > 0)
         self.world_frame = known_map.world_frame
 
     def _located(self, search: MapSearch, features: StereoFeatures) -> bool:
         """Look for the camera in the known map; where it is found, the back end begins there, with the map."""
-        T = search.locate(features, self._index + 1)
+        T = search.locate(features, self._done.index + 1)
         if T is None:
             return False
-        self.backend = self._new_backend(T)
-        search.fill(self.backend)
+        new = self._new_backend(T)
+        search.fill(new)
         self._keeper.next_id = int(search.known.ids.max(initial=-1)) + 1
-        self._search = None
+        self.backend, self._shifted, self._search = new, self.calibration.applied, None
         return True
 
     def _new_backend(self, T_world_left: Array) -> Backend:
@@ -228,8 +288,8 @@ class StereoSlam:
     ) -> tuple[Prediction, LandmarkMatches]:
         """Landmarks in this frame (paper A, III and IV); a new prediction where the camera was carried off."""
         positions = self.backend.positions(landmarks.ids)
-        doubtful = self._tracking.unmatched > 0
-        found = self._localizer.localize(prediction, landmarks, positions, features, self._index, doubtful)
+        doubtful = self._done.tracking.unmatched > 0
+        found = self._localizer.localize(prediction, landmarks, positions, features, self._done.index + 1, doubtful)
         T, a = found.T_world_left, self.config.association
         if T is None or jump(prediction, T) <= (a.lost_jump if doubtful else a.max_jump):
             self._carried = PoseHypotheses()
@@ -238,16 +298,18 @@ class StereoSlam:
         if self._carried.count < a.kidnapped_after or not self._can_restart:
             return prediction, LandmarkMatches.nothing()
         prediction = self._restart(T, features.stamp)
-        return prediction, self._localizer.localize(prediction, landmarks, positions, features, self._index)
+        return prediction, self._localizer.localize(prediction, landmarks, positions, features, self._done.index + 1)
 
     def _restart(self, T_world_left: Array, stamp: float) -> Prediction:
         """A new back end in the same map: a motion that a carried camera did not make would spoil the old one's."""
         new = self._new_backend(T_world_left)
-        self._past.append(transfer_landmarks(self.backend, new))
-        self.backend, self._carried = new, PoseHypotheses()
-        self.restarted.append(self._index)
+        past, begun = [*self._past, transfer_landmarks(self.backend, new)], [*self.restarted, self._done.index + 1]
+        prediction, shifted, carried = new.predict(stamp), self.calibration.applied, PoseHypotheses()
+        self._part = _Part.OBJECTS
+        self.backend, self._past, self.restarted, self._shifted, self._carried = new, past, begun, shifted, carried
         self.objects.restart()
-        return self.backend.predict(stamp)
+        self._part = _Part.MEASUREMENT
+        return prediction
 
     def _tracked(
         self, prediction: Prediction, features: StereoFeatures, found: LandmarkMatches, report: UpdateReport
@@ -257,20 +319,20 @@ class StereoSlam:
         Where the back end uses only the smaller part of the landmarks that agree with each other, it does not agree.
         """
         c = self.config
-        least = c.association.minimum_consistent if self._tracking.lost else _MINIMUM_TRACKED
+        least = c.association.minimum_consistent if self._done.tracking.lost else _MINIMUM_TRACKED
         vague = median_deviation(prediction) > c.association.tight_window
         recognised = len(report.used) >= least and 2 * len(report.used) >= len(found)
-        return self._tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
+        return self._done.tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
 
-    def _status(self, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
+    def _status(self, tracking: Tracking, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
         if report.status is UpdateStatus.FAILED:
             return FrameStatus.FAILED, report.reason
-        if not self._tracking.unmatched:
+        if not tracking.unmatched:
             return FrameStatus.TRACKED, ""
-        if self._keeper.next_id == added:
+        if not self._done.mapped:
             return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
         reason = report.reason or f"only {len(report.used)} landmarks recognised"
-        return (FrameStatus.LOST if self._tracking.lost else FrameStatus.PREDICTED), reason
+        return (FrameStatus.LOST if tracking.lost else FrameStatus.PREDICTED), reason
 
 
 def _landmark_ids(features: StereoFeatures, found: LandmarkMatches) -> IdArray:

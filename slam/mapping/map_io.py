@@ -127,7 +127,7 @@ class SavedMap:
             raise SlamError("there is no map yet: no frame was processed")
         from slam import __version__
 
-        marks, estimate = system.landmarks, system.estimate()
+        estimate, marks = system.estimate(), system.landmarks
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, marks.descriptors.astype(np.float32),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class Step:
         report: of the update.
         judged: which features move.
         tracking: whether the pose is known.
+        held: ids of the landmarks that were not to be measured, because they may move.
     """
 
     index: int
@@ -50,6 +51,7 @@ class Step:
     report: UpdateReport
     judged: MotionLabels
     tracking: Tracking
+    held: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class Mapper:
@@ -74,7 +76,7 @@ class Mapper:
         if config.map.monocular:
             if not isinstance(backend, MapBackend):
                 raise ConfigurationError("map.monocular: this back end cannot place landmarks")
-            self._monocular = MonocularDepth(rig, config.models.pixel_sigma, config.map.max_depth_error)
+            self._monocular = self._new_monocular()
 
     def keep(
         self, backend: Backend, landmarks: LandmarkRows, step: Step
@@ -95,6 +97,28 @@ class Mapper:
         landmarks, surplus = _without(backend, landmarks, surplus_landmarks(landmarks, self.config.map))
         return landmarks, added, np.concatenate([erased, surplus])
 
+    def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
+        """Let rows and back end agree after a step that was interrupted; what only one of both has leaves it.
+
+        Args:
+            backend: as the step left it; it was predicted.
+            landmarks: the rows before the step.
+
+        Returns:
+            the rows that stay.
+        """
+        if self._monocular is not None:
+            self._monocular = self._new_monocular()
+        known = backend.estimate().ids
+        kept = np.zeros(0, np.int64) if landmarks is None else landmarks.ids
+        strangers = np.setdiff1d(known, kept)
+        if len(strangers):
+            backend.remove(strangers)
+        return None if landmarks is None else landmarks.select(np.isin(kept, known))
+
+    def _new_monocular(self) -> MonocularDepth:
+        return MonocularDepth(self.rig, self.config.models.pixel_sigma, self.config.map.max_depth_error)
+
     def _view(self, backend: Backend, landmarks: LandmarkRows, step: Step) -> MapView:
         """The map as the camera sees it."""
         positions = backend.positions(landmarks.ids)
@@ -113,7 +137,9 @@ class Mapper:
             expected = landmarks.ids[shown]
         ids, rows = found.ids[measured], found.rows[measured]
         place = view.T_world_left[:3, 3], view.in_image, self.config.association.rematch_after
-        return landmarks.after_frame(step.index, expected, ids, step.features, rows, m.descriptor_update, *place)
+        return landmarks.after_frame(
+            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.held
+        )
 
     def _add(
         self, backend: Backend, landmarks: LandmarkRows, step: Step, known: BoolArray

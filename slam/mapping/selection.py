@@ -92,27 +92,22 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     lost = landmarks.missed >= config.erase_missed
     judged = landmarks.in_view > config.erase_missed
     rare = judged & (landmarks.seen < config.erase_share * landmarks.in_view)
-    unconfirmed = (landmarks.seen < config.confirmed) & (_frames_since(landmarks) > config.erase_missed)
+    unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
+    unconfirmed &= landmarks.last_seen >= 0  # what an earlier run kept stays until this one has seen it
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
     forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
     return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
-def _frames_since(landmarks: LandmarkRows) -> NDArray[np.intp]:
-    """For how many frames each landmark (N,) was not measured; frames in which nothing was do not count."""
-    times = np.unique(landmarks.last_seen)
-    return len(times) - 1 - np.searchsorted(times, landmarks.last_seen)
-
-
 def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) at `positions` (N, 3) the map can do without, now that they are out of view; see `spacing`.
 
-    Those are compared that have just gone out of view, with each other and with all that did before.
+    Those are compared that have just gone out of view, with each other and with all that did before; those that an
+    earlier run kept and this one has not seen yet have not gone out of view.
     """
     out = np.zeros(len(landmarks), bool)
-    later = _frames_since(landmarks)
-    gone = np.flatnonzero((later > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
-    just = gone[later[gone] <= 2 * config.erase_missed]
+    gone = np.flatnonzero((landmarks.unseen > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
+    just = gone[(landmarks.unseen[gone] <= 2 * config.erase_missed) & (landmarks.last_seen[gone] >= 0)]
     if not len(just) or not config.spacing:
         return out
     reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, so3_log
 from slam.object_data import ObjectEstimate
+from slam.object_models import ObjectModels
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
@@ -107,12 +108,16 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
     )  # fmt: skip
 
 
-def advanced(body: Body, dt: float, slot: int, acceleration: float) -> Body:
-    """The body moved on evenly to the next frame, not measured yet."""
+def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
+    """The body moved on evenly over `dt` [s] to the next frame, not measured yet.
+
+    Impulses on its velocities, of the variances that the motion model gives, add `dt` times themselves to the pose.
+    """
     T = body.T.copy()
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
-    covariance = body.covariance + (acceleration * dt) ** 2 * dt * np.eye(6)
+    linear, angular = models.velocity_variance(dt)
+    covariance = body.covariance + dt**2 * np.diag([angular] * 3 + [linear] * 3)
     return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1)
 
 

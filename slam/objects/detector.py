@@ -41,14 +41,14 @@ class MovingObjectDetector:
     Args:
         rig: the cameras.
         config: settings.
-        models: pixel noise and motion model of the estimators.
+        models: pixel noise of the estimators, and how they assume that bodies move.
     """
 
     def __init__(self, rig: StereoRig, config: ObjectsConfig, models: EstimatorModels) -> None:
         self.rig = rig
         self.config = config
         self.sigma = models.pixel_sigma
-        self.acceleration = models.motion.acceleration
+        self.models = models.objects
         self.bodies: dict[int, Body] = {}
         self.tracks: Tracks | None = None
         self._stamps = np.full(config.window, np.nan)
@@ -86,8 +86,9 @@ class MovingObjectDetector:
 
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
-        if self.tracks is None:
-            self.tracks = Tracks.empty(features.descriptors.shape[1], self.config.window)
+        dimensions = features.descriptors.shape[1]
+        if self.tracks is None or self.tracks.descriptors.shape[1] != dimensions:  # of frames without features
+            self.tracks = Tracks.empty(dimensions, self.config.window)
         self._frame += 1
         self._stamps[self.slot] = features.stamp
         return self._times(features)
@@ -113,7 +114,7 @@ class MovingObjectDetector:
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
-                self.bodies[body.id] = advanced(body, dt, self.slot, self.acceleration)
+                self.bodies[body.id] = advanced(body, dt, self.slot, self.models)
 
     def _forget(self, id: int) -> None:
         assert self.tracks is not None
@@ -284,6 +285,10 @@ class MovingObjectDetector:
         observations = [self._observations(body, features) for body in told]
         fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= 3]
         estimates = backend.update_objects(fit_to_start)
+        strangers = [e.id for e in estimates if e.id not in self.bodies]  # of before `restart`
+        if strangers:
+            backend.remove_objects(strangers)
+            estimates = [e for e in estimates if e.id in self.bodies]
         self._estimated = {e.id for e in estimates}
         reported = []
         for estimate in estimates:

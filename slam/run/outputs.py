@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
@@ -44,20 +46,18 @@ class RunFiles:
         folder: made if it does not exist; files of an earlier run in it are overwritten.
 
     Raises:
-        SlamError: the folder cannot be made or written.
+        SlamError: the folder or a file in it cannot be made or written; so do all methods.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        try:
+        with self._writing():
             folder.mkdir(parents=True, exist_ok=True)
             for stale in ("trajectory_final.txt", "landmarks.csv", "summary.json"):
                 (folder / stale).unlink(missing_ok=True)
             self._trajectory = self._open("trajectory.txt")
             self._frames = self._open("frames.csv")
             self._objects = self._open("objects.csv")
-        except OSError as error:
-            raise SlamError(f"cannot write to {folder}: {error.strerror or error}") from error
         self._frame_rows = csv.writer(self._frames, lineterminator="\n")
         self._frame_rows.writerow(FRAME_COLUMNS)
         self._object_rows = csv.writer(self._objects, lineterminator="\n")
@@ -70,14 +70,27 @@ class RunFiles:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for file in (self._trajectory, self._frames, self._objects):
-            file.close()
+        with self._writing(), ExitStack() as stack:
+            for file in (self._trajectory, self._frames, self._objects):
+                stack.callback(file.close)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """A fault of the disk as one line."""
+        try:
+            yield
+        except OSError as error:
+            raise SlamError(f"cannot write to {self.folder}: {error.strerror or error}") from error
 
     def _open(self, name: str) -> TextIO:
         return (self.folder / name).open("w", encoding="utf-8", newline="")
 
     def write_frame(self, number: int, result: FrameResult) -> None:
         """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv."""
+        with self._writing():
+            self._write_frame(number, result)
+
+    def _write_frame(self, number: int, result: FrameResult) -> None:
         e, r = result.estimate, result.report
         if result.located:
             self._trajectory.write(tum_line(e.stamp, e.T_world_left))
@@ -98,8 +111,9 @@ class RunFiles:
         self, trajectory: Trajectory, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]
     ) -> None:
         """Write trajectory_final.txt and landmarks.csv; `numbers` are the frames' numbers by step."""
-        trajectory.write_tum(self.folder / "trajectory_final.txt")
-        with self._open("landmarks.csv") as file:
+        with self._writing():
+            trajectory.write_tum(self.folder / "trajectory_final.txt")
+        with self._writing(), self._open("landmarks.csv") as file:
             rows = csv.writer(file, lineterminator="\n")
             rows.writerow(LANDMARK_COLUMNS)
             if landmarks is None:
@@ -114,7 +128,8 @@ class RunFiles:
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all."""
-        write_json(self.folder / name, tree)
+        with self._writing():
+            write_json(self.folder / name, tree)
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:

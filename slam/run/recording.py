@@ -63,6 +63,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         temporary.replace(path)
     except OSError as error:
+        temporary.unlink(missing_ok=True)
         raise SequenceError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 

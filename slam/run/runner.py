@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -114,7 +115,8 @@ def run(
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
     The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
-    summary says how it ended, and the exception goes on.
+    summary says how it ended, recording and map are written, and the exception goes on. Where a file cannot be written
+    the others are; of several errors the first one is raised.
 
     Args:
         sequence: what to run.
@@ -171,13 +173,17 @@ def _drive(
     record: RunRecord,
     on_frame: Callable[[FrameResult], None] | None,
 ) -> dict[str, Any]:
-    """Write what each frame gives, and in the end the rest, however it ends; returns the summary."""
+    """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
+
+    Raises:
+        The first error, after all that can be written has been.
+    """
     tape: list[RecordedFrame] = []
     score = score_for(sequence)
-    ended = "completed"
-    with RunFiles(options.out) as files:
+    first, summary = _FirstError(), dict[str, Any]()
+    with first.kept(), RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
-        try:
+        with first.kept(BaseException):
             for number, result in results:
                 record.add(number, result)
                 files.write_frame(number, result)
@@ -187,16 +193,43 @@ def _drive(
                     tape.append(RecordedFrame.of(result, number))
                 if on_frame is not None:
                     on_frame(result)
-        except BaseException as error:
-            ended = f"stopped: {error or type(error).__name__}"
-            raise
-        finally:
-            summary = _finish(sequence, options, system, record, files, ended, score)
+        summary = _summary(sequence, options, record, first.ended)
+        with first.kept():
+            summary |= _figures(sequence, system, record, score)
+        with first.kept():
+            files.write_json("summary.json", summary)
+        with first.kept():
+            if record.stamps:
+                files.write_final(system.trajectory(), system.estimate(), system.landmarks, record.numbers)
+        with first.kept():
             if options.record is not None:
                 save_recording(_recording(sequence, options, system, tape), options.record)
+        with first.kept():
             if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
                 save_map(options.save_map, system)
+    if first.error is not None:
+        raise first.error
     return summary
+
+
+@dataclass
+class _FirstError:
+    """The first error of several pieces of work, each of which is to be done whatever became of the others."""
+
+    error: BaseException | None = None
+
+    @contextmanager
+    def kept(self, kind: type[BaseException] = Exception) -> Iterator[None]:
+        """Keep an error of this kind in place of raising it; an interrupt while the last files are written goes on."""
+        try:
+            yield
+        except kind as error:
+            self.error = self.error or error
+
+    @property
+    def ended(self) -> str:
+        """How the frames ended, for the summary."""
+        return "completed" if self.error is None else f"stopped: {self.error or type(self.error).__name__}"
 
 
 def _recording(
@@ -260,17 +293,9 @@ def _timed(frames: Iterator[StereoFrame]) -> Iterator[tuple[StereoFrame, float]]
         yield frame, 1e3 * (time.perf_counter() - start)
 
 
-def _finish(
-    sequence: Sequence | Recording,
-    options: RunOptions,
-    system: StereoSlam | _Replayed,
-    record: RunRecord,
-    files: RunFiles,
-    ended: str,
-    score: ObjectScore | None,
-) -> dict[str, Any]:
-    """Write the last files and return the summary."""
-    summary: dict[str, Any] = {
+def _summary(sequence: Sequence | Recording, options: RunOptions, record: RunRecord, ended: str) -> dict[str, Any]:
+    """What was run and how it ended, for ``summary.json``."""
+    return {
         "sequence": sequence.name,
         "format": sequence.format,
         "frontend": options.frontend,
@@ -279,34 +304,40 @@ def _finish(
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
         "warnings": list(sequence.warnings),
+        "seed": getattr(sequence, "values", {}).get("seed", 0),  # a world's; nothing else is random
+        "configuration": options.config.to_json(),
+        "versions": versions(),
     }
-    if record.stamps:
-        final = system.trajectory()
-        files.write_final(final, system.estimate(), system.landmarks, record.numbers)
-        summary["path_length_m"] = record.trajectory.length
-        summary["landmarks"] = 0 if system.landmarks is None else len(system.landmarks)
-        summary["observations"] = {"used": record.used, "rejected": record.rejected}
-        measured = np.array(record.measured)
-        summary["accuracy"] = {
+
+
+def _figures(
+    sequence: Sequence | Recording, system: StereoSlam | _Replayed, record: RunRecord, score: ObjectScore | None
+) -> dict[str, Any]:
+    """How well the run went, for ``summary.json``; nothing where no frame has a pose."""
+    if not record.stamps:
+        return {}
+    final, measured = system.trajectory(), np.array(record.measured)
+    figures: dict[str, Any] = {
+        "path_length_m": record.trajectory.length,
+        "landmarks": 0 if system.landmarks is None else len(system.landmarks),
+        "observations": {"used": record.used, "rejected": record.rejected},
+        "accuracy": {
             "online": evaluate(record.trajectory.select(measured), sequence),
             "final": evaluate(final.select(np.isin(final.stamps, record.trajectory.stamps[measured])), sequence),
             "poses left out": int((~measured).sum()),
-        }
-        summary["consistency"] = {
+        },
+        "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
             **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
-        }
-        if isinstance(system, StereoSlam):
-            summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
-        if score is not None:
-            summary["objects"] = score.summary()
-        summary["milliseconds"] = _timings(record)
-        summary["frames_per_second"] = _rate(record)
-    summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
-    summary["configuration"] = options.config.to_json()
-    summary["versions"] = versions()
-    files.write_json("summary.json", summary)
-    return summary
+        },
+        "milliseconds": _timings(record),
+        "frames_per_second": _rate(record),
+    }
+    if isinstance(system, StereoSlam):
+        figures["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+    if score is not None:
+        figures["objects"] = score.summary()
+    return figures
 
 
 def _rate(record: RunRecord) -> float | None:

@@ -11,6 +11,7 @@ from slam.errors import ConfigurationError, MeasurementError, UnknownNameError
 from slam.geometry import se3
 from slam.mapping.selection import MapConfig
 from slam.models import EstimatorModels
+from slam.objects.modes import NoDetector
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
@@ -146,3 +147,21 @@ def test_a_long_blackout_keeps_the_map(backend):
     assert after.map_size >= before.map_size
     assert np.isin(after.matched, before.matched).mean() > 0.5  # recognised, not made anew
     assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.012
+
+
+def test_landmarks_held_in_suspicion_stay_and_are_not_counted():
+    cloud = Cloud(150)
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG)
+    held = np.zeros(0, np.int64)
+    for k, T in enumerate(path(20)):
+        if k == 5:
+            system.objects = NoDetector()
+            held = system.objects.suspects = system.landmarks.ids[:6].copy()
+            before = system.landmarks.select(np.arange(6))
+        result = system.process_features(cloud.features(T, k / 30, 0.3)[0])
+        if k >= 5:
+            assert not np.isin(held, result.matched).any()
+    after = system.landmarks.select(np.isin(system.landmarks.ids, held))
+    np.testing.assert_array_equal(after.ids, held)
+    for name in ("seen", "in_view", "missed", "unseen", "last_seen"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)

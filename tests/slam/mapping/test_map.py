@@ -85,11 +85,38 @@ def test_erase_what_is_missed_or_seldom_seen():
 
 
 def test_what_was_hardly_ever_seen_does_not_stay():
-    times = [80, 80, *range(81, 88)]
-    rows = rows_with(seen=[5, 6, *[5] * 7], in_view=[6] * 9, missed=[0] * 9, last_seen=times)
+    unseen = [7, 7, *range(6, -1, -1)]
+    rows = rows_with(seen=[5, 6, *[5] * 7], in_view=[6] * 9, missed=[0] * 9, unseen=unseen)
     assert bad_landmarks(rows, MapConfig(confirmed=6)).tolist() == [True, False, True, *[False] * 6]
-    dark = rows_with(seen=[5, 9], in_view=[6, 9], missed=[0, 0], last_seen=[80, 200])
-    assert not bad_landmarks(dark, MapConfig(confirmed=6)).any()
+
+
+def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
+    """Landmark 0 is out of view while 80 others are tracked; frames in which nothing is measured do not count."""
+    none, others = np.zeros(0, np.int64), np.arange(1, 81)
+    rows = rows_with(seen=np.full(81, 5))
+    features = features_at(np.zeros((80, 2)))
+    for frame in range(1, 7):
+        assert not bad_landmarks(rows, MapConfig(confirmed=6)).any()
+        rows = rows.after_frame(2 * frame, others, others, features, np.arange(80))
+        rows = rows.after_frame(2 * frame + 1, none, none, features_at(np.zeros((0, 2))), none.astype(np.intp))
+    assert rows.unseen.tolist() == [6] + [0] * 80
+    assert np.flatnonzero(bad_landmarks(rows, MapConfig(confirmed=6))).tolist() == [0]
+    earlier = LandmarkRows(**{**vars(rows), "last_seen": rows.last_seen - (np.arange(81) == 0)})
+    assert not bad_landmarks(earlier, MapConfig(confirmed=6)).any()  # kept by an earlier run, not seen in this one
+
+
+def test_what_is_held_back_is_neither_missed_nor_seen():
+    rows = rows_with(seen=[5, 5, 5], in_view=[5, 5, 5], missed=[4, 4, 4], unseen=[4, 4, 4])
+    after = rows.after_frame(
+        9, np.array([0, 1, 2]), np.array([2]), features_at([(1, 1)]), np.array([0]), held=np.array([0])
+    )
+    assert [getattr(after, name).tolist() for name in ("seen", "in_view", "missed", "unseen")] == [
+        [5, 5, 6],
+        [5, 6, 6],
+        [4, 5, 0],
+        [4, 5, 0],
+    ]
+    assert bad_landmarks(after, MapConfig(confirmed=0)).tolist() == [False, True, False]
 
 
 def test_what_is_not_seen_is_forgotten_only_where_wanted():
@@ -134,17 +161,17 @@ def test_out_of_view_the_map_is_thinned_to_the_best_seen():
     """Landmarks two metres off, 10 cm apart, the last one 1 m from the others; the first three are out of view."""
     config = MapConfig(spacing=0.1, erase_missed=2)
     positions = np.array([[0, 0, 2], [0.1, 0, 2], [0.2, 0, 2], [0.3, 0, 2], [0.4, 0, 2], [1.4, 0, 2.0]])
-    rows = rows_with(seen=[3, 9, 4, 1, 1, 1], last_seen=[4, 5, 6, 7, 8, 9], seen_from=np.zeros((6, 3)))
+    rows = rows_with(seen=[3, 9, 4, 1, 1, 1], unseen=[5, 4, 3, 2, 1, 0], seen_from=np.zeros((6, 3)))
     assert crowded_landmarks(rows, positions, config).tolist() == [True, False, True, False, False, False]
     assert not crowded_landmarks(rows, positions, MapConfig(spacing=0.0, erase_missed=2)).any()
     apart = positions * [3, 1, 1]  # further apart than a tenth of the distance
     assert not crowded_landmarks(rows, apart, config).any()
-    unknown = rows_with(seen=rows.seen, last_seen=rows.last_seen)
+    unknown = rows_with(seen=rows.seen, unseen=rows.unseen)
     assert not crowded_landmarks(unknown, positions, config).any()
 
 
 def test_of_equally_well_seen_ones_the_older_stays():
-    rows = rows_with(seen=[5, 5, 5, 5], last_seen=[1, 1, 2, 3], seen_from=np.zeros((4, 3)))
+    rows = rows_with(seen=[5, 5, 5, 5], unseen=[2, 2, 1, 0], seen_from=np.zeros((4, 3)))
     positions = np.array([[0, 0, 2], [0.05, 0, 2], [1, 0, 2], [2, 0, 2.0]])
     assert crowded_landmarks(rows, positions, MapConfig(erase_missed=1)).tolist() == [False, True, False, False]
 

@@ -8,17 +8,21 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from slam.config import SystemConfig
 from slam.data import StereoFrame
-from slam.errors import SequenceError, SlamError
+from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
+from slam.mapping.map_io import load_map
 from slam.run.figures import RunData
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
+from slam.run.recording import load_recording
+from slam.run.replay import RecordedFrame
 from slam.run.runner import RunOptions, parse_frames, run
 from slam.sequences import open_sequence
 
@@ -108,6 +112,44 @@ def test_a_fault_before_the_first_frame(tmp_path):
     with pytest.raises(SequenceError):
         run(Broken(0), options(tmp_path))
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 0
+
+
+def test_what_can_still_be_written_is_written_and_the_first_error_is_raised(tmp_path):
+    """A folder stands where the recording is to go: it cannot be written, map and files can."""
+    (tmp_path / "taken").mkdir()
+    wanted = {"record": tmp_path / "taken", "save_map": tmp_path / "map"}
+    for sequence, words in ((open_sequence(WORLD), "taken"), (Broken(5), "disk gone")):
+        with pytest.raises(SlamError, match=words):
+            run(sequence, options(tmp_path / "out", **wanted))
+        assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+        assert len(load_map(tmp_path / "map")) > 10
+        (tmp_path / "map").unlink()
+    assert {p.name for p in tmp_path.iterdir()} == {"taken", "out"}
+
+
+def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_path, monkeypatch):
+    def of(result, number):
+        if number == 4:
+            raise MeasurementError("frame 4 is not finite")
+        return RecordedFrame.of(result, number)
+
+    monkeypatch.setattr("slam.run.runner.RecordedFrame", SimpleNamespace(of=of))
+    monkeypatch.setattr("slam.run.runner.save_map", lambda *_: 1 / 0)
+    with pytest.raises(MeasurementError, match="frame 4"):
+        run(open_sequence(WORLD), options(tmp_path, record=tmp_path / "tape.npz", save_map=tmp_path / "map"))
+    assert {p.name for p in tmp_path.iterdir()} == FILES | {"tape.npz"}
+    assert len(load_recording(tmp_path / "tape.npz")) == 4
+    assert "frame 4" in json.loads((tmp_path / "summary.json").read_text())["ended"]
+
+
+def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("slam.run.outputs.tum_line", full)
+    with pytest.raises(SlamError, match=r"cannot write to .*: No space left"):
+        run(open_sequence(WORLD), options(tmp_path))
+    assert "No space left" in json.loads((tmp_path / "summary.json").read_text())["ended"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

@@ -1,0 +1,34 @@
+"""How the detector predicts a body: by the bodies' own motion model, not by the camera's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slam.data import Estimate, StereoFeatures
+from slam.models import EstimatorModels, MotionModel
+from slam.object_models import ObjectModels
+from slam.objects.bodies import new_body
+from slam.objects.config import ObjectsConfig
+from slam.objects.detector import MovingObjectDetector
+from tests.slam.scene import RIG
+
+HERE = Estimate(0.0, np.eye(4), np.eye(6), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NONE = np.zeros(0, np.int64)
+
+
+def test_a_body_is_predicted_by_its_own_motion_model() -> None:
+    models = EstimatorModels(
+        motion=MotionModel(acceleration=50.0, angular_acceleration=70.0),
+        objects=ObjectModels(acceleration=2.0, angular_acceleration=0.5),
+    )
+    detector, dt = MovingObjectDetector(RIG, ObjectsConfig(), models), 0.1
+    detector.classify(StereoFeatures.empty(0.0), HERE, NONE)
+    times = np.zeros(detector.config.window)
+    body = new_body(1, np.array([0, 0, 3.0]), np.array([0, 0.2, 0, 1.0, 0, 0]), times, 0.0, 0.1)
+    detector.bodies[1] = body
+    detector.classify(StereoFeatures.empty(dt), replace(HERE, stamp=dt), NONE)
+    grown = np.diag(detector.bodies[1].covariance - body.covariance)
+    np.testing.assert_allclose(grown, dt**3 * np.array([0.5] * 3 + [2.0] * 3) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(detector.bodies[1].T[:3, 3], [dt, 0, 3.0])

@@ -1,0 +1,180 @@
+"""A step that an interrupt ends at any line did not happen: map and back end agree, and the next frames are tracked."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import slam
+from slam.config import SystemConfig
+from slam.data import FrameStatus
+from slam.errors import MeasurementError
+from slam.mapping.map_io import SavedMap
+from slam.mapping.selection import MapConfig
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from tests.slam.scene import RIG, Cloud, path
+
+BACKENDS = ("ekf", "smoother")
+CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
+HERE = str(Path(slam.__file__).parent)
+ESTIMATORS = str(Path(slam.__file__).parents[1] / "backends")
+
+
+class Lines:
+    """Counts the lines of the system that are run, and raises in the n-th; what a back end runs does not count.
+
+    Each call of a back end either happens or does not: that is its own affair, and has tests of its own.
+    """
+
+    def __init__(self, stop: int | None = None) -> None:
+        self.count = 0
+        self.stop = stop
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        before = sys.gettrace()
+        sys.settrace(self._called)
+        try:
+            yield
+        finally:
+            sys.settrace(before)
+
+    def _called(self, frame: FrameType, event: str, argument: Any) -> Any:
+        if not frame.f_code.co_filename.startswith(HERE):
+            return None
+        above: FrameType | None = frame
+        while above is not None:
+            if above.f_code.co_filename.startswith(ESTIMATORS):
+                return None
+            above = above.f_back
+        return self._line
+
+    def _line(self, frame: FrameType, event: str, argument: Any) -> Any:
+        if event == "line":
+            self.count += 1
+            if self.count == self.stop:
+                raise KeyboardInterrupt
+        return self._line
+
+
+def interrupted(system: StereoSlam, features: Any, line: int) -> bool:
+    """Whether the step was interrupted before it ended."""
+    try:
+        with Lines(line).watched():
+            system.process_features(features)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def assert_agree(system: StereoSlam) -> None:
+    estimate = system.estimate()
+    np.testing.assert_array_equal(np.sort(estimate.ids), system.landmarks.ids)
+    np.testing.assert_array_equal(system.backend.positions(system.landmarks.ids).shape, (len(estimate.ids), 3))
+
+
+def interrupt_often(system: StereoSlam, frames: Iterator[Any], points: int) -> None:
+    """Every third frame is interrupted, each time later in the step; the two frames after it must be tracked."""
+    counter = Lines()
+    with counter.watched():
+        system.process_features(next(frames))
+    hits, index = 0, system.process_features(next(frames)).index
+    for k in range(points):
+        hits += interrupted(system, next(frames), 1 + k * counter.count // points)
+        if k % 4 == 0:
+            assert_agree(system)
+        results = [system.process_features(next(frames)) for _ in range(2)]
+        assert [r.status for r in results] == [FrameStatus.TRACKED] * 2, k
+        index = index + 2 if results[-1].index == index + 2 else index + 3  # the last lines may not be reached
+        assert results[-1].index == index
+        assert results[-1].map_size == len(system.landmarks)
+    assert hits > 0.6 * points
+    assert_agree(system)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_interrupted_at_any_line_the_next_frames_are_tracked(backend):
+    cloud, points = Cloud(150), 24
+    system, truth = StereoSlam(RIG, None, backend, config=CONFIG), path(3 * points + 12)
+    frames = (cloud.features(T, k / 30, 0.3)[0] for k, T in enumerate(truth))
+    for _ in range(8):
+        system.process_features(next(frames))
+    interrupt_often(system, frames, points)
+    trajectory = system.trajectory()
+    true = np.array([truth[round(30 * s)][:3, 3] for s in trajectory.stamps])
+    assert np.linalg.norm(trajectory.positions - true, axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_interrupted_where_a_body_moves(backend):
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    system = StereoSlam(sequence.rig, None, backend)
+    frames = (sequence.observations(k) for k in range(58, 300))
+    while not system.process_features(next(frames)).objects:
+        pass
+    assert interrupted(system, next(frames), 100)
+    assert system.process_features(next(frames)).objects  # interrupted elsewhere, the detector goes on
+    interrupt_often(system, frames, 10)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_first_step_may_be_interrupted(backend):
+    cloud, counter = Cloud(150), Lines()
+    with counter.watched():
+        StereoSlam(RIG, None, backend, config=CONFIG).process_features(cloud.features(np.eye(4), 0.0)[0])
+    hits = 0
+    for line in range(1, counter.count, max(1, counter.count // 12)):
+        system = StereoSlam(RIG, None, backend, config=CONFIG)
+        if not interrupted(system, cloud.features(np.eye(4), 0.0)[0], line):
+            break  # some lines are run once in a process
+        hits += 1
+        results = [system.process_features(cloud.features(T, (1 + k) / 30)[0]) for k, T in enumerate(path(3))]
+        assert [r.status.value for r in results] == ["started", "tracked", "tracked"]
+        assert_agree(system)
+    assert hits > 5
+
+
+class Failing:
+    """A back end whose `add` does its work and then fails, once."""
+
+    def __init__(self, backend: Any) -> None:
+        self._backend, self.fail = backend, False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def add(self, observations: Any) -> None:
+        self._backend.add(observations)
+        if self.fail:
+            self.fail = False
+            raise RuntimeError("no more memory")
+
+
+def test_the_same_frame_again_is_refused_in_plain_words_and_the_map_is_whole():
+    cloud = Cloud(150)
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG)
+    system.backend = Failing(system.backend)
+    for k, T in enumerate(path(10)):
+        system.process_features(cloud.features(T, k / 30, 0.3)[0])
+    before, system.backend.fail = system.landmarks, True
+    fresh = Cloud(150, seed=1).features(np.eye(4), 1.0)[0]  # another place: nothing is known, much is new
+    for k in range(40):
+        try:
+            system.process_features(replace(fresh, stamp=1.0 + k / 30))
+        except RuntimeError:
+            break
+    assert not system.backend.fail  # it was reached
+    with pytest.raises(MeasurementError, match="not later"):
+        system.process_features(replace(fresh, stamp=1.0 + k / 30))
+    assert len(SavedMap.of(system)) == len(system.landmarks) == len(before)
+    system.process_features(replace(fresh, stamp=1.1 + k / 30))
+    assert_agree(system)
