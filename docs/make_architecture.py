@@ -12,6 +12,7 @@ import ast
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -60,13 +61,21 @@ def imports(root: Path) -> Counter[Edge]:
 def imported(file: Path, root: Path) -> Iterable[str]:
     """Full names of everything that a module imports."""
     package = file.relative_to(root).parts[:-1]
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for up, name in import_statements(file.read_text(encoding="utf-8")):
+        yield ".".join([*package[: len(package) - up + 1], name]) if up else name
+
+
+@cache
+def import_statements(text: str) -> tuple[tuple[int, str], ...]:
+    """Imported names in the text of a module, each with the number of leading dots of a relative import."""
+    found: list[tuple[int, str]] = []
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [(0, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = [*package[: len(package) - node.level + 1]] if node.level else []
-            start = ".".join([*base, *([node.module] if node.module else [])])
-            yield from (f"{start}.{alias.name}" for alias in node.names)
+            start = f"{node.module}." if node.module else ""
+            found += [(node.level, f"{start}{alias.name}") for alias in node.names]
+    return tuple(found)
 
 
 def room_of(name: str, known: Iterable[str]) -> str | None:
