@@ -91,7 +91,7 @@ def duty(files: Sequence[Path], room: str) -> str:
     """First line of the docstring of a room's ``__init__``."""
     init = next((f for f in files if f.name == "__init__.py" and f.parent.name == room), None)
     text = ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))) if init is not None else None
-    return text.splitlines()[0] if text else "–"
+    return text.splitlines()[0].replace("|", "\\|") if text else "–"
 
 
 # --- Layers ----------------------------------------------------------------------------------------------------------
@@ -303,8 +303,8 @@ def core_modules(root: Path) -> dict[str, list[str]]:
     return groups
 
 
-def legend(y: float, circle: bool) -> list[str]:
-    """What the marks mean."""
+def legend(y: float, circle: bool) -> tuple[list[str], float]:
+    """What the marks mean, and where the line ends [px]."""
     x = 2 * MARGIN + BAR + GAP
     texts = [
         ("imports from (not drawn where a chain of arrows leads there)", LINE),
@@ -321,7 +321,7 @@ def legend(y: float, circle: bool) -> list[str]:
             lines.append(triangle(x + 12, y, mark))
         lines.append(f'<text x="{x + 30:.1f}" y="{y + 4:.1f}" class="s">{text}</text>')
         x += 48 + 6.2 * len(text)
-    return lines
+    return lines, x - MARGIN
 
 
 def arrow(path: str, colour: str) -> str:
@@ -369,9 +369,9 @@ def picture(root: Path) -> str:
         for node in row:
             if ">" not in node[1]:
                 parts += box(at[node], node[1], edges)
-    parts += legend(MARGIN + tall + 34, bool(circle))
-    width = max([p.x + p.half for p in at.values()] + [900.0]) + MARGIN
-    return framed(parts, width, tall + 2 * MARGIN + 44)
+    line, end = legend(MARGIN + tall + 34, bool(circle))
+    width = max([end, *(p.x + p.half for p in at.values())]) + MARGIN
+    return framed([*parts, *line], width, tall + 2 * MARGIN + 44)
 
 
 def framed(parts: Sequence[str], width: float, height: float) -> str:
