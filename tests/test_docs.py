@@ -260,6 +260,27 @@ def test_worlds_and_scripts_exist(page):
         assert (ROOT / script).is_file(), script
 
 
+def named(dotted):
+    """What a full name such as ``slam.data.StereoFrame`` stands for; fields of dataclasses count."""
+    parts = dotted.split(".")
+    found = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], start=2):
+        module = ".".join(parts[:i])
+        if hasattr(found, "__path__") and importlib.util.find_spec(module):
+            found = importlib.import_module(module)
+        else:
+            found = getattr(found, part) if hasattr(found, part) else found.__annotations__[part]
+    return found
+
+
+@each_page
+def test_names_of_the_code_in_the_text_exist(page):
+    for span in spans(page):
+        match = re.match(r"((?:slam|backends|frontends)(?:\.[A-Za-z_]\w*)+)(?:\(.*\))?$", span)
+        if match and match[1] not in ("slam.backends", "slam.frontends"):  # groups of entry points
+            assert named(match[1]) is not None, span
+
+
 @each_page
 def test_python_in_pages_is_python(page):
     for block in blocks(page, "python"):
