@@ -172,16 +172,17 @@ def gallery(pictures: Sequence[tuple[Experiment, Sequence[str]]]) -> str:
     """The page of pictures; of the worlds and the demo they are there already."""
     lines = [
         "# Gallery", "",
-        "This page is written by `python experiments/results.py`. What each picture shows: [results](results.md).", "",
+        "Pictures of the experiments, the demo and the worlds. [Results](results.md) says what each picture of an "
+        "experiment shows. Written by `python experiments/results.py`.", "",
     ]  # fmt: skip
     for experiment, shown in pictures:
         if shown:
             lines += [f"## {experiment.title}", "", *(line for picture in shown for line in (picture, ""))]
     lines += [
         "## The demo", "",
-        "`slam demo`: each back end's map of the bookshelf aisle, red what was measured in the last frame.",
+        "`slam demo`: the map of the bookshelf aisle that each back end makes. Red: measured in the last frame.",
         "", "![Top view of both maps](images/demo_top_view.png)", "",
-        "## The worlds", "", "`python docs/make_world_pictures.py`:", "",
+        "## The worlds", "", "Drawn by `python docs/make_world_pictures.py`; see [worlds](worlds.md).", "",
     ]  # fmt: skip
     return "\n".join([*lines, *(f"![{name}](images/worlds/{name}.jpg)" for name in WORLDS), ""])
 

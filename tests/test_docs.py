@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
+import shlex
+import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer.main
 
+import backends
 import slam
+from backends.ekf import EkfBackend
+from slam import worlds
+from slam.commands.cli import app
+from slam.config import SystemConfig
+from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
 from slam.interfaces import Backend
 
-DOCS = Path(__file__).parent.parent / "docs"
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+#: Pages that are written by people; the results are written by a script.
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+    *(page for page in sorted(DOCS.rglob("*.md")) if page.name != "results.md"),
+]
 #: Sections of the results page that the README quotes.
 SECTIONS = ("The bookshelf aisle", "Do the back ends know", "Moving box")
 
@@ -70,11 +87,11 @@ def test_a_recording_as_the_guide_has_it_opens(tmp_path):
     assert [frame.stamp for frame in sequence] == pytest.approx([0, 1 / 30, 2 / 30])
 
 
-def test_every_page_in_the_documentation_links_to_what_exists():
-    for page in DOCS.rglob("*.md"):
+def test_every_page_links_to_what_exists():
+    for page in [*PAGES, DOCS / "results.md"]:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
             if not target.startswith(("http:", "https:", "mailto:")):
-                assert (page.parent / target).exists(), f"{page.relative_to(DOCS)}: {target}"
+                assert (page.parent / target).exists(), f"{page.relative_to(ROOT)}: {target}"
 
 
 def table_rows(text, columns):
@@ -128,3 +145,171 @@ def test_the_figures_of_worlds_in_the_readme_are_those_of_the_results_page():
         ]
         readme = table_rows((DOCS.parent / "README.md").read_text(encoding="utf-8"), 3)
         assert [row[column] for row in readme if row[1] != "ekf"] == expected
+
+
+# What pages say that can be typed: commands, settings, worlds, scripts, snippets.
+
+SCRIPTS = ("experiments", "benchmarks")
+FENCE = re.compile(r"^```[ {.]*(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
+SETTING = re.compile(r"[a-z_]+\.[a-z_]+=\S+")
+
+
+def each_page(test):
+    return pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())(test)
+
+
+def blocks(page, *languages):
+    """Texts of the fenced blocks in one of these languages."""
+    return [text for language, text in FENCE.findall(page.read_text(encoding="utf-8")) if language in languages]
+
+
+def spans(page):
+    """Texts between single backticks, outside of fenced blocks."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    return [" ".join(span.split()) for span in re.findall(r"(?<!`)`([^`]+)`(?!`)", text)]
+
+
+def commands(page):
+    """Words of every command in the fenced blocks of a shell; comments left out."""
+    for block in blocks(page, "sh", "shell", "bash", "console"):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            while words:
+                end = next((i for i, word in enumerate(words) if word in ("&&", "|", ";")), len(words))
+                yield words[:end]
+                words = words[end + 1 :]
+
+
+def options_of(command):
+    return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+
+
+def require_accepted(settings, backend=None):
+    """Raise where a setting is refused by the configuration, the front end, or every back end that it could be for."""
+    needed = ["objects.database=FILE.npz"] if "objects.mode=procedure1" in settings else []
+    config = SystemConfig.for_kind("handheld").with_settings([*needed, *settings])
+    rig = slam.StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
+    slam.StereoSlam(rig, backend="ekf", config=SystemConfig(frontend=config.frontend))
+    if config.backend:
+        refused = []
+        for name in [backend] if backend else backends.names():
+            try:
+                backends.create(name, rig, models=config.models, **config.backend)
+                return
+            except ConfigurationError as error:
+                refused.append(str(error))
+        raise ConfigurationError("; ".join(refused))
+
+
+@each_page
+def test_commands_in_blocks_are_understood_by_the_command_line(page):
+    group = typer.main.get_command(app)
+    for words in commands(page):
+        if words[0] == "slam" and "--help" not in words:
+            context = group.commands[words[1]].make_context(words[1], words[2:])  # raises what the user would be told
+            if context.params.get("settings"):
+                require_accepted(context.params["settings"], context.params.get("backend"))
+
+
+@each_page
+def test_commands_in_the_text_name_what_exists(page):
+    group = typer.main.get_command(app)
+    scripts = [path.read_text(encoding="utf-8") for folder in SCRIPTS for path in (ROOT / folder).glob("*.py")]
+    for span in spans(page):
+        words = span.split()
+        if words[0] == "slam" and len(words) > 1:
+            used = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
+            assert used - {"--help"} <= options_of(group.commands[words[1]]), span
+        elif words[0].startswith("--"):
+            name = words[0].partition("=")[0]
+            known = any(name in options_of(command) for command in group.commands.values())
+            assert known or name == "--help" or any(f'"{name}"' in text for text in scripts), span
+
+
+def test_a_setting_needs_its_own_set():
+    assert not unset("--set backend.iterations=1 --set map.spacing=0")
+    assert unset("--set backend.iterations=1 map.spacing=0") == ["map.spacing=0"]
+
+
+def unset(span):
+    """Settings in a command that do not stand behind a ``--set`` of their own."""
+    words = span.split()
+    return [word for before, word in zip(["", *words], words) if SETTING.fullmatch(word) and before != "--set"]
+
+
+@each_page
+def test_settings_in_the_text_are_accepted(page):
+    sections = {field.name for field in fields(SystemConfig)}
+    for span in spans(page):
+        words = span.split()
+        if words[0] == "python" or span == "--set section.key=value":
+            continue
+        if "--set" in words:
+            assert not unset(span), span
+        found = [word for word in words if SETTING.fullmatch(word) and word.partition(".")[0] in sections]
+        if found:
+            require_accepted(found)
+
+
+@each_page
+def test_worlds_and_scripts_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for name, query in re.findall(r"synthetic:([a-z]+)(?:\?([\w=&.:,]+))?", text):
+        worlds.parse_query(name, "" if "key=" in query else query, worlds.options(name))
+    for script in re.findall(r"\b(?:python|pytest)(?: -\S+)* ((?:experiments|benchmarks|docs|tests)/\S+?\.py)", text):
+        assert (ROOT / script).is_file(), script
+
+
+def named(dotted):
+    """What a full name such as ``slam.data.StereoFrame`` stands for; fields of dataclasses count."""
+    parts = dotted.split(".")
+    found = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], start=2):
+        module = ".".join(parts[:i])
+        if hasattr(found, "__path__") and importlib.util.find_spec(module):
+            found = importlib.import_module(module)
+        else:
+            found = getattr(found, part) if hasattr(found, part) else found.__annotations__[part]
+    return found
+
+
+@each_page
+def test_names_of_the_code_in_the_text_exist(page):
+    for span in spans(page):
+        match = re.match(r"((?:slam|backends|frontends)(?:\.[A-Za-z_]\w*)+)(?:\(.*\))?$", span)
+        if match and match[1] not in ("slam.backends", "slam.frontends"):  # groups of entry points
+            assert named(match[1]) is not None, span
+
+
+@each_page
+def test_python_in_pages_is_python(page):
+    for block in blocks(page, "python"):
+        if not block.startswith("--8<--"):
+            ast.parse(block)
+
+
+#: Pages whose Python is run, block after block, and what is put in place of what the reader has.
+RUN = {
+    "README.md": {"path/to/kitti_or_euroc_folder": "synthetic:desk?frames=3"},
+    "CONTRIBUTING.md": {},
+    "docs/index.md": {},
+    "docs/running.md": {},
+    "docs/sequences.md": {},
+    "docs/worlds.md": {"box=1": "box=1&width=160&height=120"},
+    "docs/surf.md": {},
+    "docs/adding_a_backend.md": {"frames=100": "frames=3"},
+    "docs/comparing.md": {},
+    "docs/architecture.md": {},
+}
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_python_in_pages_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(DOCS / "examples"), *sys.path])
+    names = {"MyBackend": EkfBackend}
+    for block in blocks(ROOT / name, "python"):
+        for shown, used in RUN[name].items():
+            block = block.replace(shown, used)
+        if not block.startswith("--8<--"):
+            exec(block, names)

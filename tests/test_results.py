@@ -87,3 +87,10 @@ def test_only_what_the_same_code_has_left_is_taken_again(results, scripts, capsy
 def test_every_experiment_has_its_script(results):
     for experiment in results.EXPERIMENTS:
         assert (ROOT / "experiments" / f"{experiment.name}.py").exists()
+
+
+def test_the_gallery_in_the_documentation_is_as_the_script_writes_it(results):
+    head, demo, tail = results.gallery([]).partition("## The demo")
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert page.startswith(head)
+    assert page.endswith(demo + tail)
