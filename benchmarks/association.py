@@ -24,6 +24,7 @@ from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.landmarks import LandmarkRows
+from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, match_everywhere, match_in_windows
 from slam.tracking.localizer import Localizer
 
@@ -90,14 +91,14 @@ def all_distances(rows: LandmarkRows, features: StereoFeatures) -> np.ndarray:
 def row(landmarks: int, features: int, uncertainty: float, outliers: float) -> str:
     """One row of the table."""
     config = AssociationConfig()
-    localizer = Localizer(RIG, config, SIGMA)
+    localizer = Localizer(RIG, config, EstimatorModels(pixel_sigma=SIGMA))
     prediction, rows, points, frame = scene(landmarks, features, uncertainty, outliers, np.random.default_rng(0))
     look = (rows.descriptors, rows.laplacian, frame)
     full = cpu_ms(lambda: all_distances(rows, frame))
     windows = cpu_ms(lambda: match_in_windows(prediction, *look, config))
     fixed = cpu_ms(lambda: match_in_windows(prediction, *look, replace(config, windows="fixed")))
-    whole = cpu_ms(lambda: localizer.localize(prediction, rows, points, frame, 0))
-    found = len(localizer.localize(prediction, rows, points, frame, 0))
+    whole = cpu_ms(lambda: localizer.match(prediction, rows, points, frame, 0))
+    found = len(localizer.match(prediction, rows, points, frame, 0))
     times = " | ".join(f"{t:.2f} ({t / full:.2f})" for t in (windows, fixed, whole))
     return f"| {uncertainty:.0f} | {outliers:.0%} | {found} | {times} |"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from slam.calibration.disparity_offset import SelfCalibrationConfig
 from slam.errors import ConfigurationError
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
 from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings

@@ -2,70 +2,53 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
 from slam import registry
 from slam.calibration.disparity_offset import SelfCalibration
 from slam.config import SystemConfig
-from slam.data import (
-    Estimate,
-    FrameResult,
-    FrameStatus,
-    IdArray,
-    Prediction,
-    StereoFeatures,
-    StereoFrame,
-    UpdateReport,
-    UpdateStatus,
-)
-from slam.errors import ConfigurationError
+from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
+from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, Frontend, MapBackend, RevisingBackend
+from slam.interfaces import Backend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
-from slam.mapping.map_search import MapSearch, models_at
-from slam.mapping.mapper import Mapper, Step, observations_of
+from slam.mapping.mapper import MapChange, Mapper, Step
+from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
+from slam.results import frame_result
+from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
-from slam.tracking.localizer import LandmarkMatches, Localizer, jump, median_deviation
-from slam.tracking.relocalization import PoseHypotheses, transfer_landmarks
-from slam.tracking.state import Tracking
+from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.state import TrackingState
 
-_MINIMUM_TRACKED = 3  # stereo points that fix a pose
-_COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
-
-
-class _Part(Enum):
-    """The part of a step that is in work; it tells what an exception has left undone."""
-
-    NONE = 0  #: between steps
-    PREDICTION = 1
-    MEASUREMENT = 2
-    OBJECTS = 3
-    MAP = 4
+#: Standard deviations of the disparity's error by which a correction must change for a back end to revise the past.
+_REVISION = 0.5
 
 
 @dataclass(frozen=True)
-class _Done:
+class _Last:
     """What completed steps leave for the next one, besides the map.
 
     Attributes:
-        index: of the last one.
-        tracking: how recognition has gone.
+        index: of the last frame.
+        state: how localization has gone.
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
     """
 
     index: int = -1
-    tracking: Tracking = field(default_factory=Tracking)
+    state: TrackingState = field(default_factory=TrackingState)
     dimensions: int | None = None
     mapped: bool = False
+
+    def after(self, step: Step, change: MapChange) -> _Last:
+        """The same after one more step."""
+        dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
+        return _Last(step.index, step.state, dimensions, self.mapped or len(change.added) > 0)
 
 
 class StereoSlam:
@@ -103,11 +86,9 @@ class StereoSlam:
         config: SystemConfig | None = None,
         known_map: SavedMap | None = None,
     ) -> None:
+        names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
-        names = (name if isinstance(name, str) else None for name in (frontend, backend))
-        default = SystemConfig.for_kind(kind, *names)
-        self.config = config or default
-        c = self.config
+        self.config = c = config or SystemConfig.for_kind(kind, *names)
         self.frontend: Frontend | None = (
             registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
         )
@@ -119,238 +100,161 @@ class StereoSlam:
         self.landmarks: LandmarkRows | None = None  # of the last step that was completed
         self.calibration = SelfCalibration(rig, c.self_calibration)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
-        self._localizer = Localizer(rig, c.association, c.models.pixel_sigma)
-        self._done = _Done()
-        self._part = _Part.NONE
+        self.frontend_name = names[0] or ""
+        self.world_frame = FIRST_FRAME if known_map is None else known_map.world_frame
+        self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
+        self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
+        self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
+        self._last = _Last()
+        self._stages = Stages()
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._shifted = 0.0  # by how much the back end has moved its right pixels [px]
-        self.frontend_name = frontend if isinstance(frontend, str) else ""
-        self.world_frame = FIRST_FRAME
-        self._keeper = Mapper(rig, c, self._localizer, self.backend)
-        self._backend_name = backend if isinstance(backend, str) else None
-        self._can_restart = isinstance(backend, str) and isinstance(self.backend, MapBackend)
-        self._carried = PoseHypotheses()
-        self._past: list[Trajectory] = []  # the paths of back ends before the camera was carried off
-        self.restarted: list[int] = []  # indices of the frames in which another back end went on
-        self._search: MapSearch | None = None
         if known_map is not None:
-            self._search_in(known_map, backend)
+            known_map.require_fits(self.frontend_name)
+            self._relocalizer.search_in(known_map, self.backend)
+            self.landmarks = known_map.rows
+            self._last = _Last(mapped=len(known_map) > 0)
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
-        start = time.perf_counter()
-        features = self.frontend.extract(frame)
-        elapsed = 1e3 * (time.perf_counter() - start)
+        stages = Stages()
+        with stages.stage("extract"):
+            features = self.frontend.extract(frame)
         result = self.process_features(features)
-        return replace(result, milliseconds={"extract": elapsed, **result.milliseconds})
+        return replace(result, milliseconds={**stages.milliseconds, **result.milliseconds})
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 
         A frame with nothing to see is no error: the state is predicted and the status says so. A step that an exception
-        ends, an interrupt for instance, did not happen, but for the back end's belief, which stands at its stamp: the
-        next step goes on with a later frame; see `settle`.
+        ends, an interrupt for instance, did not happen, except that the back end's belief stands at its stamp: continue
+        with a later frame; see `roll_back`.
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
         """
-        clock = _Clock()
-        features = usable(features, self.rig, self._done.dimensions, self._stamp)
-        self.settle()
-        index = self._done.index + 1
-        if self._search is not None and not self._located(self._search, features):
-            self._done = replace(self._done, index=index)
-            return self._search.lost(index, features)
-        self._part = _Part.PREDICTION
-        shift = self._revise()
-        prediction = self.backend.predict(features.stamp)
-        self._stamp, self._part = features.stamp, _Part.MEASUREMENT
-        landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
-        clock.lap("predict")
-        measured, features = features, self.calibration.correct(features)
-        prediction, found = self._localize(prediction, landmarks, features)
-        held = self.objects.suspects
-        found = found.without(held)
-        self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
-        clock.lap("associate")
-        report = self.backend.update(observations_of(features, found), found.T_world_left)
-        clock.lap("update")
-        tracking = self._tracked(prediction, features, found, report)
-        estimate = self.backend.estimate(landmarks=False)
-        clock.lap("estimate")
-        self._part = _Part.OBJECTS
-        judged = self.objects.classify(features, estimate, _landmark_ids(features, found))
-        objects = self.objects.update(self.backend, features)
-        self._part = _Part.MAP
-        clock.lap("objects")
-        step = Step(index, features, estimate, found, report, judged, tracking, held)
-        landmarks, added, erased = self._keeper.keep(self.backend, landmarks, step)
-        status, reason = self._status(tracking, report, len(added))
-        clock.lap("manage")
-        result = FrameResult(
-            index=index,
-            status=status,
-            reason=reason,
-            estimate=estimate,
-            report=report,
-            features=features,
-            predicted=len(prediction.ids),
-            matched=found.ids,
-            matched_features=found.rows,
-            added=added.ids,
-            added_features=added.rows,
-            erased=erased,
-            map_size=len(landmarks),
-            milliseconds=clock.laps,
-            moving_features=judged.moving,
-            objects=objects,
-            shift=shift,
-        )
-        dimensions = features.descriptors.shape[1] if len(features) else self._done.dimensions
-        done = _Done(index, tracking, dimensions, self._done.mapped or len(added) > 0)
-        self._done, self.landmarks, self._part = done, landmarks, _Part.NONE  # all of it, or nothing
+        features = usable(features, self.rig, self._last.dimensions, self._stamp)
+        self.roll_back()
+        index, stages = self._last.index + 1, self._stages
+        if self._relocalizer.search is not None and not self._locate(features, index):
+            self._last = replace(self._last, index=index)
+            return self._relocalizer.search.lost(index, features)
+        with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
+            shift = self._revise()
+            prediction = self.backend.predict(features.stamp)
+            self._stamp = features.stamp
+        with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
+            raw, features = features, self.calibration.correct(features)
+            landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
+            prediction, matches = self._localize(prediction, landmarks, features, index)
+            held = self.objects.suspects
+            matches = matches.without(held)
+            self.calibration.observe(matches.ids, raw.uv_left[matches.rows], raw.uv_right[matches.rows])
+        with stages.stage("update"):  # the measurement of the landmarks
+            report = self.backend.update(matches.observations(features), matches.T_world_left)
+            state = self._localizer.state_after(self._last.state, prediction, features, matches, report)
+        with stages.stage("estimate"):
+            estimate = self.backend.estimate(landmarks=False)
+        with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
+            labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
+            objects = self.objects.update(self.backend, features)
+        with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
+            step = Step(index, features, prediction, matches, held, report, state, estimate, labels)
+            change = self._mapper.update(self.backend, landmarks, step)
+        result = frame_result(step, change, objects, self._last.mapped, shift, stages.milliseconds)
+        # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
+        self._last, self.landmarks, self._stages = self._last.after(step, change), change.landmarks, Stages()
         return result
 
-    def settle(self) -> None:
+    def roll_back(self) -> None:
         """After a step that an exception ended: take back what it did to the map, in the back end as well.
 
         Landmarks that it added are removed, and those that it had removed leave the map. The belief about the camera
-        stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step and
-        `estimate` do this by themselves; without such an exception there is nothing to do.
+        stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step, `estimate`
+        and `snapshot` do this by themselves; without such an exception there is nothing to do.
         """
-        if self._part is _Part.OBJECTS:
+        stage = self._stages.current
+        if stage in ("associate", "objects"):
             self.objects.restart()
-        if self._part not in (_Part.NONE, _Part.PREDICTION):
-            self.landmarks = self._keeper.reconcile(self.backend, self.landmarks)
-        self._part = _Part.NONE
+        if stage not in (None, "predict"):
+            self.landmarks = self._mapper.reconcile(self.backend, self.landmarks)
+        self._stages = Stages()
+
+    def trajectory(self) -> Trajectory:
+        """The left camera's path: the back end's last word on every frame (in a known map, from when it was found)."""
+        return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
+
+    def estimate(self) -> Estimate:
+        """Pose and map with covariances."""
+        self.roll_back()
+        search = self._relocalizer.search
+        return self.backend.estimate() if search is None else search.estimate(float("nan"))
+
+    def snapshot(self) -> SavedMap:
+        """The map as it is now, apart from the system; one that the camera has not been found in is itself.
+
+        Raises:
+            SlamError: there is no map yet.
+        """
+        if self._relocalizer.search is not None:
+            return self._relocalizer.search.known
+        estimate = self.estimate() if self.landmarks is not None else None
+        if estimate is None or self.landmarks is None:
+            raise SlamError("there is no map yet: no frame was processed")
+        from slam import __version__
+
+        return SavedMap.of(self.landmarks, estimate, self.frontend_name, self.world_frame, __version__)
+
+    @property
+    def restarted(self) -> list[int]:
+        """Indices of the frames in which another back end took over, as the camera had been kidnapped."""
+        return self._relocalizer.restarted
 
     def _revise(self) -> float:
-        """Take what has become known of the disparity's error into use, for what was given to the back end as well.
+        """Apply what has become known of the disparity's error; returns how far earlier right pixels were moved [px].
 
-        All its measurements are then to be weighed anew, so a back end that can do that waits for a change that counts.
+        A back end that weighs all its measurements anew for that waits for a change that is significant.
         """
         if not isinstance(self.backend, RevisingBackend):
             self.calibration.apply()
             return 0.0
-        self.calibration.apply(_COUNTS)
+        self.calibration.apply(_REVISION)
         shift = self.calibration.applied - self._shifted
         if shift:
             self.backend.shift_right(shift)
             self._shifted = self.calibration.applied
         return shift
 
-    @property
-    def unlocated_map(self) -> SavedMap | None:
-        """The map that the system was started with, as long as the camera has not been found in it."""
-        return None if self._search is None else self._search.known
-
-    def trajectory(self) -> Trajectory:
-        """The left camera's path: the back end's last word on every frame (in a known map, from when it was found)."""
-        return Trajectory.joined([*self._past, self.backend.trajectory()])
-
-    def estimate(self) -> Estimate:
-        """Pose and map with covariances."""
-        self.settle()
-        return self.backend.estimate() if self._search is None else self._search.estimate(float("nan"))
-
-    def _search_in(self, known_map: SavedMap, backend: str | Backend) -> None:
-        """Start in a known map."""
-        if not isinstance(backend, str):
-            raise ConfigurationError("a system that starts in a known map needs its back end by name")
-        known_map.require_fits(self.frontend_name)
-        self._search = MapSearch(known_map, self.rig, self._localizer, self.config.models.initial_pose)
-        self._search.fill(self.backend)
-        self.landmarks = known_map.rows
-        self._done = _Done(mapped=len(known_map) > 0)
-        self.world_frame = known_map.world_frame
-
-    def _located(self, search: MapSearch, features: StereoFeatures) -> bool:
-        """Look for the camera in the known map; where it is found, the back end begins there, with the map."""
-        T = search.locate(features, self._done.index + 1)
+    def _locate(self, features: StereoFeatures, index: int) -> bool:
+        """Look for the camera in the map that the system was started with; where it is found, the back end starts."""
+        search = self._relocalizer.search
+        assert search is not None
+        T = search.locate(features, index)
         if T is None:
             return False
-        new = self._new_backend(T)
+        new = self._relocalizer.start(T)
         search.fill(new)
-        self._keeper.next_id = int(search.known.ids.max(initial=-1)) + 1
-        self.backend, self._shifted, self._search = new, self.calibration.applied, None
+        self._mapper.next_id = int(search.known.ids.max(initial=-1)) + 1
+        self.backend, self._shifted, self._relocalizer.search = new, self.calibration.applied, None
         return True
 
-    def _new_backend(self, T_world_left: Array) -> Backend:
-        """A back end of the same name that begins at a pose (4, 4) which is only roughly known."""
-        assert self._backend_name is not None
-        models = models_at(self.config.models, T_world_left)
-        return registry.create("backends", self._backend_name, self.rig, models=models, **self.config.backend)
-
     def _localize(
-        self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures
+        self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures, index: int
     ) -> tuple[Prediction, LandmarkMatches]:
-        """Landmarks in this frame (paper A, III and IV); a new prediction where the camera was carried off."""
+        """Landmarks in this frame; where the camera was kidnapped, a new back end's prediction with them."""
         positions = self.backend.positions(landmarks.ids)
-        doubtful = self._done.tracking.unmatched > 0
-        found = self._localizer.localize(prediction, landmarks, positions, features, self._done.index + 1, doubtful)
-        T, a = found.T_world_left, self.config.association
-        if T is None or jump(prediction, T) <= (a.lost_jump if doubtful else a.max_jump):
-            self._carried = PoseHypotheses()
-            return prediction, found
-        self._carried = self._carried.after(T, features.stamp, self.config.models)
-        if self._carried.count < a.kidnapped_after or not self._can_restart:
+        matches = self._localizer.localize(prediction, landmarks, positions, features, self._last.state, index)
+        if not matches.kidnapped:
+            return prediction, matches
+        assert matches.T_world_left is not None
+        if not self._relocalizer.can_restart(self.backend):
             return prediction, LandmarkMatches.nothing()
-        prediction = self._restart(T, features.stamp)
-        return prediction, self._localizer.localize(prediction, landmarks, positions, features, self._done.index + 1)
-
-    def _restart(self, T_world_left: Array, stamp: float) -> Prediction:
-        """A new back end in the same map: a motion that a carried camera did not make would spoil the old one's."""
-        new = self._new_backend(T_world_left)
-        past, begun = [*self._past, transfer_landmarks(self.backend, new)], [*self.restarted, self._done.index + 1]
-        prediction, shifted, carried = new.predict(stamp), self.calibration.applied, PoseHypotheses()
-        self._part = _Part.OBJECTS
-        self.backend, self._past, self.restarted, self._shifted, self._carried = new, past, begun, shifted, carried
+        new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
+        prediction, r = new.predict(features.stamp), self._relocalizer
+        self.backend, self._shifted, r.past, r.restarted = (
+            new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
+        )  # fmt: skip
         self.objects.restart()
-        self._part = _Part.MEASUREMENT
-        return prediction
-
-    def _tracked(
-        self, prediction: Prediction, features: StereoFeatures, found: LandmarkMatches, report: UpdateReport
-    ) -> Tracking:
-        """Whether the pose was measured; a lost camera must localize more than a tracked one.
-
-        Where the back end uses only the smaller part of the landmarks that agree with each other, it does not agree.
-        """
-        c = self.config
-        least = c.association.minimum_consistent if self._done.tracking.lost else _MINIMUM_TRACKED
-        vague = median_deviation(prediction) > c.association.tight_window
-        recognised = len(report.used) >= least and 2 * len(report.used) >= len(found)
-        return self._done.tracking.after(recognised, vague, int(features.has_stereo.sum()), c.map)
-
-    def _status(self, tracking: Tracking, report: UpdateReport, added: int) -> tuple[FrameStatus, str]:
-        if report.status is UpdateStatus.FAILED:
-            return FrameStatus.FAILED, report.reason
-        if not tracking.unmatched:
-            return FrameStatus.TRACKED, ""
-        if not self._done.mapped:
-            return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
-        reason = report.reason or f"only {len(report.used)} landmarks recognised"
-        return (FrameStatus.LOST if tracking.lost else FrameStatus.PREDICTED), reason
-
-
-def _landmark_ids(features: StereoFeatures, found: LandmarkMatches) -> IdArray:
-    """Id of the landmark that each feature was recognised as (N,), −1 for none."""
-    ids = np.full(len(features), -1, np.int64)
-    ids[found.rows] = found.ids
-    return ids
-
-
-@dataclass
-class _Clock:
-    """Wall time between laps [ms]."""
-
-    def __post_init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = 1e3 * (now - self._last)
-        self._last = now
+        return prediction, self._localizer.match(prediction, landmarks, positions, features, index)

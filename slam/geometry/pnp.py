@@ -14,7 +14,9 @@ from slam.data import BoolArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse
 
-_MINIMAL = 3  # stereo points that fix a pose
+#: Stereo points that fix a pose.
+MINIMAL_POINTS = 3
+
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5
@@ -69,7 +71,7 @@ def find_consensus(
     if nearer.inliers.sum() >= max(clear, first.inliers.sum()):
         return nearer
     stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
-    if len(stereo) < _MINIMAL:
+    if len(stereo) < MINIMAL_POINTS:
         return first
     T_left_world = _best_hypothesis(rig, points, measured, stereo, threshold, hypotheses, seed)
     if T_left_world is None:
@@ -101,7 +103,7 @@ def _best_hypothesis(
         support = _agreement(rig, points, measured, poses, threshold).sum(axis=1)
         if support.max() > most:
             best, most = poses[int(np.argmax(support))], int(support.max())
-        if (1 - (most / len(points)) ** _MINIMAL) ** tried < 0.01:
+        if (1 - (most / len(points)) ** MINIMAL_POINTS) ** tried < 0.01:
             break
     return best
 
@@ -110,7 +112,7 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array,
     """Least squares on the matches that agree with a pose, repeated while their number grows."""
     inliers = _agreement(rig, points, measured, T_left_world[None], threshold)[0]
     for _ in range(_POLISHING_ROUNDS):
-        if inliers.sum() < _MINIMAL:
+        if inliers.sum() < MINIMAL_POINTS:
             break
         better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], _STEPS)[0]
         again = _agreement(rig, points, measured, better[None], threshold)[0]
@@ -128,7 +130,7 @@ def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Arra
     for _ in range(_APPROACHES):
         error = _errors(rig, points, measured, T_left_world[None])[0]
         good = np.isfinite(error)
-        if good.sum() < _MINIMAL:
+        if good.sum() < MINIMAL_POINTS:
             break
         rows = _some(good & (error <= _median(error[good])))
         T_left_world = _refined(rig, points, measured, rows[None], T_left_world[None], 2)[0]
@@ -172,7 +174,7 @@ def _minimal_poses(
     rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, rng: np.random.Generator
 ) -> Array:
     """Poses T_left_world (H, 4, 4) from random triples of stereo matches."""
-    triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :_MINIMAL]]
+    triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :MINIMAL_POINTS]]
     uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
     local = rig.triangulate(measured[:, :2], uv_right)
     good = np.isfinite(local[triples]).all(axis=(1, 2))

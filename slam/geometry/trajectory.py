@@ -50,8 +50,8 @@ class Trajectory:
         """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
-    def select(self, rows: np.ndarray) -> Trajectory:
-        """The poses of these rows (a mask or indices)."""
+    def select(self, rows: np.ndarray | slice) -> Trajectory:
+        """The poses of these rows (a mask, indices or a slice)."""
         return Trajectory(self.stamps[rows], self.poses[rows])
 
     @classmethod

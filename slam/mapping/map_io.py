@@ -13,19 +13,25 @@ import os
 import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray
+from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.mapping.known_landmarks import require_known
 
-if TYPE_CHECKING:
-    from slam.system import StereoSlam
+
+class HasMap(Protocol):
+    """A running system, as far as saving its map goes."""
+
+    def snapshot(self) -> SavedMap:
+        """The map as it is now; raises SlamError where there is none."""
+        ...
+
 
 _MAGIC = "surf-stereo-slam map "
 _VERSION = 2
@@ -115,24 +121,13 @@ class SavedMap:
         )  # fmt: skip
 
     @classmethod
-    def of(cls, system: StereoSlam) -> SavedMap:
-        """The map of a system as it is now.
-
-        Raises:
-            SlamError: there is no map yet.
-        """
-        if system.unlocated_map is not None:
-            return system.unlocated_map
-        if system.landmarks is None:
-            raise SlamError("there is no map yet: no frame was processed")
-        from slam import __version__
-
-        estimate, marks = system.estimate(), system.landmarks
+    def of(cls, landmarks: LandmarkRows, estimate: Estimate, frontend: str, world_frame: str, version: str) -> SavedMap:
+        """The map of a running system: its rows, its back end's estimate, and what they belong to."""
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
-            estimate.ids.astype(np.int64), estimate.positions, P, marks.descriptors.astype(np.float32),
-            marks.laplacian.astype(np.int8), marks.seen, marks.in_view, system.frontend_name, system.world_frame,
-            f"surf-stereo-slam {__version__}", seen_from=marks.seen_from,
+            estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
+            landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
+            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
@@ -153,13 +148,13 @@ class SavedMap:
             )
 
 
-def save_map(path: str | Path, what: StereoSlam | SavedMap) -> None:
+def save_map(path: str | Path, what: HasMap | SavedMap) -> None:
     """Write a map, or that of a system, to a file: whole or not at all.
 
     Raises:
         SlamError: there is no map yet, or the file cannot be written.
     """
-    data = encode(what if isinstance(what, SavedMap) else SavedMap.of(what))
+    data = encode(what if isinstance(what, SavedMap) else what.snapshot())
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
     try:

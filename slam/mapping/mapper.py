@@ -2,100 +2,105 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam.config import SystemConfig
-from slam.data import BoolArray, Estimate, IdArray, Observations, StereoFeatures, UpdateReport
+from slam.data import BoolArray, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.errors import ConfigurationError
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
+from slam.mapping.config import MapConfig
+from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
+from slam.mapping.duplicates import doubled_landmarks, known_features
 from slam.mapping.monocular import MonocularDepth, unclaimed
-from slam.mapping.selection import (
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    new_landmarks,
-    surplus_landmarks,
-)
+from slam.mapping.selection import new_landmarks
 from slam.object_data import MotionLabels
 from slam.tracking.localizer import LandmarkMatches, Localizer
-from slam.tracking.state import Tracking
+from slam.tracking.state import TrackingState
 from slam.tracking.visibility import MapView, expected_landmarks
-
-_MINIMUM_TRACKED = 3  # stereo points that fix a pose
 
 
 @dataclass(frozen=True)
 class Step:
-    """What a frame brought.
+    """What a frame brought before the map was changed.
 
     Attributes:
         index: of the frame.
-        features: all of them.
-        estimate: the camera's pose after the update.
-        found: the landmarks that were recognised.
+        features: all of them, corrected by the calibration.
+        prediction: of the back end.
+        matches: landmarks that were given to the back end's update.
+        held: ids of landmarks that were not, because they may move.
         report: of the update.
-        judged: which features move.
-        tracking: whether the pose is known.
-        held: ids of the landmarks that were not to be measured, because they may move.
+        state: whether the pose is known.
+        estimate: the camera's pose after the update.
+        labels: which features move.
     """
 
     index: int
     features: StereoFeatures
-    estimate: Estimate
-    found: LandmarkMatches
+    prediction: Prediction
+    matches: LandmarkMatches
+    held: IdArray
     report: UpdateReport
-    judged: MotionLabels
-    tracking: Tracking
-    held: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    state: TrackingState
+    estimate: Estimate
+    labels: MotionLabels
+
+
+@dataclass(frozen=True)
+class MapChange:
+    """What a frame did to the map.
+
+    Attributes:
+        landmarks: the map after it.
+        added: new landmarks, and the features that they are from.
+        erased: ids of the landmarks that left the map.
+    """
+
+    landmarks: LandmarkRows
+    added: LandmarkMatches
+    erased: IdArray
 
 
 class Mapper:
-    """Keeps the map of a system; the only one that adds landmarks to a back end and removes them.
+    """Keeps the map of a system; nothing else adds landmarks to a back end or removes them.
 
     Args:
         rig: the cameras.
-        config: all settings.
-        localizer: says which landmarks can look as they did.
-        backend: that is to be kept; it must be able to place landmarks where left images alone are to add some.
+        config: settings.
+        localizer: says which landmarks are seen from a similar viewpoint as before.
+        backend: the first one; it must be able to place landmarks where left images alone are to add some.
 
     Raises:
         ConfigurationError: the back end cannot place landmarks.
     """
 
-    def __init__(self, rig: StereoRig, config: SystemConfig, localizer: Localizer, backend: Backend) -> None:
+    def __init__(self, rig: StereoRig, config: MapConfig, localizer: Localizer, backend: Backend) -> None:
         self.rig = rig
         self.config = config
         self.next_id = 0
         self._localizer = localizer
         self._monocular: MonocularDepth | None = None
-        if config.map.monocular:
+        if config.monocular:
             if not isinstance(backend, MapBackend):
                 raise ConfigurationError("map.monocular: this back end cannot place landmarks")
             self._monocular = self._new_monocular()
 
-    def keep(
-        self, backend: Backend, landmarks: LandmarkRows, step: Step
-    ) -> tuple[LandmarkRows, LandmarkMatches, IdArray]:
-        """Count what was seen, erase bad landmarks, add new ones (paper A, IV).
-
-        Returns:
-            the landmarks after the step, those that were added, and the ids of those that were erased.
-        """
+    def update(self, backend: Backend, landmarks: LandmarkRows, step: Step) -> MapChange:
+        """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
         view = self._view(backend, landmarks, step)
         landmarks = self._count(landmarks, view, step)
-        bad = bad_landmarks(landmarks, self.config.map) | np.isin(landmarks.ids, step.judged.landmarks)
-        bad |= doubled_landmarks(view, landmarks, self.config.map)
-        bad |= crowded_landmarks(landmarks, view.positions, self.config.map)
-        known = known_features(view, landmarks, step.features, self.config.map)
-        landmarks, erased = _without(backend, landmarks, bad)
+        bad = bad_landmarks(landmarks, self.config) | np.isin(landmarks.ids, step.labels.landmarks)
+        bad |= doubled_landmarks(view, landmarks, self.config)
+        bad |= crowded_landmarks(landmarks, view.positions, self.config)
+        known = known_features(view, landmarks, step.features, self.config)
+        landmarks, erased = _erase(backend, landmarks, bad)
         landmarks, added = self._add(backend, landmarks, step, known)
-        landmarks, surplus = _without(backend, landmarks, surplus_landmarks(landmarks, self.config.map))
-        return landmarks, added, np.concatenate([erased, surplus])
+        landmarks, surplus = _erase(backend, landmarks, surplus_landmarks(landmarks, self.config))
+        return MapChange(landmarks, added, np.concatenate([erased, surplus]))
 
     def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
         """Let rows and back end agree after a step that was interrupted; what only one of both has leaves it.
@@ -117,26 +122,26 @@ class Mapper:
         return None if landmarks is None else landmarks.select(np.isin(kept, known))
 
     def _new_monocular(self) -> MonocularDepth:
-        return MonocularDepth(self.rig, self.config.models.pixel_sigma, self.config.map.max_depth_error)
+        return MonocularDepth(self.rig, self._localizer.pixel_sigma, self.config.max_depth_error)
 
     def _view(self, backend: Backend, landmarks: LandmarkRows, step: Step) -> MapView:
         """The map as the camera sees it."""
         positions = backend.positions(landmarks.ids)
-        sigma = self.config.models.pixel_sigma
-        return MapView.of(self.rig, step.estimate.T_world_left, positions, step.features, sigma)
+        pose = step.estimate.T_world_left
+        return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
     def _count(self, landmarks: LandmarkRows, view: MapView, step: Step) -> LandmarkRows:
-        """Count what was seen and missed; a frame in which nothing is recognised says nothing of single landmarks."""
-        m, found = self.config.map, step.found
-        measured = np.isin(found.ids, step.report.used)
+        """Count what was seen and missed; a frame without a measured pose says nothing of single landmarks."""
+        m, matches = self.config, step.matches
+        measured = np.isin(matches.ids, step.report.used)
         expected = landmarks.ids[:0]
-        if not step.tracking.unmatched:
+        if not step.state.unmatched:
             size = (self.rig.width, self.rig.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
             shown &= self._localizer.similar_view(view.T_world_left, landmarks, view.positions)
             expected = landmarks.ids[shown]
-        ids, rows = found.ids[measured], found.rows[measured]
-        place = view.T_world_left[:3, 3], view.in_image, self.config.association.rematch_after
+        ids, rows = matches.ids[measured], matches.rows[measured]
+        place = view.T_world_left[:3, 3], view.in_image, self._localizer.config.rematch_after
         return landmarks.after_frame(
             step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.held
         )
@@ -144,20 +149,20 @@ class Mapper:
     def _add(
         self, backend: Backend, landmarks: LandmarkRows, step: Step, known: BoolArray
     ) -> tuple[LandmarkRows, LandmarkMatches]:
-        """Make landmarks of features that are none yet; not where the pose is unknown, but for starting anew.
+        """Make landmarks of features that are none yet, unless the pose is unknown.
 
-        What moves, or lies on a body that moves, becomes none, nor what is in doubt.
+        Moving features are excluded, and those whose motion label is undecided.
         """
-        if len(landmarks) >= _MINIMUM_TRACKED and not step.tracking.may_add(self.config.map):
+        if len(landmarks) >= MINIMAL_POINTS and not step.state.may_add(self.config.restart_after):
             return landmarks, LandmarkMatches.nothing()
-        features, found = step.features, step.found
+        features, matches = step.features, step.matches
         free = ~known
-        free[found.rows] = free[step.judged.moving] = free[step.judged.undecided] = False
-        occupied = features.uv_left[found.rows]
-        rows = new_landmarks(features, free, occupied, self.rig, self.config.models.pixel_sigma, self.config.map)
+        free[matches.rows] = free[step.labels.moving] = free[step.labels.undecided] = False
+        occupied = features.uv_left[matches.rows]
+        rows = new_landmarks(features, free, occupied, self.rig, self._localizer.pixel_sigma, self.config)
         added = LandmarkMatches(self._new_ids(len(rows)), rows)
         if len(added):
-            backend.add(observations_of(features, added))
+            backend.add(added.observations(features))
             landmarks = landmarks.with_new(step.index, added.ids, features, rows, self._camera(backend))
         if self._monocular is not None:
             return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
@@ -173,15 +178,15 @@ class Mapper:
         free: BoolArray,
     ) -> tuple[LandmarkRows, LandmarkMatches]:
         """Make landmarks of features without a stereo match that two views give a depth (paper B, 2.2)."""
-        features, found = step.features, step.found
-        if len(found) < _MINIMUM_TRACKED:
+        features, matches = step.features, step.matches
+        if len(matches) < MINIMAL_POINTS:
             return landmarks, added
         estimate = backend.estimate(landmarks=False)
         view = self._view(backend, landmarks, step)
         rows = unclaimed(view, landmarks, features, np.flatnonzero(free & ~features.has_stereo))
-        covariance = monocular.pose_covariance(estimate, view, landmarks, features, found)
+        covariance = monocular.pose_covariance(estimate, view, landmarks, features, matches)
         new = monocular.step(features, rows, estimate.T_world_left, covariance, step.index)
-        wanted = max(self.config.map.target_in_view - len(found) - len(added), 0)
+        wanted = max(self.config.target_in_view - len(matches) - len(added), 0)
         best = np.sort(np.argsort(-features.response[new.rows], kind="stable")[:wanted])
         if not len(best):
             return landmarks, added
@@ -199,19 +204,14 @@ class Mapper:
 
     @staticmethod
     def _camera(backend: Backend) -> np.ndarray:
-        """The camera's place (3,)."""
+        """The camera's position (3,)."""
         return backend.estimate(landmarks=False).T_world_left[:3, 3]
 
 
-def _without(backend: Backend, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
-    """Drop landmarks from the map and from the back end."""
+def _erase(backend: Backend, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
+    """Remove landmarks from the map and from the back end."""
     erased = landmarks.ids[rows]
     if len(erased):
         backend.remove(erased)
         landmarks = landmarks.select(~rows)
     return landmarks, erased
-
-
-def observations_of(features: StereoFeatures, found: LandmarkMatches) -> Observations:
-    """Landmarks with the pixels of the features that they were recognised as."""
-    return Observations(found.ids, features.uv_left[found.rows], features.uv_right[found.rows])

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import IdArray, Observations
-from slam.mapping.selection import MapConfig, new_landmarks
+from slam.mapping.config import MapConfig
+from slam.mapping.selection import new_landmarks
 from slam.models import EstimatorModels, models_for
 from slam.run.replay import RecordedFrame, RecordedRows, Recording
 from slam.worlds.observe import SimulatedFeatures

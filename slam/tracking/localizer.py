@@ -1,6 +1,6 @@
 """Which landmarks are in this frame: search windows, agreement on one camera pose, and the whole map as a last resort.
 
-The same for every back end: a back end gives predictions and positions, and gets matches that agree with each other.
+The same for every back end: it gives predictions and positions, and gets matches that agree with each other.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, Prediction, StereoFeatures
-from slam.geometry.pnp import PoseConsensus, find_consensus, measurement_rows
+from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
+from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, transform
 from slam.landmarks import LandmarkRows
+from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
+from slam.tracking.hypotheses import PoseHypotheses
+from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
 
 _TINY = 1e-12
@@ -29,11 +32,14 @@ class LandmarkMatches:
         ids: landmark ids (K,), ascending.
         rows: rows of their features (K,).
         T_world_left: the pose (4, 4) on which they agree; None where there is none.
+        kidnapped: that pose cannot be reached by a motion that the prediction allows, but several frames agree on it:
+            the camera was moved while it saw nothing.
     """
 
     ids: IdArray
     rows: NDArray[np.intp]
     T_world_left: Array | None = None
+    kidnapped: bool = False
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -43,6 +49,16 @@ class LandmarkMatches:
         keep = ~np.isin(self.ids, ids)
         return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left)
 
+    def landmark_of(self, features: int) -> IdArray:
+        """Id of the landmark that each of so many features was matched with (N,), −1 for none."""
+        ids = np.full(features, -1, np.int64)
+        ids[self.rows] = self.ids
+        return ids
+
+    def observations(self, features: StereoFeatures) -> Observations:
+        """The landmarks with the pixels of the features that they were matched with."""
+        return Observations(self.ids, features.uv_left[self.rows], features.uv_right[self.rows])
+
     @classmethod
     def nothing(cls) -> LandmarkMatches:
         """No landmark found."""
@@ -50,20 +66,66 @@ class LandmarkMatches:
 
 
 class Localizer:
-    """Finds landmarks in frames.
+    """Finds landmarks in frames, and says whether the pose that they give can be believed.
 
     Args:
         rig: the cameras.
         config: settings.
-        pixel_sigma: noise of uL, vL, uR [px].
+        models: noise of uL, vL, uR [px], and how fast a camera may move.
+        lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
     """
 
-    def __init__(self, rig: StereoRig, config: AssociationConfig, pixel_sigma: float) -> None:
+    def __init__(self, rig: StereoRig, config: AssociationConfig, models: EstimatorModels, lost_after: int = 5) -> None:
         self.rig = rig
         self.config = config
-        self.pixel_sigma = pixel_sigma
+        self.pixel_sigma = models.pixel_sigma
+        self._models = models
+        self._lost_after = lost_after
+        self._hypotheses = PoseHypotheses()
 
     def localize(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkRows,
+        positions: Array,
+        features: StereoFeatures,
+        state: TrackingState,
+        seed: int,
+    ) -> LandmarkMatches:
+        """`match`, but poses farther from the prediction than it allows are not believed before several frames agree.
+
+        None match meanwhile; then the matches have no landmarks but the pose, and are marked as `kidnapped`.
+        """
+        doubtful = state.unmatched > 0
+        matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
+        T, c = matches.T_world_left, self.config
+        if T is None or jump(prediction, T) <= (c.lost_jump if doubtful else c.max_jump):
+            self._hypotheses = PoseHypotheses()
+            return matches
+        self._hypotheses = self._hypotheses.after(T, features.stamp, self._models)
+        if self._hypotheses.count < c.kidnapped_after:
+            return LandmarkMatches.nothing()
+        self._hypotheses = PoseHypotheses()
+        return replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+
+    def state_after(
+        self,
+        state: TrackingState,
+        prediction: Prediction,
+        features: StereoFeatures,
+        matches: LandmarkMatches,
+        report: UpdateReport,
+    ) -> TrackingState:
+        """Whether the pose was measured; a lost camera must match more landmarks than a tracked one.
+
+        It was not where the back end uses less than half of the landmarks that agree with each other.
+        """
+        least = self.config.minimum_consistent if state.lost else MINIMAL_POINTS
+        measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
+        uncertain = median_deviation(prediction) > self.config.tight_window
+        return state.after(measured, uncertain, int(features.has_stereo.sum()), self._lost_after)
+
+    def match(
         self,
         prediction: Prediction,
         landmarks: LandmarkRows,

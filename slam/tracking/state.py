@@ -1,48 +1,46 @@
-"""Whether the camera knows where it is: tracked, lost, or in a place that the map does not know."""
+"""Whether the camera's pose is known: tracked, predicted, lost, or in a place that the map does not show."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from slam.mapping.selection import MapConfig
 
 #: Stereo features with which a known place would be recognised.
 _ENOUGH_FEATURES = 20
 
 
 @dataclass(frozen=True)
-class Tracking:
-    """How recognition has gone of late.
+class TrackingState:
+    """How localization has gone of late.
 
     Attributes:
-        unmatched: frames since landmarks were last recognised.
-        unknown: how many of these showed enough features to localize something.
-        lost: for so long, and the prediction is so vague, that the camera's place is not known.
+        unmatched: frames since the pose was last measured.
+        unknown: how many of these showed enough features to recognise a known place.
+        lost: for so long, and the prediction is so uncertain, that the camera's pose is not known.
     """
 
     unmatched: int = 0
     unknown: int = 0
     lost: bool = False
 
-    def after(self, recognised: bool, vague: bool, stereo_features: int, config: MapConfig) -> Tracking:
-        """After a frame.
+    def after(self, measured: bool, uncertain: bool, stereo_features: int, lost_after: int) -> TrackingState:
+        """The state after a frame.
 
         Args:
-            recognised: enough landmarks were.
-            vague: the prediction would not tell where in the image landmarks are.
+            measured: the pose was measured.
+            uncertain: the prediction does not tell where in the image landmarks are.
             stereo_features: number of features with depth in the frame.
-            config: settings.
+            lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
         """
-        if recognised:
-            return Tracking()
+        if measured:
+            return TrackingState()
         unmatched = self.unmatched + 1
         unknown = self.unknown + (stereo_features >= _ENOUGH_FEATURES)
-        return Tracking(unmatched, unknown, self.lost or (vague and unmatched >= config.lost_after))
+        return TrackingState(unmatched, unknown, self.lost or (uncertain and unmatched >= lost_after))
 
-    def may_add(self, config: MapConfig) -> bool:
+    def may_add(self, restart_after: int) -> bool:
         """Whether new landmarks may join the map.
 
-        Not where the pose is unknown; but where nothing was recognised for long although there was enough to see, the
-        place is an unknown one, and is mapped from the predicted pose on.
+        Not while the pose is unknown. But after `restart_after` frames that showed enough and matched nothing, the
+        place is taken for an unknown one, and is mapped from the predicted pose on.
         """
-        return not self.unmatched or (self.unknown > 0 and self.unknown % config.restart_after == 0)
+        return not self.unmatched or (self.unknown > 0 and self.unknown % restart_after == 0)

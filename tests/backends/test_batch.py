@@ -16,7 +16,7 @@ from backends.smoother.solver import SolverError
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.run.simulated_recording import true_recording

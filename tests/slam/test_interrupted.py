@@ -17,8 +17,7 @@ import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.errors import MeasurementError
-from slam.mapping.map_io import SavedMap
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
@@ -175,6 +174,6 @@ def test_the_same_frame_again_is_refused_in_plain_words_and_the_map_is_whole():
     assert not system.backend.fail  # it was reached
     with pytest.raises(MeasurementError, match="not later"):
         system.process_features(replace(fresh, stamp=1.0 + k / 30))
-    assert len(SavedMap.of(system)) == len(system.landmarks) == len(before)
+    assert len(system.snapshot()) == len(system.landmarks) == len(before)
     system.process_features(replace(fresh, stamp=1.1 + k / 30))
     assert_agree(system)

@@ -9,7 +9,7 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, UnknownNameError
 from slam.geometry import se3
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.objects.modes import NoDetector
 from slam.system import StereoSlam

@@ -6,15 +6,10 @@ import pytest
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.landmarks import LandmarkRows
-from slam.mapping.selection import (
-    MapConfig,
-    bad_landmarks,
-    crowded_landmarks,
-    doubled_landmarks,
-    known_features,
-    new_landmarks,
-    surplus_landmarks,
-)
+from slam.mapping.config import MapConfig
+from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
+from slam.mapping.duplicates import doubled_landmarks, known_features
+from slam.mapping.selection import new_landmarks
 from slam.tracking.visibility import MapView, expected_landmarks, similar_view
 from tests.slam.scene import RIG
 

@@ -13,6 +13,7 @@ from slam.data import FrameStatus
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap
 from slam.mapping.monocular import find_pose, frame_covariance, two_view_depth
+from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
 from slam.tracking.localizer import Localizer
@@ -91,7 +92,7 @@ def test_the_pose_in_a_map_from_left_pixels_alone():
     cloud, T = Cloud(120), se3.exp(np.array([0.05, -0.2, 0.1, 0.4, -0.1, 0.3]))
     known = map_of(cloud)
     features, _ = cloud.features(T, 0.0, 0.3)
-    localizer = Localizer(RIG, SystemConfig().association, 0.5)
+    localizer = Localizer(RIG, SystemConfig().association, EstimatorModels(pixel_sigma=0.5))
     left = replace(features, uv_right=features.uv_right * np.nan)
     found = find_pose(RIG, known, left, localizer, seed=0)
     # from three points alone; least squares on all follow elsewhere
@@ -139,7 +140,7 @@ def test_the_desk_with_left_images_alone(backend):
     first = StereoSlam(one.rig, None, backend, config=config)
     for k in range(0, 100, 2):
         first.process_features(one.observations(k))
-    whole = SavedMap.of(first)
+    whole = first.snapshot()
     rows = np.arange(0, len(whole), 4)
     names = ("ids", "positions", "covariances", "descriptors", "laplacian", "seen", "in_view")
     known = SavedMap(*(getattr(whole, name)[rows] for name in names))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam

@@ -13,7 +13,7 @@ import pytest
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.errors import MeasurementError
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path

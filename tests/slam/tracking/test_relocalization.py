@@ -11,11 +11,11 @@ import pytest
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
 from slam.geometry import se3
-from slam.mapping.selection import MapConfig
+from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.tracking.relocalization import PoseHypotheses
-from slam.tracking.state import Tracking
+from slam.tracking.hypotheses import PoseHypotheses
+from slam.tracking.state import TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother")
@@ -141,10 +141,9 @@ def test_carried_off_to_an_unknown_place_the_map_begins_anew(backend):
 
 
 def test_what_counts_as_lost():
-    config = MapConfig(lost_after=3, restart_after=4)
-    steps = [Tracking()]
+    steps = [TrackingState()]
     for vague, features in ((False, 50), (False, 50), (False, 0), (True, 50), (True, 50)):
-        steps.append(steps[-1].after(False, vague, features, config))
+        steps.append(steps[-1].after(False, vague, features, lost_after=3))
     assert [s.lost for s in steps] == [False, False, False, False, True, True]
-    assert [s.may_add(config) for s in steps] == [True, False, False, False, False, True]
-    assert steps[-1].after(True, True, 50, config) == Tracking()
+    assert [s.may_add(4) for s in steps] == [True, False, False, False, False, True]
+    assert steps[-1].after(True, True, 50, 3) == TrackingState()

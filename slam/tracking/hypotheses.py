@@ -1,4 +1,4 @@
-"""A camera that was carried off: it is found again where the prediction, however vague, would not have it."""
+"""Poses far from the prediction on which landmarks agree: is the camera kidnapped (moved while it saw nothing)?"""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.geometry.se3 import Array, inverse, log
-from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, MapBackend
 from slam.models import EstimatorModels
 
 _SIGMAS = 3.0
-_LEAST_VARIANCE = 1e-12  # of a landmark's place along any direction [m²]
 _SLACK = 0.05  # between two poses found one by one [m], [rad]
 
 
@@ -38,21 +35,3 @@ class PoseHypotheses:
         turn = np.linalg.norm(step[:3]) < _SLACK + _SIGMAS * models.initial_angular_velocity_sigma * dt
         way = np.linalg.norm(step[3:]) < _SLACK + _SIGMAS * models.initial_velocity_sigma * dt
         return PoseHypotheses(self.count + 1 if turn and way else 1, stamp, T_world_left)
-
-
-def transfer_landmarks(old: Backend, new: Backend) -> Trajectory:
-    """Give a new back end the landmarks of an old one.
-
-    What the landmarks' errors have in common is lost, as with a map from a file.
-
-    Returns:
-        the path that the old one leaves, but for its newest pose.
-    """
-    assert isinstance(new, MapBackend)
-    whole = old.estimate()
-    covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
-    short = np.maximum(_LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)  # by rounding
-    covariances = covariances + short[:, None, None] * np.eye(3)
-    new.insert(whole.ids, whole.positions, covariances)
-    path = old.trajectory()
-    return Trajectory(path.stamps[:-1], path.poses[:-1])

@@ -1,0 +1,68 @@
+"""Features and landmarks that are the same as a landmark already: by position and by descriptor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import StereoFeatures
+from slam.geometry.arrays import Array, BoolArray
+from slam.landmarks import LandmarkRows
+from slam.mapping.config import MapConfig
+from slam.tracking.association import pairs_in_boxes
+from slam.tracking.visibility import MapView
+
+_SIGMAS = 3.0  # standard deviations of the depth within which two positions along a line of sight are the same
+_SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
+
+
+def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, config: MapConfig) -> BoolArray:
+    """Which features (F,) are landmarks although they were not recognised: the same place and the same looks.
+
+    The place is the same within `same_distance`, or within what the depth's uncertainty allows along the line of sight.
+    """
+    out = np.zeros(len(features), bool)
+    feature, rows = _near_landmarks(features.uv_left, view, config)
+    offset = view.points[feature] - view.local[rows]
+    along = np.abs(offset[:, 2]) < _SIGMAS * view.depth_sigma[feature]
+    same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
+    same &= _alike(landmarks, rows, features.descriptors[feature], features.laplacian[feature], config)
+    out[feature[same]] = True
+    return out
+
+
+def doubled_landmarks(view: MapView, landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+    """Which landmarks in view (N,) are the same as another that was seen more often (or is older)."""
+    out = np.zeros(len(landmarks), bool)
+    shown = np.flatnonzero(view.in_image)
+    one, other = _near_landmarks(view.uv_left[shown], view, config)
+    one = shown[one]
+    less = (landmarks.seen[one] < landmarks.seen[other]) | (
+        (landmarks.seen[one] == landmarks.seen[other]) & (one > other)
+    )
+    one, other = one[less], other[less]
+    same = np.linalg.norm(view.positions[one] - view.positions[other], axis=1) < config.same_distance
+    same &= _alike(landmarks, one, landmarks.descriptors[other], landmarks.laplacian[other], config)
+    out[one[same]] = True
+    return out
+
+
+def _near_landmarks(uv: Array, view: MapView, config: MapConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of pixels (P, 2) and of landmarks in view that lie near each other in the image."""
+    shown = np.flatnonzero(view.in_image)
+    if not len(uv) or not len(shown):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    at, which = pairs_in_boxes(uv, np.full((len(uv), 2), _SAME_PIXELS), view.uv_left[shown])
+    return at, shown[which]
+
+
+def _alike(
+    landmarks: LandmarkRows,
+    rows: NDArray[np.intp],
+    descriptors: NDArray[np.float32],
+    laplacian: NDArray[np.int8],
+    config: MapConfig,
+) -> BoolArray:
+    """Whether landmarks look like these descriptors (P, D) and signs of the Laplacian (P,)."""
+    distance = np.linalg.norm(landmarks.descriptors[rows] - descriptors, axis=1)
+    return np.asarray((distance < config.same_descriptor) & (landmarks.laplacian[rows] == laplacian))

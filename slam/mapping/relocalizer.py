@@ -1,0 +1,188 @@
+"""Starting a back end in a map: where a kidnapped camera was found, or where the camera is in a map from a file.
+
+Until the camera has been found in a map from a file, no estimator runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from slam import registry
+from slam.data import Estimate, FrameResult, FrameStatus, Prediction, StereoFeatures, UpdateReport, UpdateStatus
+from slam.errors import ConfigurationError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.interfaces import Backend, MapBackend
+from slam.mapping.map_io import SavedMap
+from slam.models import EstimatorModels
+from slam.tracking.localizer import Localizer
+
+#: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
+#: back end itself measures the landmarks that give that pose: a narrow prior would count them twice.
+POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
+
+REASON = "the camera has not been found in the map yet"
+
+_LEAST_VARIANCE = 1e-12  # of a landmark's position along any direction [m²], against rounding
+
+
+class Relocalizer:
+    """Starts back ends of one kind in a map.
+
+    Args:
+        rig: the cameras.
+        models: what the back ends assume.
+        backend: their name; None where none can be made, as the first one was given as an object.
+        options: theirs.
+        localizer: finds landmarks in frames.
+
+    Attributes:
+        search: looks for the camera in the map that the system was started with; None without one, or once it is found.
+        past: the paths that back ends before the present one have left.
+        restarted: indices of the frames in which another back end took over.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        models: EstimatorModels,
+        backend: str | None,
+        options: Mapping[str, Any],
+        localizer: Localizer,
+    ) -> None:
+        self._rig = rig
+        self._models = models
+        self._backend = backend
+        self._options = options
+        self._localizer = localizer
+        self.search: MapSearch | None = None
+        self.past: list[Trajectory] = []
+        self.restarted: list[int] = []
+
+    def search_in(self, known: SavedMap, backend: Backend) -> None:
+        """Look for the camera in a map before any back end starts.
+
+        Raises:
+            ConfigurationError: the back end was not given by its name, or cannot start in a known map.
+        """
+        if self._backend is None:
+            raise ConfigurationError("a system that starts in a known map needs its back end by name")
+        self.search = MapSearch(known, self._rig, self._localizer, self._models.initial_pose)
+        self.search.fill(backend)
+
+    def can_restart(self, old: Backend) -> bool:
+        """Whether another back end can take over from this one."""
+        return self._backend is not None and isinstance(old, MapBackend)
+
+    def restart(self, old: Backend, T_world_left: Array) -> tuple[Backend, Trajectory]:
+        """A new back end at a pose (4, 4) in the map of an old one: the old one would take the displacement for motion.
+
+        Correlations between the landmarks are lost, as with a map from a file.
+
+        Returns:
+            the new back end, and the path that the old one leaves, but for its newest pose.
+        """
+        new = self.start(T_world_left)
+        assert isinstance(new, MapBackend)
+        whole = old.estimate()
+        covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
+        short = np.maximum(_LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
+        new.insert(whole.ids, whole.positions, covariances + short[:, None, None] * np.eye(3))
+        return new, old.trajectory().select(slice(None, -1))
+
+    def start(self, T_world_left: Array) -> Backend:
+        """A back end without landmarks at a pose (4, 4) that is only roughly known."""
+        assert self._backend is not None
+        models = replace(
+            self._models,
+            T_world_left=T_world_left.tolist(),
+            initial_position_sigma=POSITION_SIGMA,
+            initial_rotation_sigma=ROTATION_SIGMA,
+        )
+        backend: Backend = registry.create("backends", self._backend, self._rig, models=models, **self._options)
+        return backend
+
+
+class MapSearch:
+    """Looks for the camera in a known map, by descriptors over the whole map and a geometric check.
+
+    Args:
+        known: the map.
+        rig: the cameras.
+        localizer: finds landmarks in frames.
+        T_world_left: where the camera is said to be (4, 4): tried first, no more.
+    """
+
+    def __init__(self, known: SavedMap, rig: StereoRig, localizer: Localizer, T_world_left: Array) -> None:
+        self.known = known
+        self._rig = rig
+        self._localizer = localizer
+        self._guess = T_world_left
+
+    def locate(self, features: StereoFeatures, seed: int) -> Array | None:
+        """The pose (4, 4) in the map on which landmarks agree, or None.
+
+        Raises:
+            SlamError: the descriptors are not of the length of the map's.
+        """
+        self.known.require_fits("", features.descriptors.shape[1])
+        guess = self._guess
+        if not features.has_stereo.any():
+            from slam.mapping.monocular import find_pose
+
+            found = find_pose(self._rig, self.known, features, self._localizer, seed)
+            if found is None:
+                return None
+            guess = found
+        prediction = nowhere(features.stamp, guess)
+        matches = self._localizer.match(prediction, self.known.rows, self.known.positions, features, seed)
+        return matches.T_world_left if len(matches) >= self._localizer.config.minimum_consistent else None
+
+    def fill(self, backend: Backend) -> None:
+        """Give a back end the map.
+
+        Raises:
+            ConfigurationError: it cannot start in a known map.
+        """
+        if not isinstance(backend, MapBackend):
+            raise ConfigurationError(f"{type(backend).__name__} cannot start in a known map: it has no insert")
+        backend.insert(self.known.ids, self.known.positions, self.known.covariances)
+
+    def estimate(self, stamp: float) -> Estimate:
+        """What is known without a pose: the map. The pose is the guess, its covariance says that it means nothing."""
+        none = nowhere(stamp, self._guess)
+        k = self.known
+        return Estimate(stamp, none.T_world_left, none.covariance, k.ids, k.positions, k.covariances)
+
+    def lost(self, index: int, features: StereoFeatures) -> FrameResult:
+        """The result of a frame in which the camera was not found."""
+        none, rows = np.zeros(0, np.int64), np.zeros(0, np.intp)
+        whole = self.estimate(features.stamp)
+        estimate = replace(whole, ids=none, positions=whole.positions[:0], covariances=whole.covariances[:0])
+        return FrameResult(
+            index=index,
+            status=FrameStatus.LOST,
+            reason=REASON,
+            estimate=estimate,
+            report=UpdateReport.nothing(UpdateStatus.EMPTY, REASON),
+            features=features,
+            predicted=0,
+            matched=none,
+            matched_features=rows,
+            added=none,
+            added_features=rows,
+            erased=none,
+            map_size=len(self.known),
+            located=False,
+        )
+
+
+def nowhere(stamp: float, T_world_left: Array) -> Prediction:
+    """A prediction that says nothing: no landmark is expected anywhere."""
+    none, P = np.zeros((0, 2)), np.diag(np.repeat([np.pi**2, 1e6], 3))
+    return Prediction(stamp, T_world_left, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))

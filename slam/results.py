@@ -1,0 +1,61 @@
+"""The result of a step, put together from what its parts gave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from slam.data import FrameResult, FrameStatus, UpdateStatus
+from slam.mapping.mapper import MapChange, Step
+from slam.object_data import MovingObject
+
+
+def frame_result(
+    step: Step,
+    change: MapChange,
+    objects: tuple[MovingObject, ...],
+    mapped_before: bool,
+    shift: float,
+    milliseconds: Mapping[str, float],
+) -> FrameResult:
+    """What a step did.
+
+    Args:
+        step: what the frame brought.
+        change: what it did to the map.
+        objects: the moving bodies.
+        mapped_before: whether there ever was a landmark before this frame.
+        shift: how far the right pixels of earlier frames were moved before it [px].
+        milliseconds: wall time per stage.
+    """
+    status, reason = frame_status(step, len(change.added), mapped_before)
+    return FrameResult(
+        index=step.index,
+        status=status,
+        reason=reason,
+        estimate=step.estimate,
+        report=step.report,
+        features=step.features,
+        predicted=len(step.prediction.ids),
+        matched=step.matches.ids,
+        matched_features=step.matches.rows,
+        added=change.added.ids,
+        added_features=change.added.rows,
+        erased=change.erased,
+        map_size=len(change.landmarks),
+        milliseconds=dict(milliseconds),
+        moving_features=step.labels.moving,
+        objects=objects,
+        shift=shift,
+    )
+
+
+def frame_status(step: Step, added: int, mapped_before: bool) -> tuple[FrameStatus, str]:
+    """How a frame ended, and why where it was not tracked."""
+    if step.report.status is UpdateStatus.FAILED:
+        return FrameStatus.FAILED, step.report.reason
+    if not step.state.unmatched:
+        return FrameStatus.TRACKED, ""
+    if not mapped_before:
+        return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
+    reason = step.report.reason or f"only {len(step.report.used)} landmarks recognised"
+    return (FrameStatus.LOST if step.state.lost else FrameStatus.PREDICTED), reason
