@@ -110,6 +110,9 @@ def run_command(
     draw: Annotated[
         Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
     ] = None,
+    overlap: Annotated[
+        bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
+    ] = True,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
 ) -> None:
     """Run one sequence through one back end."""
@@ -125,7 +128,7 @@ def run_command(
     config = default.with_settings([*mono_settings, *(settings or [])])
     if mono and known_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
-    options = RunOptions(backend, frontend, config, out, start, stop, record, known_map, save_map, mono)
+    options = RunOptions(backend, frontend, config, out, start, stop, record, known_map, save_map, mono, overlap)
     progress = Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet)
     with ExitStack() as stack:
         watches = []

@@ -52,6 +52,7 @@ class RunOptions:
         known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
         mono: use the left images alone.
+        overlap: read and extract the next frame while the present one is estimated; the results are the same.
     """
 
     backend: str
@@ -64,6 +65,7 @@ class RunOptions:
     known_map: Path | None = None
     save_map: Path | None = None
     mono: bool = False
+    overlap: bool = True
 
 
 @dataclass
@@ -77,6 +79,7 @@ class RunRecord:
     covariances: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # of the clock at the end of each frame [s]
     rejected: int = 0
     used: int = 0
     nis: float = 0.0
@@ -87,6 +90,7 @@ class RunRecord:
         self.numbers.append(number)
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
+        self.times.append(time.perf_counter())
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)
@@ -142,7 +146,9 @@ def run(
     system = StereoSlam(
         sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
     )
-    return _drive(sequence, options, system, _processed(system, frames, tuple(watches)), RunRecord(), on_frame)
+    return _drive(
+        sequence, options, system, _processed(system, frames, tuple(watches), options.overlap), RunRecord(), on_frame
+    )
 
 
 def run_recording(
@@ -250,12 +256,12 @@ def _recording(
 
 
 def _processed(
-    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]
+    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...], overlap: bool
 ) -> Iterator[tuple[int, FrameResult]]:
     """Each frame's number and what the system did with it."""
-    for frame, elapsed in _timed(frames):
-        result = system.process(frame)
-        result.milliseconds["read"] = elapsed  # type: ignore[index]
+    reading = _Reading(frames)
+    for frame, result in system.run(reading, overlap):
+        result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
         yield frame.index, result
         for watch in watches:
             watch(frame, result, system)
@@ -283,14 +289,21 @@ class _Replayed:
         return self.recording.landmarks(len(self.record.stamps))
 
 
-def _timed(frames: Iterator[StereoFrame]) -> Iterator[tuple[StereoFrame, float]]:
-    """Frames with the wall time that reading each took [ms]."""
-    while True:
-        start = time.perf_counter()
-        frame = next(frames, None)
-        if frame is None:
-            return
-        yield frame, 1e3 * (time.perf_counter() - start)
+class _Reading:
+    """Frames, and the wall time that reading each took [ms] by its index."""
+
+    def __init__(self, frames: Iterator[StereoFrame]) -> None:
+        self._frames = frames
+        self.milliseconds: dict[int, float] = {}
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        while True:
+            start = time.perf_counter()
+            frame = next(self._frames, None)
+            if frame is None:
+                return
+            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start)
+            yield frame
 
 
 def _summary(sequence: Sequence | Recording, options: RunOptions, record: RunRecord, ended: str) -> dict[str, Any]:
@@ -342,8 +355,8 @@ def _figures(
 
 def _rate(record: RunRecord) -> float | None:
     """Frames per second over all frames but the first, which may wait for compilers; None for a single frame."""
-    seconds = sum(sum(m.values()) for m in record.milliseconds[1:]) / 1e3
-    return (len(record.milliseconds) - 1) / seconds if seconds > 0 else None
+    seconds = record.times[-1] - record.times[0]
+    return (len(record.times) - 1) / seconds if seconds > 0 else None
 
 
 def _timings(record: RunRecord) -> dict[str, Any]:
