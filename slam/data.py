@@ -20,6 +20,7 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
 if TYPE_CHECKING:
+    from slam.calibration.correction import Revision
     from slam.object_data import MovingObject
 
 IdArray = NDArray[np.int64]
@@ -249,7 +250,8 @@ class FrameResult:
         moving_features: rows of features that are judged to move (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
         located: False where the camera has not been found yet in the map that it was started with: its pose is none.
-        shift: before the step, the right pixels of all earlier frames were moved by so much (`RevisingBackend`) [px].
+        revision: before the step, the pixels of all earlier frames were corrected anew (`RevisingBackend`); None where
+            they were not.
     """
 
     index: int
@@ -269,4 +271,4 @@ class FrameResult:
     moving_features: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     objects: tuple[MovingObject, ...] = ()
     located: bool = True
-    shift: float = 0.0
+    revision: Revision | None = None

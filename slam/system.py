@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam import registry
-from slam.calibration.disparity_offset import SelfCalibration
+from slam.calibration import Revision, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import (
     Estimate,
@@ -36,7 +36,7 @@ from slam.tracking.relocalization import PoseHypotheses, transfer_landmarks
 from slam.tracking.state import Tracking
 
 _MINIMUM_TRACKED = 3  # stereo points that fix a pose
-_COUNTS = 0.5  # standard deviations of the disparity's error; what changes by less is as likely as before
+_COUNTS = 0.5  # standard deviations of the disparities' error; what changes by less is as likely as before
 
 
 class StereoSlam:
@@ -127,7 +127,7 @@ class StereoSlam:
         if self._search is not None and not self._located(self._search, features):
             self._index += 1
             return self._search.lost(self._index, features)
-        shift = self._revise()
+        revision = self._revise()
         prediction = self.backend.predict(features.stamp)
         self._index += 1
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
@@ -135,7 +135,8 @@ class StereoSlam:
         measured, features = features, self.calibration.correct(features)
         prediction, found = self._localize(prediction, landmarks, features)
         found = found.without(self.objects.suspects)
-        self.calibration.observe(found.ids, measured.uv_left[found.rows], measured.uv_right[found.rows])
+        pose = prediction.T_world_left if found.T_world_left is None else found.T_world_left
+        self.calibration.observe(measured, pose)
         clock.lap("associate")
         report = self.backend.update(observations_of(features, found), found.T_world_left)
         clock.lap("update")
@@ -167,21 +168,21 @@ class StereoSlam:
             milliseconds=clock.laps,
             moving_features=judged.moving,
             objects=objects,
-            shift=shift,
+            revision=revision,
         )
 
-    def _revise(self) -> float:
-        """Take what has become known of the disparity's error into use, for what was given to the back end as well.
+    def _revise(self) -> Revision | None:
+        """Take what has become known of the rig's error into use, for what was given to the back end as well.
 
         All its measurements are then to be weighed anew, so a back end that can do that waits for a change that counts.
         """
         if not isinstance(self.backend, RevisingBackend):
             self.calibration.apply()
-            return 0.0
-        shift = self.calibration.apply(_COUNTS)
-        if shift:
-            self.backend.shift_right(shift)
-        return shift
+            return None
+        revision = self.calibration.apply(_COUNTS)
+        if revision is not None:
+            self.backend.revise(revision.rows)
+        return revision
 
     @property
     def unlocated_map(self) -> SavedMap | None:

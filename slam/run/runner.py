@@ -290,7 +290,7 @@ def _finish(
             **consistency(record.trajectory, np.array(record.covariances), sequence),
         }
         if isinstance(system, StereoSlam):
-            summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+            summary["self_calibration"] = system.calibration.summary()
         if score is not None:
             summary["objects"] = score.summary()
         summary["milliseconds"] = _timings(record)
