@@ -5,7 +5,7 @@ Every landmark is a variable and every accepted measurement a factor of its own;
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -89,9 +89,9 @@ class BatchBackend:
         self._solution = None
 
     @one_blas_thread
-    def shift_right(self, shift: float) -> None:
-        """See `slam.interfaces.RevisingBackend.shift_right`."""
-        self._smoother.shift_right(shift)
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """See `slam.interfaces.RevisingBackend.revise`."""
+        self._smoother.revise(mend)
         self._solution = None
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from slam.calibration.disparity_offset import SelfCalibrationConfig
+from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
@@ -53,7 +53,7 @@ class SystemConfig:
         models: noise, priors and motion model of all back ends.
         association: search windows, descriptor distances, geometric check.
         map: which features become landmarks and which landmarks are dropped.
-        self_calibration: the disparity offset found while running.
+        self_calibration: the rig's error, found while running.
         objects: the detector of moving objects.
         frontend: options of the front end by name.
         backend: options of the back end by name.

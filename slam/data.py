@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,6 +214,14 @@ class Estimate:
     covariances: Array
 
 
+class Revision(Protocol):
+    """A change of the rig's correction in the course of a run, for measurements that were corrected as before."""
+
+    def rows(self, z: Array) -> Array:
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""
+        ...
+
+
 class FrameStatus(str, Enum):
     """How a frame ended."""
 
@@ -245,7 +254,8 @@ class FrameResult:
         moving_features: rows of features that are judged to move (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
         located: False where the camera has not been found yet in the map that it was started with: its pose is none.
-        shift: before the step, the right pixels of all earlier frames were moved by so much (`RevisingBackend`) [px].
+        revision: before the step, the pixels of all earlier frames were corrected anew (`RevisingBackend`); None where
+            they were not.
     """
 
     index: int
@@ -265,4 +275,4 @@ class FrameResult:
     moving_features: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     objects: tuple[MovingObject, ...] = ()
     located: bool = True
-    shift: float = 0.0
+    revision: Revision | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from slam.data import Estimate, IdArray, Observations, Prediction, StereoFeatures, StereoFrame, UpdateReport
@@ -128,11 +128,14 @@ class ObjectBackend(Protocol):
 class RevisingBackend(Protocol):
     """What a back end offers besides, where it can mend measurements that it was given long ago."""
 
-    def shift_right(self, shift: float) -> None:
-        """Move the right pixels of all measurements so far by `shift` along the rectified row [rectified px].
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """Mend all measurements so far: `mend` takes rectified rows (uL, vL, uR) (N, 3) [px] to better ones.
 
-        Called before `Backend.predict`, when more has become known of a constant error of the disparity. A back end
-        without this goes on with what it made of the measurements as they were.
+        Called before `Backend.predict`, when more has become known of the rig's error; uR is NaN where there is none,
+        and stays so. A back end without this goes on with what it made of the measurements as they were.
+
+        Raises:
+            MeasurementError: a mended measurement is not finite.
         """
         ...
 

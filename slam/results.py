@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from slam.data import FrameResult, FrameStatus, UpdateStatus
+from slam.data import FrameResult, FrameStatus, Revision, UpdateStatus
 from slam.mapping.mapper import MapChange, Step
 from slam.object_data import MovingObject
 
@@ -14,7 +14,7 @@ def frame_result(
     change: MapChange,
     objects: tuple[MovingObject, ...],
     mapped_before: bool,
-    shift: float,
+    revision: Revision | None,
     milliseconds: Mapping[str, float],
 ) -> FrameResult:
     """What a step did.
@@ -24,7 +24,7 @@ def frame_result(
         change: what it did to the map.
         objects: the moving bodies.
         mapped_before: whether there ever was a landmark before this frame.
-        shift: how far the right pixels of earlier frames were moved before it [px].
+        revision: how the pixels of earlier frames were corrected anew before it.
         milliseconds: wall time per stage.
     """
     status, reason = frame_status(step, len(change.added), mapped_before)
@@ -45,7 +45,7 @@ def frame_result(
         milliseconds=dict(milliseconds),
         moving_features=step.labels.moving,
         objects=objects,
-        shift=shift,
+        revision=revision,
     )
 
 

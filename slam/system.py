@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slam import registry
-from slam.calibration.disparity_offset import SelfCalibration
+from slam.calibration import Revision, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SlamError
@@ -27,7 +27,7 @@ from slam.tracking.feature_check import usable
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
 
-#: Standard deviations of the disparity's error by which a correction must change for a back end to revise the past.
+#: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
 _REVISION = 0.5
 
 
@@ -104,13 +104,14 @@ class StereoSlam:
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if known_map is None else known_map.world_frame
+        self._uncertainty = RigUncertainty(self.calibration.model, c.models.pixel_sigma)
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
         self._stamp = -np.inf  # that the back end was last advanced to [s]
-        self._shifted = 0.0  # by how much the back end has moved its right pixels [px]
+        self._given = self.calibration.applied  # the correction of all that the back end was given
         if known_map is not None:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
@@ -165,7 +166,7 @@ class StereoSlam:
             self._last = replace(self._last, index=index)
             return self._relocalizer.search.lost(index, features)
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
-            shift = self._revise()
+            revision = self._revise()
             prediction = self.backend.predict(features.stamp)
             self._stamp = features.stamp
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
@@ -174,19 +175,24 @@ class StereoSlam:
             prediction, matches = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
             matches = matches.without(held)
-            self.calibration.observe(matches.ids, raw.uv_left[matches.rows], raw.uv_right[matches.rows])
+            pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
+            self.calibration.observe(raw, pose)
         with stages.stage("update"):  # the measurement of the landmarks
             report = self.backend.update(matches.observations(features), matches.T_world_left)
             state = self._localizer.state_after(self._last.state, prediction, features, matches, report)
         with stages.stage("estimate"):
             estimate = self.backend.estimate(landmarks=False)
+            self._uncertainty.observe(estimate.T_world_left, report.used, self.backend.positions(report.used))
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(index, features, prediction, matches, held, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
-        result = frame_result(step, change, objects, self._last.mapped, shift, stages.milliseconds)
+            new = np.setdiff1d(change.added.ids, change.erased)
+            self._uncertainty.change(new, self.backend.positions(new), change.erased)
+        step = replace(step, estimate=self._considered(estimate))
+        result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self._stages = self._last.after(step, change), change.landmarks, Stages()
         return result
@@ -213,7 +219,7 @@ class StereoSlam:
         """Pose and map with covariances."""
         self.roll_back()
         search = self._relocalizer.search
-        return self.backend.estimate() if search is None else search.estimate(float("nan"))
+        return self._considered(self.backend.estimate()) if search is None else search.estimate(float("nan"))
 
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.
@@ -235,20 +241,29 @@ class StereoSlam:
         """Indices of the frames in which another back end took over, as the camera had been kidnapped."""
         return self._relocalizer.restarted
 
-    def _revise(self) -> float:
-        """Apply what has become known of the disparity's error; returns how far earlier right pixels were moved [px].
+    def _considered(self, estimate: Estimate) -> Estimate:
+        """The back end's estimate with the rig's uncertainty, which it knows nothing of."""
+        if not self.calibration.config.enabled:
+            return estimate
+        return self._uncertainty.added_to(estimate, self.calibration.posterior.covariance)
 
-        A back end that weighs all its measurements anew for that waits for a change that is significant.
+    def _revise(self) -> Revision | None:
+        """Apply what has become known of the rig's error, also to what a back end was given before, if it can do that.
+
+        As all its measurements are then weighed anew, that waits for a change that is significant.
         """
         if not isinstance(self.backend, RevisingBackend):
-            self.calibration.apply()
-            return 0.0
+            change = self.calibration.apply()
+            if change is not None:
+                self._uncertainty.corrected(change.after.parameters - change.before.parameters)
+            return None
         self.calibration.apply(_REVISION)
-        shift = self.calibration.applied - self._shifted
-        if shift:
-            self.backend.shift_right(shift)
-            self._shifted = self.calibration.applied
-        return shift
+        if self.calibration.applied is self._given:
+            return None
+        revision = Revision(self._given, self.calibration.applied)
+        self.backend.revise(revision.rows)
+        self._given = revision.after
+        return revision
 
     def _locate(self, features: StereoFeatures, index: int) -> bool:
         """Look for the camera in the map that the system was started with; where it is found, the back end starts."""
@@ -260,7 +275,7 @@ class StereoSlam:
         new = self._relocalizer.start(T)
         search.fill(new)
         self._mapper.next_id = int(search.known.ids.max(initial=-1)) + 1
-        self.backend, self._shifted, self._relocalizer.search = new, self.calibration.applied, None
+        self.backend, self._given, self._relocalizer.search = new, self.calibration.applied, None
         return True
 
     def _localize(
@@ -276,7 +291,7 @@ class StereoSlam:
             return prediction, LandmarkMatches.nothing()
         new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
         prediction, r = new.predict(features.stamp), self._relocalizer
-        self.backend, self._shifted, r.past, r.restarted = (
+        self.backend, self._given, r.past, r.restarted = (
             new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
         self.objects.restart()

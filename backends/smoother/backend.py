@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -191,13 +191,11 @@ class SmootherBackend:
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @one_blas_thread
-    def shift_right(self, shift: float) -> None:
-        """See `slam.interfaces.RevisingBackend.shift_right`: all is solved anew, as long as a run of so many frames."""
-        if not np.isfinite(shift):
-            raise MeasurementError(f"smoother: shift must be finite, got {shift}")
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """See `slam.interfaces.RevisingBackend.revise`: all is solved anew, as long as a run of so many frames."""
         self._commit()
         if self.measurement_log.measurements.count:
-            self._graph.shift_right(float(shift))
+            self._graph.revise(mend)
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 

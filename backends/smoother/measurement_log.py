@@ -342,9 +342,16 @@ class MeasurementLog:
             del self.history.explicit[variable], self.history.places[variable]
             self.landmarks.variable[slot] = -1
 
-    def shift_right(self, shift: float, point: Callable[[list[float]], Any]) -> None:
-        """Move all right pixels by `shift`; `point` makes the solver's measurements of rows (uL, vL, uR)."""
-        self.measurements.z[:, 2] += shift
+    def revise(self, mend: Callable[[Array], Array], point: Callable[[list[float]], Any]) -> None:
+        """Mend all measurements; `point` makes the solver's measurements of rows (uL, vL, uR).
+
+        Raises:
+            MeasurementError: a mended measurement is not finite.
+        """
+        z = mend(self.measurements.z.copy())
+        if not (np.isfinite(z) | np.isnan(self.measurements.z)).all():
+            raise MeasurementError("smoother: a mended measurement is not finite")
+        self.measurements.z[:] = z
         for track in self.landmarks.tracks.values():
             track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -173,10 +174,10 @@ class PoseGraph:
             self.measurement_log.finish(marks.tracks[slot])
         marks.remove(slots)
 
-    def shift_right(self, shift: float) -> None:
-        """Move all right pixels by `shift` [px] and solve anew."""
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """Mend all measurements and solve anew."""
         marks = self.measurement_log.landmarks
-        self.measurement_log.shift_right(shift, self._make.point)
+        self.measurement_log.revise(mend, self._make.point)
         self._recover()
         with suppress(SolverError):  # of a problem that could not be solved: the landmarks stay where they were
             for _ in range(_REFINED):

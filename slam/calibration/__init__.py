@@ -1,4 +1,21 @@
-"""The rig as something estimated: what the images tell about the error of its calibration.
+"""The rig as something estimated: what its calibration is off by, from the images alone, with a posterior.
 
-May import `slam.geometry` and the data.
+docs/selfcalibration.md derives the estimator. May import `slam.geometry` and the data.
 """
+
+from slam.calibration.config import SelfCalibrationConfig
+from slam.calibration.consider import RigUncertainty
+from slam.calibration.correction import Revision, RigCorrection
+from slam.calibration.estimator import SelfCalibration
+from slam.calibration.model import RigModel
+from slam.calibration.posterior import RigPosterior
+
+__all__ = [
+    "Revision",
+    "RigCorrection",
+    "RigModel",
+    "RigPosterior",
+    "RigUncertainty",
+    "SelfCalibration",
+    "SelfCalibrationConfig",
+]

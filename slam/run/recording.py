@@ -2,8 +2,8 @@
 
 Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
 ``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where
-earlier frames were mended ``shift``, and, where the true path is known, ``truth_stamps`` and ``truth_poses``. Meanings:
-`slam.run.replay.Recording`.
+earlier frames were corrected anew ``corrections``, and, where the true path is known, ``truth_stamps`` and
+``truth_poses``. Meanings: `slam.run.replay.Recording`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from slam.object_models import ObjectModels
 from slam.run.replay import RecordedRows, Recording
 
 _FORMAT = "surf-stereo-slam recording"
-_VERSION = 1
+_VERSION = 2
 _ROWS = ("frame", "ids", "uv_left", "uv_right")
 
 
@@ -52,8 +52,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     }
     for what, rows in (("observed", r.observed), ("added", r.added)):
         arrays.update({f"{what}_{key}": getattr(rows, key) for key in _ROWS})
-    if r.shift is not None and r.shift.any():
-        arrays["shift"] = r.shift
+    if r.corrections is not None:
+        arrays["corrections"] = r.corrections
     if r.ground_truth is not None:
         arrays.update(truth_stamps=r.ground_truth.stamps, truth_poses=r.ground_truth.poses)
     path = Path(path)
@@ -106,7 +106,7 @@ def _recording(arrays: Mapping[str, np.ndarray]) -> Recording:
         _array(arrays, "removed_frame", 1, np.int64),
         _array(arrays, "removed", 1, np.int64),
         truth,
-        shift=_array(arrays, "shift", 1, float) if "shift" in arrays else None,
+        corrections=_array(arrays, "corrections", 2, float) if "corrections" in arrays else None,
         kind=str(arrays.get("kind", "handheld")),
     )
     _check_lives(recording)

@@ -13,6 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from slam.calibration.correction import Revision, RigCorrection
+from slam.calibration.model import RigModel
 from slam.data import (
     FrameResult,
     FrameStatus,
@@ -47,7 +49,7 @@ class RecordedFrame:
         observed: landmarks of the map, as measured.
         added: landmarks that joined the map, at their first sight.
         removed: ids of those that left it (R,).
-        shift: before the frame, the right pixels of all earlier ones were moved by so much [px].
+        revision: before the frame, the pixels of all earlier ones were corrected anew; None where they were not.
     """
 
     number: int
@@ -55,7 +57,7 @@ class RecordedFrame:
     observed: Observations
     added: Observations
     removed: IdArray
-    shift: float = 0.0
+    revision: Revision | None = None
 
     @classmethod
     def of(cls, result: FrameResult, number: int | None = None) -> RecordedFrame:
@@ -67,7 +69,7 @@ class RecordedFrame:
             Observations(result.matched, f.uv_left[seen], f.uv_right[seen]),
             Observations(result.added, f.uv_left[new], f.uv_right[new]),
             result.erased,
-            result.shift,
+            result.revision if isinstance(result.revision, Revision) else None,
         )
 
 
@@ -121,7 +123,8 @@ class Recording:
         added: first measurements of those that joined it.
         removed_frame, removed: row of `stamps`, ascending, and id of each landmark that left the map (R,).
         ground_truth: the left camera's true path, where it is known.
-        shift: of the right pixels of all earlier frames, before each (F,) [px]; None for none at all.
+        corrections: parameters of the correction that each frame's pixels have, and all earlier frames' with it (F, n),
+            see `slam.calibration`; None where nothing was ever corrected anew.
         kind: of motion, which chooses a back end's default options.
 
     Raises:
@@ -139,7 +142,7 @@ class Recording:
     removed: IdArray
     ground_truth: Trajectory | None = None
     warnings: list[str] = field(default_factory=list)
-    shift: Array | None = None
+    corrections: Array | None = None
     kind: str = "handheld"
 
     format: ClassVar[str] = "recording"
@@ -148,8 +151,10 @@ class Recording:
         count = len(self.stamps)
         if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
-        if self.shift is not None and (self.shift.shape != (count,) or not np.isfinite(self.shift).all()):
-            raise MeasurementError("recording: shift must be finite, with a value for each stamp")
+        if self.corrections is not None:
+            shape = count, len(RigModel(self.rig).names)
+            if self.corrections.shape != shape or not np.isfinite(self.corrections).all():
+                raise MeasurementError("recording: corrections must be finite, with a row for each stamp")
         if self.removed.shape != self.removed_frame.shape:
             raise MeasurementError("recording: removed and removed_frame differ in length")
         frames = {"observed": self.observed.frame, "added": self.added.frame, "removed": self.removed_frame}
@@ -169,8 +174,15 @@ class Recording:
         """What was given in frame k."""
         gone = self.removed[slice(*np.searchsorted(self.removed_frame, [k, k + 1]))]
         number, stamp = int(self.numbers[k]), float(self.stamps[k])
-        shift = 0.0 if self.shift is None else float(self.shift[k])
-        return RecordedFrame(number, stamp, self.observed.at(k), self.added.at(k), gone, shift)
+        return RecordedFrame(number, stamp, self.observed.at(k), self.added.at(k), gone, self._revision(k))
+
+    def _revision(self, k: int) -> Revision | None:
+        """How frames before k are corrected anew; None where they are not."""
+        if self.corrections is None or not k or (self.corrections[k] == self.corrections[k - 1]).all():
+            return None
+        model = RigModel(self.rig)
+        before, after = (RigCorrection(model, self.corrections[i]) for i in (k - 1, k))
+        return Revision(before, after)
 
     def map_size(self, k: int) -> int:
         """Number of landmarks in the map after frame k."""
@@ -221,8 +233,20 @@ class Recording:
             np.repeat(np.arange(len(every)), [len(f.removed) for f in every]),
             np.concatenate([np.zeros(0, np.int64), *(np.asarray(f.removed, np.int64) for f in every)]),
             ground_truth,
-            shift=np.array([f.shift for f in every]),
+            corrections=_corrections(every),
         )
+
+
+def _corrections(frames: Sequence[RecordedFrame]) -> Array | None:
+    """Parameters of the correction in force in each frame (F, n); None where there never was a revision."""
+    revisions = [f.revision for f in frames]
+    first = next((r for r in revisions if r is not None), None)
+    if first is None:
+        return None
+    rows = [first.before.parameters]
+    for revision in revisions:
+        rows.append(rows[-1] if revision is None else revision.after.parameters)
+    return np.array(rows[1:])
 
 
 def _check_rows(what: str, rows: RecordedRows) -> None:
@@ -285,8 +309,8 @@ def _step(
 ) -> FrameResult:
     """One frame."""
     times = [time.perf_counter()]
-    if frame.shift and isinstance(backend, RevisingBackend):
-        backend.shift_right(frame.shift)
+    if frame.revision is not None and isinstance(backend, RevisingBackend):
+        backend.revise(frame.revision.rows)
     prediction = backend.predict(frame.stamp)
     times.append(time.perf_counter())
     guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
@@ -314,7 +338,7 @@ def _step(
         added_features=np.arange(seen, seen + new),
         erased=frame.removed,
         map_size=recording.map_size(k),
-        shift=frame.shift,
+        revision=frame.revision,
         milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
     )
 

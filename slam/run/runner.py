@@ -347,7 +347,7 @@ def _figures(
         "frames_per_second": _rate(record),
     }
     if isinstance(system, StereoSlam):
-        figures["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+        figures["self_calibration"] = system.calibration.summary()
     if score is not None:
         figures["objects"] = score.summary()
     return figures

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from slam.calibration.disparity_offset import SelfCalibration, SelfCalibrationConfig, _move, offset_from_pair
+
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError

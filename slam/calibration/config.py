@@ -1,0 +1,49 @@
+"""Settings of the self-calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from slam.errors import ConfigurationError
+from slam.models import FORBID_UNKNOWN
+
+
+@dataclass(frozen=True)
+class SelfCalibrationConfig:
+    """Settings of the self-calibration. What the calibration may be off by is in `slam.calibration.prior`.
+
+    Attributes:
+        enabled: False leaves all measurements as they are.
+        prior_scale: factor on all standard deviations of the prior; small for a rig that was calibrated with care.
+        pixel_sigma: noise of a left pixel [px]; only its ratio to `disparity_sigma` matters, the scale is estimated.
+        disparity_sigma: noise of a disparity [px].
+        systematic: error of the matching in row and disparity that all frames of a recording share [px].
+        kept_share: two views are compared once less than this share of the first view's features is matched.
+        minimum_common: least number of features matched in both views.
+        minimum_parallax: least median of what translation moves the features by between two views [px].
+        inflation: factor on the variance of the evidence before anything is known of its scatter.
+    """
+
+    enabled: bool = True
+    prior_scale: float = 1.0
+    pixel_sigma: float = 0.4
+    disparity_sigma: float = 0.2
+    systematic: float = 0.05
+    kept_share: float = 0.5
+    minimum_common: int = 30
+    minimum_parallax: float = 4.0
+    inflation: float = 4.0
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not isinstance(value, bool) and not (np.isfinite(value) and value > 0):
+                raise ConfigurationError(f"self_calibration: {f.name} must be positive and finite, got {value}")
+        if self.kept_share > 1:
+            raise ConfigurationError(f"self_calibration: kept_share must lie in (0, 1], got {self.kept_share}")
+        if self.minimum_common < 10:
+            raise ConfigurationError("self_calibration: minimum_common >= 10 is required (a pose and the rig)")

@@ -1,0 +1,177 @@
+"""The rig's uncertainty in poses and landmarks: how the estimate depends on the rig's parameters (Schmidt, 1966).
+
+A back end takes the rig for exact. What is left of the rig's error acts on all frames alike, so it does not average out
+as pixel noise does. With δ the error of the applied correction and ``Σ`` its covariance, poses and landmarks are
+
+    T_true = T exp(J δ),    y_true = y + L δ,
+
+and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. J follows
+in every frame from the landmarks that measured the pose: pixels that an ideal rig would have measured, ``z + F δ``, see
+landmarks that are displaced by L δ,
+
+    H (Rᵀ L + [h]ₓ J_ω − J_ρ) = F,
+
+which is solved for J by weighted least squares. A new landmark has ``L = R (H⁻¹ F − [h]ₓ J_ω + J_ρ)``. Where old
+landmarks are measured again, J goes back to what it was when they were first seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.calibration.model import RigModel
+from slam.data import Estimate
+from slam.geometry.arrays import Array, IdArray
+from slam.geometry.se3 import adjoint, hat, inverse, transform
+
+#: Standard deviation of the baseline's length, as a share of it. It scales the whole world, so images never show it:
+#: the squares of a calibration board are known to some tenths of a percent.
+BASELINE = 0.002
+
+_MINIMAL = 3  # landmarks that fix a pose
+
+
+@dataclass(frozen=True)
+class _Landmarks:
+    """Sensitivities of landmarks, a row each, ids ascending.
+
+    Attributes:
+        ids: (N,).
+        by_rig: ∂y/∂δ (N, 3, m).
+        covariance: of the position by pixel noise at first sight (N, 3, 3) [m²], relative to the camera.
+        seen: number of frames that measured it (N,).
+    """
+
+    ids: IdArray
+    by_rig: Array
+    covariance: Array
+    seen: IdArray
+
+    @classmethod
+    def none(cls, columns: int) -> _Landmarks:
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3, columns)), np.zeros((0, 3, 3)), np.zeros(0, np.int64))
+
+    def select(self, rows: np.ndarray) -> _Landmarks:
+        return _Landmarks(self.ids[rows], self.by_rig[rows], self.covariance[rows], self.seen[rows])
+
+
+class RigUncertainty:
+    """What the rig's uncertainty adds to the covariances of poses and landmarks.
+
+    Columns of all sensitivities are the parameters of `RigModel`, the baseline's length (a share), and one column of
+    unit variance: what earlier corrections, that are known by now, have left in a back end that cannot revise.
+
+    Args:
+        model: the rig's parameters.
+        pixel_sigma: noise of uL, vL, uR [px].
+    """
+
+    def __init__(self, model: RigModel, pixel_sigma: float) -> None:
+        self._model = model
+        self._noise = pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
+        self._columns = len(model.names) + 2
+        self._T_world: Array | None = None
+        self._pose: Array = np.zeros((6, self._columns))
+        self._landmarks = _Landmarks.none(self._columns)
+
+    def observe(self, T_world_left: Array, ids: IdArray, positions: Array) -> None:
+        """Take in a frame.
+
+        Args:
+            T_world_left: the estimated pose (4, 4).
+            ids: landmarks that measured it (M,).
+            positions: their estimated positions (M, 3) [m] in world coordinates.
+        """
+        T = T_world_left @ self._model.rig.rectified.T_left_rectified
+        if self._T_world is not None:
+            self._pose = adjoint(inverse(T) @ self._T_world) @ self._pose
+        self._T_world = T
+        known = self._landmarks
+        rows = np.searchsorted(known.ids, ids).clip(0, max(len(known.ids) - 1, 0))
+        old = known.ids[rows] == ids if len(known.ids) else np.zeros(len(ids), bool)
+        local = transform(inverse(T), positions[old])
+        good = local[:, 2] > 0
+        if good.sum() >= _MINIMAL:
+            self._solve(T[:3, :3], local[good], known.select(rows[old][good]))
+        seen = known.seen.copy()
+        seen[rows[old]] += 1
+        self._landmarks = replace(known, seen=seen)
+
+    def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
+        """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
+        assert self._T_world is not None
+        kept = self._landmarks.select(~np.isin(self._landmarks.ids, erased))
+        new = ~np.isin(ids, [*kept.ids, *erased])
+        local = transform(inverse(self._T_world), positions[new])
+        R = self._T_world[:3, :3]
+        back = np.linalg.inv(self._by_point(local))
+        by_rig = R @ (back @ self._field(local) + _by_pose(local) @ self._pose)
+        covariance = R @ back @ self._noise @ np.swapaxes(back, 1, 2) @ R.T
+        both = _Landmarks(
+            np.concatenate([kept.ids, ids[new]]),
+            np.concatenate([kept.by_rig, by_rig]),
+            np.concatenate([kept.covariance, covariance]),
+            np.concatenate([kept.seen, np.ones(int(new.sum()), np.int64)]),
+        )
+        self._landmarks = both.select(np.argsort(both.ids, kind="stable"))
+
+    def corrected(self, step: Array) -> None:
+        """The applied correction changed by `step` (n,), and the back end keeps what the old one made of the past."""
+        self._pose[:, -1] += self._pose[:, :-2] @ step
+        self._landmarks.by_rig[:, :, -1] += self._landmarks.by_rig[:, :, :-2] @ step
+
+    def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
+        """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
+        n = self._columns
+        factor = np.zeros((n, n))
+        values, vectors = np.linalg.eigh(covariance)
+        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0))
+        factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
+        J = adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose @ factor
+        positions = estimate.covariances
+        if len(estimate.ids):
+            rows = np.searchsorted(self._landmarks.ids, estimate.ids).clip(0, max(len(self._landmarks.ids) - 1, 0))
+            known = self._landmarks.ids[rows] == estimate.ids
+            L = self._landmarks.by_rig[rows[known]] @ factor
+            positions = positions.copy()
+            positions[known] += L @ np.swapaxes(L, 1, 2)
+        return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
+
+    def _solve(self, R: Array, local: Array, landmarks: _Landmarks) -> None:
+        """Sensitivity of the pose from landmarks at `local` (M, 3) [m] in the rectified left camera's coordinates."""
+        H = self._by_point(local)
+        A = -H @ _by_pose(local)
+        b = self._field(local) - H @ (R.T @ landmarks.by_rig)
+        P = R.T @ landmarks.covariance @ R / landmarks.seen[:, None, None]
+        W = np.linalg.inv(self._noise + H @ P @ np.swapaxes(H, 1, 2))
+        WA = W @ A
+        normal = np.tensordot(A, WA, axes=((0, 1), (0, 1)))
+        right = np.tensordot(WA, b, axes=((0, 1), (0, 1)))
+        normal += 1e-9 * np.trace(normal) * np.eye(6)
+        self._pose = np.asarray(np.linalg.solve(normal, right))
+
+    def _field(self, local: Array) -> Array:
+        """∂(x, y, d)/∂δ (M, 3, m) [px] at points (M, 3) [m]; the corrected pixels are those of an ideal rig."""
+        points = self._pixels(local)
+        out = np.zeros((len(local), 3, self._columns))
+        out[:, :, :-2] = self._model.field(points)
+        out[:, 2, -2] = -points[:, 2]  # a longer baseline makes the nominal one's disparity smaller
+        return out
+
+    def _pixels(self, local: Array) -> Array:
+        scale = self._model.focal / local[:, 2:]
+        return np.column_stack([local[:, :2] * scale, self._model.rig.baseline * scale])
+
+    def _by_point(self, local: Array) -> Array:
+        """∂(x, y, d)/∂h (M, 3, 3) [px/m] at points (M, 3) [m]."""
+        x, y, d = self._pixels(local).T
+        f, z, none = self._model.focal, local[:, 2], np.zeros(len(local))
+        rows = [[f + none, none, -x], [none, f + none, -y], [none, none, -d]]
+        return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) / z[:, None, None])
+
+
+def _by_pose(local: Array) -> Array:
+    """∂y/∂ξ (M, 3, 6) in camera axes of points (M, 3) [m] that move with the camera: [−[h]ₓ, I]."""
+    return np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (len(local), 3, 3))], axis=2)

@@ -1,0 +1,66 @@
+"""Corrections of pixels by a rig's parameters, for whoever holds measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.calibration.model import RigModel
+from slam.data import StereoFeatures
+from slam.geometry.se3 import Array
+
+_ROUNDS = 4  # of the fixed point that undoes a correction; each takes off a factor of some 30
+
+
+@dataclass(frozen=True)
+class RigCorrection:
+    """Takes measured pixels to those of an ideal rig.
+
+    Attributes:
+        model: the parameters' meaning.
+        parameters: their values (n,).
+    """
+
+    model: RigModel
+    parameters: Array
+
+    def rows(self, z: Array) -> Array:
+        """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]; uR NaN stays NaN."""
+        points = self.model.points(z)
+        return self.model.rows(points + self.model.field(points) @ self.parameters)
+
+    def undone(self, z: Array) -> Array:
+        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
+        corrected = points = self.model.points(z)
+        for _ in range(_ROUNDS):
+            points = corrected - self.model.field(points) @ self.parameters
+        return self.model.rows(points)
+
+    def features(self, features: StereoFeatures) -> StereoFeatures:
+        """Features with both pixels corrected; the right row keeps what is left of the vertical disparity."""
+        rectified_rig = self.model.rig.rectified
+        left, right = rectified_rig.rectify_left(features.uv_left), rectified_rig.rectify_right(features.uv_right)
+        z = np.column_stack([left, right[:, 0]])
+        vertical = right[:, 1] - left[:, 1] + self.model.vertical(self.model.points(z)) @ self.parameters
+        z = self.rows(z)
+        new_right = np.column_stack([z[:, 2], z[:, 1] + vertical])
+        return replace(
+            features, uv_left=rectified_rig.unrectify_left(z[:, :2]), uv_right=rectified_rig.unrectify_right(new_right)
+        )
+
+
+@dataclass(frozen=True)
+class Revision:
+    """A change of the correction in the course of a run, for measurements that were corrected as before.
+
+    Attributes:
+        before, after: the corrections.
+    """
+
+    before: RigCorrection
+    after: RigCorrection
+
+    def rows(self, z: Array) -> Array:
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""
+        return self.after.rows(self.before.undone(z))

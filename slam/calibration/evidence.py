@@ -1,0 +1,92 @@
+"""What data say about the parameters, added up so that errors that last over many frames are counted as such."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from slam.geometry.se3 import Array
+
+_MOST_BLOCKS = 32
+_PRIOR_TERMS = 20.0  # degrees of freedom that the inflation known beforehand counts for
+
+
+class Evidence(NamedTuple):
+    """A Gaussian likelihood in information form: ``log p = eᵀ θ - θᵀ S θ / 2``.
+
+    Attributes:
+        S: information (n, n).
+        e: information times mean (n,).
+    """
+
+    S: Array
+    e: Array
+
+
+class Accumulator:
+    """The sum of many likelihoods whose errors may be correlated over time.
+
+    They are gathered in blocks in the order in which they come. Were all errors independent, the blocks' gradients at
+    the common solution would scatter as their information says; how much more they scatter is the factor by which the
+    information is reduced (the blocks' version of a sandwich covariance). When there are too many blocks, neighbours
+    are joined: so the blocks grow with the run, and with them the time over which correlations are counted.
+
+    Args:
+        n: number of parameters.
+        inflation: factor on variances before anything is known of the scatter.
+        length: likelihoods in a block at first.
+    """
+
+    def __init__(self, n: int, inflation: float, length: int) -> None:
+        self._n = n
+        self._prior = inflation
+        self._blocks: list[Evidence] = []
+        self._length = length
+        self._in_last = 0
+        self.count = 0
+        self.inflation = inflation
+
+    def add(self, evidence: Evidence) -> None:
+        """Take in a likelihood."""
+        if not self._blocks or self._in_last == self._length:
+            self._blocks.append(Evidence(np.zeros((self._n, self._n)), np.zeros(self._n)))
+            self._in_last = 0
+        S, e = self._blocks[-1]
+        S += evidence.S
+        e += evidence.e
+        self._in_last += 1
+        self.count += 1
+        if len(self._blocks) > _MOST_BLOCKS:
+            self._join()
+
+    def _join(self) -> None:
+        """Blocks of twice the length."""
+        pairs = zip(self._blocks[::2], [*self._blocks[1::2], None])
+        odd = len(self._blocks) % 2
+        self._blocks = [Evidence(a.S + b.S, a.e + b.e) if b is not None else a for a, b in pairs]
+        self._in_last += 0 if odd else self._length
+        self._length *= 2
+
+    def total(self) -> Evidence:
+        """The sum, with its information reduced by the inflation."""
+        S, e = np.zeros((self._n, self._n)), np.zeros(self._n)
+        for block in self._blocks:
+            S += block.S
+            e += block.e
+        return Evidence(S / self.inflation, e / self.inflation)
+
+    def judge(self, mean: Array, covariance: Array) -> None:
+        """Estimate the inflation anew from the scatter about the posterior's `mean` (n,), in units of `covariance`."""
+        count = len(self._blocks)
+        scatter = terms = 0.0
+        for S, e in self._blocks:
+            gradient = e - S @ mean
+            scatter += float(gradient @ covariance @ gradient)
+            terms += float(np.sum(S * covariance))
+        if count < 2 or terms <= 0:
+            return
+        ratio = scatter / (terms * (1 - 1 / count))
+        weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block
+        total = _PRIOR_TERMS * self._prior + weight * ratio
+        self.inflation = max(1.0, total / (_PRIOR_TERMS + weight))

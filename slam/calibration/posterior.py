@@ -1,0 +1,105 @@
+"""The posterior of a rig's parameters: mean, covariance, names and units; as JSON and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slam.calibration.evidence import Evidence
+from slam.errors import CalibrationError
+from slam.geometry.se3 import Array
+
+#: Scales of the prior that are weighed against each other, from a calibration without errors to one as bad as the
+#: prior allows; equally probable beforehand.
+_SCALES = (0.02, 0.1, 0.3, 1.0)
+
+
+@dataclass(frozen=True)
+class RigPosterior:
+    """Gaussian belief about the parameters of `slam.calibration.model`.
+
+    Attributes:
+        names: of the parameters (n,).
+        units: of the parameters (n,).
+        mean: (n,).
+        covariance: (n, n).
+
+    Raises:
+        CalibrationError: shapes do not fit each other, or a value is not finite.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(self.units) != n or self.mean.shape != (n,) or self.covariance.shape != (n, n):
+            raise CalibrationError("calibration: names, units, mean and covariance differ in length")
+        if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
+            raise CalibrationError("calibration: mean and covariance must be finite")
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (n,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def marginal(self, indices: Sequence[int] | Array) -> RigPosterior:
+        """The belief about some of the parameters."""
+        rows = [int(i) for i in indices]
+        names, units = ([values[i] for i in rows] for values in (self.names, self.units))
+        return RigPosterior(tuple(names), tuple(units), self.mean[rows], self.covariance[np.ix_(rows, rows)])
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain types."""
+        values = zip(self.names, self.units, self.mean.tolist(), self.sigma.tolist())
+        parameters = [dict(zip(("name", "unit", "mean", "sigma"), row)) for row in values]
+        return {"parameters": parameters, "covariance": self.covariance.tolist()}
+
+    @classmethod
+    def from_json(cls, tree: Mapping[str, Any]) -> RigPosterior:
+        """The inverse of `to_json`.
+
+        Raises:
+            CalibrationError: a key is missing, or a value is of the wrong kind.
+        """
+        try:
+            rows = tree["parameters"]
+            names, units = (tuple(str(row[key]) for row in rows) for key in ("name", "unit"))
+            mean = np.array([row["mean"] for row in rows], float)
+            covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
+        except (KeyError, TypeError, ValueError) as error:
+            raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
+        return cls(names, units, mean, covariance)
+
+
+def solve(prior: Array, evidence: Sequence[Evidence]) -> tuple[Array, Array]:
+    """Posterior mean (n,) and covariance (n, n), averaged over how large a calibration's errors are.
+
+    The prior `N(0, s² prior⁻¹)` has a scale s that is not known. The scales' probabilities follow from the evidence
+    (the marginal likelihood), so a calibration that nothing speaks against is left as it is, instead of following the
+    noise.
+
+    Args:
+        prior: its information (n, n) at the scale 1.
+        evidence: of the data.
+    """
+    S, e = sum(x.S for x in evidence), sum(x.e for x in evidence)
+    logs, means, covariances = [], [], []
+    for scale in _SCALES:
+        information = prior / scale**2
+        total = information + S
+        covariance = np.linalg.inv(total)
+        mean = covariance @ e
+        logs.append(0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + mean @ e))
+        means.append(mean)
+        covariances.append(covariance)
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    mean = sum(w * m for w, m in zip(weights, means))
+    spread = [C + np.outer(m - mean, m - mean) for m, C in zip(means, covariances)]
+    return np.asarray(mean), np.asarray(sum(w * C for w, C in zip(weights, spread)))

@@ -1,0 +1,106 @@
+"""Views of the scene as the self-calibration needs them, and which features are the same in two of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.calibration.model import RigModel
+from slam.calibration.motion import Pair, move
+from slam.data import StereoFeatures
+from slam.geometry.pnp import find_consensus
+from slam.geometry.se3 import Array, inverse
+
+_RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
+_NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
+_AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
+_HYPOTHESES = 100
+
+
+@dataclass(frozen=True)
+class View:
+    """The stereo features of one frame, as measured.
+
+    Attributes:
+        points: ``(x, y, d)`` (N, 3), rectified pixel from the principal point and disparity [px].
+        vertical: right row less left row (N,) [px].
+        descriptors: (N, D).
+        laplacian: (N,).
+        T_world_left: pose of the rectified left camera (4, 4) as the system has it.
+    """
+
+    points: Array
+    vertical: Array
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    T_world_left: Array
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array) -> View:
+        """Of features as measured, at a pose (4, 4) of the left camera."""
+        rectified_rig = model.rig.rectified
+        rows = np.flatnonzero(features.has_stereo)
+        left, right = (
+            rectified_rig.rectify_left(features.uv_left[rows]),
+            rectified_rig.rectify_right(features.uv_right[rows]),
+        )
+        points = model.points(np.column_stack([left, right[:, 0]]))
+        vertical = right[:, 1] - left[:, 1]
+        good = np.isfinite(points).all(axis=1) & np.isfinite(vertical)
+        rows = rows[good]
+        return cls(
+            points[good],
+            vertical[good],
+            features.descriptors[rows],
+            features.laplacian[rows],
+            T_world_left @ rectified_rig.T_left_rectified,
+        )
+
+
+def match(first: View, second: View) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of features that look alike in two views: each the other's nearest, and clearly nearer than the next."""
+    if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    likeness = first.descriptors @ second.descriptors.T
+    likeness[first.laplacian[:, None] != second.laplacian] = -1.0
+    best, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    two = np.partition(likeness, -2, axis=1)[:, -2:]
+    clear = 1 - two[:, 1] < _RATIO**2 * (1 - two[:, 0])  # of unit vectors, |a - b|² = 2 (1 - a·b)
+    rows = np.flatnonzero((back[best] == np.arange(len(first))) & clear)
+    return rows, best[rows]
+
+
+def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed: int) -> Pair:
+    """What two views have in common: matches that agree with one motion, and that motion.
+
+    The motion of the system's poses is the first guess; it is the only one where most matches agree with it.
+
+    Args:
+        model: the parameters' meaning.
+        first: the earlier view.
+        second: the later view.
+        parameters: of the rig (n,), as known so far.
+        seed: of the random choice in the geometric check.
+    """
+    a, b = match(first, second)
+    one, two = first.points[a], second.points[b]
+    ideal = [p + model.field(p) @ parameters for p in (one, two)]
+    T = inverse(second.T_world_left) @ first.T_world_left
+    near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
+    rig = model.rig.rectified.rig
+    if near.sum() >= 3:
+        rows = [model.rows(p[near]) for p in ideal]
+        local = rig.triangulate(rows[0][:, :2], rows[0][:, [2, 1]])
+        found = find_consensus(rig, local, rows[1], inverse(T), _AGREES, _HYPOTHESES, seed)
+        T = inverse(found.T_world_left)
+    R, t = T[:3, :3], T[:3, 3] / rig.baseline
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.abs(move(ideal[0], R, t, model.focal)[0] - ideal[1])
+    error[:, 2] += 0 * error[:, 0]
+    agree = (error[:, :2] <= _AGREES).all(axis=1) & (np.abs(error[:, 0] - error[:, 2]) <= 2 * _AGREES)
+    return Pair(one[agree], two[agree], R, t)
