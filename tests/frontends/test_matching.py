@@ -36,7 +36,7 @@ def plain_match(a, b, window, d_match, ratio, mutual):
     return pairs
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 10_000), n=st.integers(0, 30), n2=st.integers(0, 30), dimensions=st.sampled_from([16, 64]),
     window=st.sampled_from([np.inf, 40.0, 5.0]), d_match=st.sampled_from([np.inf, 1.0]),

@@ -10,7 +10,7 @@ import pytest
 
 def in_a_new_process(*arguments, **more):
     command = [sys.executable, "-m", "slam", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **more)
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, **more)
 
 
 def fails_with_one_line(done, *words):
