@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 
+@pytest.mark.slow
 def test_the_command_leaves_report_and_tables_and_says_what_follows(slam_command, tmp_path):
     done = slam_command(
         "compare", "synthetic:aisle?frames=6", "--backends", "ekf,smoother", "--frontends", "simulated", "--no-replay",
