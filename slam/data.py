@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +157,7 @@ class Prediction:
     innovation: Array
 
 
-class UpdateStatus(str, Enum):
+class UpdateStatus(StrEnum):
     """How an update ended."""
 
     OK = "ok"  #: measurements were used
@@ -213,7 +213,7 @@ class Estimate:
     covariances: Array
 
 
-class FrameStatus(str, Enum):
+class FrameStatus(StrEnum):
     """How a frame ended."""
 
     STARTED = "started"  #: first frame, or the first one with anything to see: the map begins

@@ -206,7 +206,7 @@ class SmootherBackend:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
         self._commit()
-        return self._objects.update(observations, self.measurement_log.path, self._graph.window)
+        return self._objects.update(observations, self.measurement_log.path, self._graph.last_poses)
 
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""

@@ -41,10 +41,14 @@ class FactorBuilder:
         self._config = config
         self._lag = lag
 
+    @property
+    def oldest(self) -> int:
+        """The first frame whose pose is in the solver."""
+        return 0 if self._lag is None else self._lag.first
+
     def newest(self) -> list[int]:
         """Frames of the window."""
-        first = 0 if self._lag is None else self._lag.first
-        return self.measurement_log.path.newest(self._config.window, first).tolist()
+        return self.measurement_log.path.newest(self._config.window, self.oldest).tolist()
 
     def eliminate_late(self, change: Change) -> None:
         """Have the landmarks of late eliminated late, and the newest poses last."""

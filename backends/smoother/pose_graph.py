@@ -192,6 +192,19 @@ class PoseGraph:
             self._last_window = self._window if count else None
         return self._window
 
+    def last_poses(self, count: int) -> PoseSet:
+        """The window, or the last `count` poses where it leaves some of them out: those without measurements."""
+        window, path = self.window(), self.measurement_log.path
+        frames = np.arange(max(self._factor_builder.oldest, path.count - count), path.count)
+        if np.isin(frames, window.frames).all():
+            return window
+        try:
+            return PoseSet(
+                frames, path.poses[frames], self._solver.joint_covariance([pose_key(i) for i in frames.tolist()])
+            )
+        except SolverError:
+            return window
+
     def _joint_covariance(self, frames: IndexArray) -> Array:
         """Joint covariance of poses; where the solver cannot give it, the last one carried on by the motion model."""
         keys = [pose_key(i) for i in frames.tolist()]

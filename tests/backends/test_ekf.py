@@ -14,7 +14,7 @@ from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
-from tests.slam.numeric import jacobian
+from tests.slam.numeric import assert_equal_to_rounding, jacobian
 
 FORWARD, STILL = np.array([0, 0, 1.5]), np.zeros(3)
 YAW, ROLL = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
@@ -31,6 +31,12 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
     found = backend.estimate(landmarks=False)
     xi = se3.log(se3.inverse(found.T_world_left) @ truth)
     return float(xi @ np.linalg.solve(found.covariance, xi))
+
+
+def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """A covariance in units of another's standard deviations: entries of m², m rad/s and 1/m² become comparable."""
+    deviation = np.sqrt(np.diag(of))
+    return P / np.outer(deviation, deviation)
 
 
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:
@@ -91,9 +97,9 @@ def test_prediction_is_as_printed(drive):
     W = np.zeros((len(P), 6))
     W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
     linear, angular = MODELS.motion.velocity_variance(dt)
-    np.testing.assert_allclose(backend._camera, A[:12, :12] @ before, rtol=1e-12)
+    assert_equal_to_rounding(backend._camera, A[:12, :12] @ before)
     expected = A @ P @ A.T + W @ np.diag([linear] * 3 + [angular] * 3) @ W.T
-    np.testing.assert_allclose(backend._covariance.full(), expected, rtol=1e-10, atol=1e-15)
+    assert_equal_to_rounding(in_deviations(backend._covariance.full(), expected), in_deviations(expected, expected))
 
 
 @pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
@@ -142,9 +148,11 @@ def test_augmentation_is_the_derivative_of_triangulation(drive, landmarks):
 
     J = jacobian(coordinates, np.concatenate([camera[:6], np.zeros(3)]))
     whole = backend._covariance.full()
-    np.testing.assert_allclose(whole[-3:, :-3], J[:, :6] @ P[:6], rtol=1e-6, atol=1e-12)
     noise = J[:, 6:] @ RIG.triangulation_covariance(h, 0.5)[0] @ J[:, 6:].T
-    np.testing.assert_allclose(whole[-3:, -3:], J[:, :6] @ P[:6, :6] @ J[:, :6].T + noise, rtol=1e-6)
+    cross = J[:, :6] @ P[:6]
+    expected = np.block([[P, cross.T], [cross, J[:, :6] @ P[:6, :6] @ J[:, :6].T + noise]])
+    # central differences by 1e-6 leave 1e-10 in J
+    np.testing.assert_allclose(in_deviations(whole, expected), in_deviations(expected, expected), atol=1e-7)
     np.testing.assert_allclose(backend.positions(new.ids)[0], camera[:3] + R @ h[0], atol=1e-12)
 
 

@@ -78,15 +78,20 @@ def test_the_cameras_error_is_not_taken_for_new_in_every_frame(name):
     assert last[3:].max() < 0.3 * 0.03 if name == "ekf" else last[3:].max() < 0.15 * 0.03
 
 
-@BOTH
-def test_the_cameras_error_since_the_first_sight_is_in_the_covariance(name):
+def test_the_cameras_error_since_the_first_sight_is_in_the_covariance():
     """Without landmarks a moving camera loses its way: so does the body that it sees, as far as the world goes."""
     scene = box_scene(seed=1, frames=12)
     lost = replace(scene, landmarks=np.zeros((0, 3)))
-    seen, blind = (
-        list(follow(backends.create(name, s.rig, models=s.models), s))[-1][1].covariance for s in (scene, lost)
-    )
-    assert (np.diag(blind) > 20 * np.diag(seen)).all()
+
+    def deviations(name, s):
+        return np.sqrt(np.diag(list(follow(backends.create(name, s.rig, models=s.models), s))[-1][1].covariance))
+
+    blind = {name: deviations(name, lost) for name in ("ekf", "smoother")}
+    for name in blind:
+        assert (blind[name] > 5 * deviations(name, scene)).all()
+    # 8 to 15 degrees and as many centimetres, told by the motion model alone: the two linearise it differently
+    ratio = blind["smoother"] / blind["ekf"]
+    assert (ratio > 0.4).all() and (ratio < 2.5).all()
 
 
 # --- parts of the filter ---
