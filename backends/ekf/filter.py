@@ -280,8 +280,15 @@ class EkfBackend:
         return Problem(
             prior, self._covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
-            None if guess is None else self._change_to(guess),
+            None if guess is None else self._change_to(guess), self._by_world(slots) if self._consistent else None,
         )  # fmt: skip
+
+    def _by_world(self, slots: SlotArray) -> Array:
+        """Derivatives (6 + 3M, 6) of [r, φ, landmarks] by a displacement of the world."""
+        own = np.eye(6)
+        own[:3, 3:] = -se3.hat(self._camera[:3])
+        own[3:, 3:] = np.linalg.inv(self._turning(self._camera))
+        return np.concatenate([own, self._landmarks.gauge_jacobian[slots].reshape(-1, 6)])
 
     def _change_to(self, T_world_left: Array) -> Array:
         """The change of [r, φ] (6,) that moves the pose to `T_world_left`."""

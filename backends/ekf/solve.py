@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
@@ -61,6 +62,38 @@ class Problem:
     iterations: int
     gate_probability: float
     guess: Array | None = None
+    gauge_jacobian: Array | None = None
+
+    @cached_property
+    def _rigid(self) -> tuple[Array, Array] | None:
+        """``(U, L)``: a change c of the mean displaces the world by ``ξ = L c``, and that changes the mean by ``U ξ``.
+
+        ξ is the least-squares fit (in pixels) of the landmarks' change to a displacement of all of them.
+        """
+        if self.gauge_jacobian is None:
+            return None
+        U, m = self.gauge_jacobian, len(self.z)
+        line = self.model.linearise(self.prior)
+        seen = np.isfinite(line.z).all(axis=1)[:, None, None]
+        own = np.where(seen, line.own, 0.0)
+        weighted = (np.swapaxes(own, 1, 2) @ own @ U[6:].reshape(m, 3, 6)).reshape(3 * m, 6)
+        L = np.zeros((6, 6 + 3 * m))
+        L[:, 6:] = np.linalg.pinv(U[6:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
+        return U, L
+
+    def mean(self, change: Array) -> Array:
+        """The mean (6 + 3M,) at which the model is asked after a change: without the world's displacement in it."""
+        if self._rigid is None or not change.any():
+            return self.prior + change
+        U, L = self._rigid
+        return self.prior + (change - U @ (L @ change))
+
+    def jacobian(self, H: Array, change: Array) -> Array:
+        """Derivatives by the change, from those (3M, 6 + 3M) by the mean."""
+        if self._rigid is None or not change.any():
+            return H
+        U, L = self._rigid
+        return H - (H @ U) @ L
 
 
 @dataclass(frozen=True)
@@ -134,7 +167,7 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     if at_guess:
         s = _towards_guess(problem)
         change = problem.covariance @ s
-    line = problem.model.linearise(problem.prior + change)
+    line = problem.model.linearise(problem.mean(change))
     start = _Iterate(s, change, line.z, np.inf)
     measured = np.isfinite(problem.z)
     visible = np.asarray(np.isfinite(line.z).all(axis=1))
@@ -232,7 +265,7 @@ def _towards_guess(problem: Problem) -> Array:
 
 def _visit(problem: Problem, rows: BoolArray, s: Array) -> _Iterate:
     change = problem.covariance @ s
-    z = problem.model.predict(problem.prior + change)
+    z = problem.model.predict(problem.mean(change))
     return _Iterate(s, change, z, _cost(problem, rows, z, float(s @ change)))
 
 
@@ -249,8 +282,8 @@ def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) ->
 
 
 def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
-    line = line or problem.model.linearise(problem.prior + now.change)
-    H = stacked(line, rows)
+    line = line or problem.model.linearise(problem.mean(now.change))
+    H = problem.jacobian(stacked(line, rows), now.change)
     nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
     if now.change.any():
         nu += H @ now.change
