@@ -65,7 +65,6 @@ class EkfBackend:
         self._camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self._covariance = Covariance(self._initial_covariance())
         self._objects = ObjectFilter(rig, models, self.config.iterations)
-        self._has_objects = False
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -95,6 +94,8 @@ class EkfBackend:
             problem = self._problem(observations, slots, guess)
             problem, gated, surprise = self._gated(problem)
             solution = solve(problem, gated)
+            if solution is not None and len(slots) >= _ENOUGH and 2 * solution.used.sum() < len(slots):
+                solution = None
             if solution is not None:
                 self._correct(slots, solution, surprise)
         except UnsolvableError as error:
@@ -171,7 +172,6 @@ class EkfBackend:
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
-        self._has_objects = self._has_objects or bool(observations)
         T, columns = self._poses[-1], self._covariance.columns(np.zeros(0, np.intp))
         camera = CameraBelief(T, pose_jacobian(T[:3, :3], self._camera[3:6]), columns)
         return self._objects.update(observations, self._stamps[-1], camera)
@@ -179,7 +179,6 @@ class EkfBackend:
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
         self._objects.remove(ids)
-        self._has_objects = bool(self._objects.count)
 
     # --- the filter's parts ---
 
@@ -341,8 +340,8 @@ class EkfBackend:
             if surprise is not None:
                 covariance.move_camera(0.0, -surprise)
             raise UnsolvableError("the corrected state is not finite")
-        if self._has_objects:
-            self._objects.camera_corrected(slots, solution, covariance.columns(slots) @ solution.B)
+        if self._objects.count:
+            self._correct_objects(slots, solution)
         covariance.subtract(slots, solution.B)
         before = self._camera
         self._camera = self._camera + change[:CAMERA]
@@ -354,12 +353,21 @@ class EkfBackend:
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
 
+    def _correct_objects(self, slots: SlotArray, solution: Solution) -> None:
+        """The bodies' part of a correction, before that of the filter's own state."""
+        columns = self._covariance.columns(slots)
+        W = columns @ solution.B
+        T = self._poses[-1]
+        by_state = pose_jacobian(T[:3, :3], self._camera[3:6])
+        camera = CameraBelief(T, by_state, columns[:, :POSE] - W @ W[:POSE].T)
+        self._objects.camera_corrected(slots, solution, W, camera)
+
     # --- what nothing measures ---
 
     @property
     def _consistent(self) -> bool:
-        """Whether the covariance is referred to the corrected state. The bodies' correlation with it cannot follow."""
-        return self.config.consistent and self.config.measurement == "stereo" and not self._has_objects
+        """Whether the covariance is referred to the corrected state."""
+        return self.config.consistent and self.config.measurement == "stereo"
 
     def _transport(self, before: Array) -> None:
         """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
@@ -399,6 +407,7 @@ class EkfBackend:
         K = self._landmarks.transport(slots) @ world
         if K.any():
             self._covariance.transform_landmarks(K)
+            self._objects.landmarks_transformed(slots, K)
 
     def _turning(self, camera: Array) -> Array:
         """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ."""

@@ -113,6 +113,12 @@ class ObjectFilter:
             new = body.cross[:, :POSE] @ J.reshape(-1, POSE).T
             self._bodies[number] = replace(body, cross=np.concatenate([body.cross, new], axis=1))
 
+    def landmarks_transformed(self, slots: NDArray[np.intp], K: Array) -> None:
+        """The coordinates Y of landmarks `slots` became ``Y + K [r, φ]``; K (M, 3, 6)."""
+        columns = (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)
+        for body in self._bodies.values():
+            body.cross[:, columns] += body.cross[:, :POSE] @ K.reshape(-1, POSE).T
+
     def landmarks_dropped(self, holes: NDArray[np.intp], movers: NDArray[np.intp], left: int) -> None:
         """Landmarks went: those of the slots `movers` have moved into `holes`, and the first `left` slots remain."""
         for number, body in self._bodies.items():
@@ -121,15 +127,16 @@ class ObjectFilter:
             cross = np.concatenate([body.cross[:, :CAMERA], marks[:, :left].reshape(len(marks), -1)], axis=1)
             self._bodies[number] = replace(body, cross=cross)
 
-    def camera_corrected(self, slots: NDArray[np.intp], solution: Solution, W: Array) -> None:
+    def camera_corrected(self, slots: NDArray[np.intp], solution: Solution, W: Array, camera: CameraBelief) -> None:
         """The filter's state changed by ``P[:, g] s``, its covariance became ``P − W Wᵀ`` with ``W = P[:, g] B``.
 
-        g = [r, φ, landmarks `slots`]; s and B are the solution's. What has been learnt of the camera and the map is
+        g = [r, φ, landmarks `slots`]; s and B are the solution's; the camera has its covariance after the update, at
+        the pose before it. What has been learnt of the camera and the map is
         learnt of the bodies too, as far as they hang on it.
         """
         columns = np.concatenate([np.arange(POSE), (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)])
         for number, body in self._bodies.items():
-            self._bodies[number] = corrected_by_map(body, columns, solution.s, solution.B, W)
+            self._bodies[number] = corrected_by_map(body, columns, solution.s, solution.B, W, camera)
 
     # --- parts ---
 

@@ -74,7 +74,7 @@ class Problem:
             return None
         U, m = self.gauge_jacobian, len(self.z)
         line = self.model.linearise(self.prior)
-        seen = np.isfinite(line.z).all(axis=1)[:, None, None]
+        seen = np.asarray(np.isfinite(line.z).all(axis=1))[:, None, None]
         own = np.where(seen, line.own, 0.0)
         weighted = (np.swapaxes(own, 1, 2) @ own @ U[6:].reshape(m, 3, 6)).reshape(3 * m, 6)
         L = np.zeros((6, 6 + 3 * m))
