@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from backends.ekf.landmarks import COORDINATES, Landmarks, far_charts
 from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
 from backends.ekf.objects import ObjectFilter
 from backends.ekf.objects_body import CameraBelief
-from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
+from backends.ekf.recovery import Agreement, agreement, landmarks_pose
+from backends.ekf.solve import Problem, Solution, UnsolvableError
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -34,7 +34,6 @@ from slam.runtime.blas import one_blas_thread
 _SURPRISES = (3.0, 10.0)
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
-_ENOUGH = 6  # observations that can be judged to agree with each other
 
 
 class EkfBackend:
@@ -90,18 +89,16 @@ class EkfBackend:
         joined = self._covariance.make_local(slots)
         if self._consistent:
             self._refer_landmarks(joined)
+        problem = self._problem(observations, slots, guess)
         try:
-            problem = self._problem(observations, slots, guess)
-            problem, gated, surprise = self._gated(problem)
-            solution = solve(problem, gated)
-            if solution is not None and len(slots) >= _ENOUGH and 2 * solution.used.sum() < len(slots):
-                solution = None
-            if solution is not None:
-                self._correct(slots, solution, surprise)
+            found = agreement(problem, self._surprises(), lambda: self._landmarks_pose(problem, slots), self.models)
+            if found is None:
+                reason = "no observation, or only a minority, agrees with the prediction"
+                return UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids)
+            self._correct(slots, found)
         except UnsolvableError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
-        if solution is None:
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
+        solution = found.solution
         used = solution.used
         dof = int(np.isfinite(problem.z[used]).sum())
         return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], solution.nis, dof)
@@ -298,47 +295,36 @@ class EkfBackend:
         nearest = changes[np.argmin(np.linalg.norm(changes, axis=1))]
         return np.concatenate([T_world_left[:3, 3] - self._camera[:3], nearest])
 
-    def _gated(self, problem: Problem) -> tuple[Problem, Gated, Array | None]:
-        """Gate the observations; where most fail together, the prediction is at fault and not they.
+    def _surprises(self) -> list[Array]:
+        """Motion noises (12, 12) beyond what the model expects of the last step."""
+        if len(self._stamps) < 2:
+            return []
+        noise = self._motion_noise(self._stamps[-1] - self._stamps[-2])
+        return [factor**2 * noise for factor in _SURPRISES]
 
-        It may be so far off that its linearisation does not hold: then the guess may serve. Or an impulse (or a turn
-        that the Euler model does not follow) was larger than the motion model expects: then all predictions are off
-        together, while the observations agree with each other. If a wider motion noise lets most of them pass, that
-        noise was there: it joins the prediction's covariance. What still disagrees is taken out later by `solve`.
+    def _landmarks_pose(self, problem: Problem, slots: SlotArray) -> Array | None:
+        """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""
+        T = self._pose() if problem.guess is None else self._changed(problem.guess)
+        T_world_left = landmarks_pose(self.rig, self._landmarks.points[slots], problem, T, len(self._stamps))
+        return None if T_world_left is None else self._change_to(T_world_left)
 
-        Returns:
-            the problem, its gate, and the noise (12, 12) to add to the camera's covariance, or None.
-        """
-        first = gate(problem)
-        most = max(_ENOUGH, (len(problem.z) + 1) // 2)
-        if len(problem.z) < most or first.used.sum() >= most:
-            return problem, first, None
-        started = len(self._stamps) > 1
-        dt = self._stamps[-1] - self._stamps[-2] if started else 0.0
-        for factor in (0.0, *_SURPRISES) if started else (0.0,):
-            noise = factor**2 * self._motion_noise(dt)
-            covariance = problem.covariance.copy()
-            covariance[:POSE, :POSE] += noise[:POSE, :POSE]
-            wider = replace(problem, covariance=covariance)
-            for at_guess in (False,) if problem.guess is None else (False, True):
-                gated = gate(wider, at_guess)
-                if gated.used.sum() >= most:
-                    return wider, gated, noise
-        return problem, first, None
+    def _changed(self, change: Array) -> Array:
+        """The pose (4, 4) after a change of [r, φ] (6,)."""
+        return se3.pose(attitude(self._R_world_angles, self._camera[3:6] + change[3:]), self._camera[:3] + change[:3])
 
-    def _correct(self, slots: SlotArray, solution: Solution, surprise: Array | None) -> None:
-        """Change the whole state and covariance, or nothing; `surprise` (12, 12) adds to the camera's covariance.
+    def _correct(self, slots: SlotArray, found: Agreement) -> None:
+        """Change the whole state and covariance, or nothing.
 
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        covariance = self._covariance
-        if surprise is not None:
-            covariance.move_camera(0.0, surprise)
+        covariance, solution = self._covariance, found.solution
+        if found.noise is not None:
+            covariance.move_camera(0.0, found.noise)
         change = covariance.times(slots, solution.s)
         if not np.isfinite(change).all():
-            if surprise is not None:
-                covariance.move_camera(0.0, -surprise)
+            if found.noise is not None:
+                covariance.move_camera(0.0, -found.noise)
             raise UnsolvableError("the corrected state is not finite")
         if self._objects.count:
             self._correct_objects(slots, solution)
@@ -346,10 +332,8 @@ class EkfBackend:
         before = self._camera
         self._camera = self._camera + change[:CAMERA]
         self._landmarks.move(change[CAMERA:].reshape(-1, 3))
-        if self._consistent and solution.at_prior:
+        if self._consistent:
             self._transport(before)
-        elif self._consistent:  # it refers to about the corrected state already
-            self._landmarks.transport(covariance.local)
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
 

@@ -68,16 +68,17 @@ class Problem:
     def _rigid(self) -> tuple[Array, Array] | None:
         """``(U, L)``: a change c of the mean displaces the world by ``ξ = L c``, and that changes the mean by ``U ξ``.
 
-        ξ is the least-squares fit (in pixels) of the landmarks' change to a displacement of all of them.
+        ξ is the displacement of all landmarks that explains their change best, given how well they are known to each
+        other.
         """
         if self.gauge_jacobian is None:
             return None
-        U, m = self.gauge_jacobian, len(self.z)
-        line = self.model.linearise(self.prior)
-        seen = np.asarray(np.isfinite(line.z).all(axis=1))[:, None, None]
-        own = np.where(seen, line.own, 0.0)
-        weighted = (np.swapaxes(own, 1, 2) @ own @ U[6:].reshape(m, 3, 6)).reshape(3 * m, 6)
-        L = np.zeros((6, 6 + 3 * m))
+        U = self.gauge_jacobian
+        lower, info = dpotrf(self.covariance[6:, 6:].T, lower=1, clean=0)
+        if info != 0:
+            return None
+        weighted = np.asarray(dpotrs(lower, U[6:], lower=1)[0])
+        L = np.zeros(U.T.shape)
         L[:, 6:] = np.linalg.pinv(U[6:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
         return U, L
 
@@ -106,7 +107,6 @@ class Solution:
         B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K) in Fortran order: the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
         nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
-        at_prior: whether it is linearised at the prior.
     """
 
     used: BoolArray
@@ -114,7 +114,6 @@ class Solution:
     B: Array
     nis: float
     distances: Array
-    at_prior: bool
 
 
 @dataclass(frozen=True)
@@ -233,8 +232,7 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
         raise UnsolvableError("the pose's variances would not stay positive")
     measured = rows.reshape(-1)
     B = B if measured.all() else np.asfortranarray(B[:, measured])
-    at_prior = iteration == 1 and not start.s.any()
-    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y), at_prior)
+    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y))
 
 
 def _solved(system: _System) -> Array:
