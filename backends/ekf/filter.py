@@ -32,6 +32,8 @@ from slam.runtime.blas import one_blas_thread
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
+_ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
+_ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
 
@@ -206,6 +208,9 @@ class EkfBackend:
 
     def _advance(self, dt: float) -> None:
         """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity."""
+        if self._attitude_deviation(dt) > _ANY_ATTITUDE:
+            self._forget_motion(dt)
+            return
         turn = float(self._camera[10]) * dt
         if abs(float(self._camera[4]) + turn) > LIMIT:
             self._reanchor()
@@ -223,6 +228,28 @@ class EkfBackend:
             self._turn_with(before)
         self._covariance.move_camera(dt, self._motion_noise(dt))
         self._objects.camera_moved(dt)
+
+    def _attitude_deviation(self, dt: float) -> float:
+        """Largest standard deviation [rad] of the angles after a step."""
+        phi, omega = np.arange(3, 6), np.arange(9, 12)
+        P = self._covariance.camera
+        variance = P[phi, phi] + 2 * dt * P[phi, omega] + dt * dt * P[omega, omega]
+        return math.sqrt(max(variance.max() + dt * dt * self.models.motion.velocity_variance(dt)[1], 0.0))
+
+    def _forget_motion(self, dt: float) -> None:
+        """A step after which the camera may be turned anyhow: it stays where it was, and starts anew.
+
+        As uncertain as its speed at the start would make it meanwhile, and independent of the map. Larger numbers mean
+        nothing, and next to what is known of the map they would not leave a double enough digits for that.
+        """
+        P, E = self._initial_covariance(), np.linalg.inv(body_rate_matrix(self._camera[3:6]))
+        P[:3, :3] = self._covariance.pose[:3, :3] + (self.models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
+        P[:3, :3] *= min(1.0, _ANYWHERE**2 / P[:3, :3].diagonal().max())
+        P[3:6, 3:6] = np.pi**2 / 3 * E @ E.T
+        self._camera = np.concatenate([self._camera[:POSE], np.zeros(POSE)])
+        self._covariance.transform_camera(np.zeros((CAMERA, CAMERA)))
+        self._covariance.move_camera(0.0, P)
+        self._objects.camera_transformed(np.zeros((CAMERA, CAMERA)))
 
     def _motion_noise(self, dt: float) -> Array:
         """``W Q Wᵀ`` (12, 12)."""

@@ -144,11 +144,12 @@ class _System:
 class Gated:
     """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`.
 
-    The limits (M,) are the gate's, of a squared distance.
+    The limits (M,) are the gate's, of the squared distances (M,) of the innovations; NaN where none is predicted.
     """
 
     used: BoolArray
     limits: Array
+    distances: Array
     start: _Iterate
     system: _System
 
@@ -172,8 +173,8 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     visible = np.asarray(np.isfinite(line.z).all(axis=1))
     system = _system(problem, measured & visible[:, None], start, line)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
-    used = visible & (_squared_distances(system.nu, _diagonal_blocks(system.S)) <= limits)
-    return Gated(used, limits, start, system)
+    distances = np.where(visible, _squared_distances(system.nu, _diagonal_blocks(system.S)), np.nan)
+    return Gated(distances <= limits, limits, distances, start, system)
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
