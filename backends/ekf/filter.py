@@ -34,6 +34,8 @@ from slam.runtime.blas import one_blas_thread
 _SURPRISES = (3.0, 10.0)
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
 _ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
+_PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
+_DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
 
@@ -66,6 +68,7 @@ class EkfBackend:
         self._camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self._covariance = Covariance(self._initial_covariance())
         self._objects = ObjectFilter(rig, models, self.config.iterations)
+        self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -113,9 +116,13 @@ class EkfBackend:
         if not len(observations):
             return
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
-        bad = ~np.isfinite(h).all(axis=1)
+        bad = ~(np.isfinite(h).all(axis=1) & (np.abs(observations.uv_left) < _PIXELS).all(axis=1))
         if bad.any():
-            raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
+            raise MeasurementError(
+                f"ekf: landmark {observations.ids[bad][0]} has no right pixel, no positive depth or no pixel that a "
+                "camera has"
+            )
+        h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         self._place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
@@ -132,9 +139,10 @@ class EkfBackend:
         marks = self._landmarks
         slots = np.argsort(marks.ids) if landmarks else np.zeros(0, np.intp)
         D = marks.jacobian(slots)
+        blocks = D @ self._covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1)
         return Estimate(
             self._stamps[-1], self._poses[-1].copy(), self._pose_covariance(),
-            marks.ids[slots], marks.points[slots], D @ self._covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1),
+            marks.ids[slots], marks.points[slots], 0.5 * (blocks + blocks.transpose(0, 2, 1)),
         )  # fmt: skip
 
     def positions(self, ids: IdArray) -> Array:
@@ -276,7 +284,8 @@ class EkfBackend:
 
     def _pose_covariance(self) -> Array:
         J = pose_jacobian(self._poses[-1][:3, :3], self._camera[3:6])
-        return J @ self._covariance.pose @ J.T
+        P = J @ self._covariance.pose @ J.T
+        return np.asarray(0.5 * (P + P.T))
 
     def _prediction(self) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
@@ -295,6 +304,7 @@ class EkfBackend:
     def _problem(self, observations: Observations, slots: SlotArray, guess: Array | None) -> Problem:
         """The update in the coordinates [r, φ, measured landmarks]."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
+        z = np.clip(np.where(np.isfinite(z), z, np.nan), -_PIXELS, _PIXELS)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
         marks = self._landmarks

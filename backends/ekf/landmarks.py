@@ -22,6 +22,8 @@ from slam.geometry.se3 import Array, hat
 
 SlotArray = NDArray[np.intp]
 
+_FARTHEST = 1e-6  # least inverse depth [1/m]
+_NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
@@ -40,6 +42,14 @@ class Coordinates(Protocol):
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
         ...
 
+    def proper(self, c: Array) -> Array:
+        """The nearest coordinates to c (M, 3) that are those of points."""
+        ...
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """Coordinates c (M, 3) of points after a change: those of points again."""
+        ...
+
 
 class Euclidean:
     """The papers': the position in the world. Charts do not matter."""
@@ -56,15 +66,23 @@ class Euclidean:
         """See `Coordinates.jacobian`."""
         return np.tile(np.eye(3), (len(c), 1, 1))
 
+    def proper(self, c: Array) -> Array:
+        """See `Coordinates.proper`."""
+        return c
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """See `Coordinates.moved`."""
+        return c + change
+
 
 class InverseDepth:
-    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes."""
+    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes; z is positive."""
 
     def points(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.points`."""
+        """See `Coordinates.points`; NaN where the inverse depth is not positive."""
         homogeneous = np.ones((len(c), 4))  # [x/z, y/z, 1, 1/z]
         homogeneous[:, :2], homogeneous[:, 3] = c[:, :2], c[:, 2]
-        return np.asarray(np.einsum("nij,nj->ni", anchors, homogeneous) / c[:, 2:])
+        return np.asarray(np.einsum("nij,nj->ni", anchors, homogeneous) * _depth(c)[:, None])
 
     def of(self, anchors: Array, points: Array) -> Array:
         """See `Coordinates.of`."""
@@ -73,12 +91,35 @@ class InverseDepth:
 
     def jacobian(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.jacobian`."""
-        depth = 1 / c[:, 2]
+        depth = _depth(c)
         D = np.zeros((len(c), 3, 3))
         D[:, 0, 0] = D[:, 1, 1] = depth
         D[:, :2, 2] = -c[:, :2] * (depth * depth)[:, None]
         D[:, 2, 2] = -depth * depth
         return np.asarray(anchors[:, :, :3] @ D)
+
+    def proper(self, c: Array) -> Array:
+        """See `Coordinates.proper`."""
+        if (c[:, 2] >= _FARTHEST).all():
+            return c
+        out = c.copy()
+        out[:, 2] = np.maximum(out[:, 2], _FARTHEST)
+        return out
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """See `Coordinates.moved`.
+
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step.
+        """
+        out = c + change
+        out[:, 2] = np.maximum(out[:, 2], np.maximum(_NEARER * c[:, 2], _FARTHEST))
+        return np.asarray(out)
+
+
+def _depth(c: Array) -> Array:
+    """Depths (M,) of inverse-depth coordinates (M, 3); NaN where they are not positive."""
+    rho = c[:, 2]
+    return np.asarray(1 / np.where(rho > 0, rho, np.nan))
 
 
 #: By the name of the option.
@@ -149,7 +190,7 @@ class Landmarks:
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""
-        self.state = self.state + change
+        self.state = self.coordinates.moved(self.state, change)
         self.points = self.coordinates.points(self.anchors, self.state)
 
     def transport(self, slots: SlotArray) -> Array:

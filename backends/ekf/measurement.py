@@ -85,13 +85,17 @@ class StereoMeasurement:
     def linearise(self, x: Array) -> Linearisation:
         """The same with derivatives."""
         h, R = self._local(x)
-        D = self.coordinates.jacobian(self.anchors, x[6:].reshape(-1, 3))
+        D = self.coordinates.jacobian(self.anchors, self._landmarks(x))
         return chained(*self.rig.project_stereo(h), h, R, x[3:6], D)
 
     def _local(self, x: Array) -> tuple[Array, Array]:
         """Landmarks ``h = Rᵀ (Y − r)`` (M, 3) in camera coordinates (paper B, Eqs. 3-5), and R (3, 3)."""
         R = attitude(self.R_world_angles, x[3:6])
-        return (self.coordinates.points(self.anchors, x[6:].reshape(-1, 3)) - x[:3]) @ R, R
+        return (self.coordinates.points(self.anchors, self._landmarks(x)) - x[:3]) @ R, R
+
+    def _landmarks(self, x: Array) -> Array:
+        """The landmarks' coordinates (M, 3); a linear step may ask for a point beyond infinity: it is at infinity."""
+        return self.coordinates.proper(x[6:].reshape(-1, 3))
 
 
 def chained(z: Array, J: Array, h: Array, R: Array, phi: Array, D: Array) -> Linearisation:

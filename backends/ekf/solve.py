@@ -223,6 +223,8 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
         if iteration == 1 and problem.guess is not None:
             at_guess = _visit(problem, rows, _towards_guess(problem))
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
+        if following is now and iteration == 1:
+            raise UnsolvableError("no step towards the solution lowers the cost")
         s = following.s
         if iteration == problem.iterations or following is now:
             break

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 import backends.ekf.filter as ekf_filter
 from backends.ekf import EkfBackend
 from slam.data import Observations, UpdateStatus
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel, models_for
 from tests.backends.scenes import RIG, Scene, cloud, observe, path, random_path, run, scene, step
@@ -360,6 +360,54 @@ def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     np.testing.assert_array_equal(backend._covariance.full(), before)
     np.testing.assert_array_equal(backend._camera, camera)
     np.testing.assert_array_equal(backend._landmarks.points, points)
+
+
+@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
+def test_far_points_stay_before_the_camera(landmarks):
+    """Points at 60 to 400 m, whose disparity is all noise: no position and no covariance loses its meaning.
+
+    Nor do they hold up the first steps: the inverse depth of some wants to be negative.
+    """
+    rng = np.random.default_rng(5)
+    poses = path(40, 0.1, np.array([0, 0, 2.0]), 0.02 * YAW)
+    points = np.concatenate([cloud(poses, 60, rng, 4.0, 15.0), cloud(poses, 120, rng, 60.0, 400.0)])
+    backend, known = EkfBackend(RIG, replace(MODELS, pixel_sigma=0.7), landmarks=landmarks), set()
+    for k, T in enumerate(poses):
+        step(backend, 0.1 * k, observe(T, points, 0.7, rng, 180), known)
+        found = backend.estimate()
+        depth = ((found.positions - T[:3, 3]) @ T[:3, :3])[found.ids >= 60, 2]
+        assert landmarks == "euclidean" or (depth > 0).all()
+        assert np.linalg.eigvalsh(found.covariances).min() > 0
+        np.testing.assert_array_equal(found.covariances, np.swapaxes(found.covariances, 1, 2))
+    assert landmarks == "euclidean" or errors(backend, poses)[1] < 0.05
+
+
+@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
+@pytest.mark.parametrize("disparity", [1e-6, 1e-12])
+def test_hardly_any_disparity(drive, disparity, landmarks):
+    backend, known = halfway(drive, 6, landmarks=landmarks)
+    new, seen = max(known) + 1, drive.observations[6]
+    left = np.array([[300.0, 200.0]])
+    backend.add(Observations(np.array([new]), left, left - [disparity, 0]))
+    backend.predict(0.6)
+    report = backend.update(seen.select(np.array([i in known for i in seen.ids.tolist()])))
+    assert report.status is UpdateStatus.OK and len(report.rejected) < 3
+    P = backend._covariance.full()
+    d = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(d, d)).min() > 0
+    assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0
+
+
+@pytest.mark.parametrize("pixel", [1e7, 1e300])
+def test_no_pixel_of_a_camera(drive, pixel):
+    backend, seen = predicted(drive, 5)
+    uv = seen.uv_left.copy()
+    uv[3, 0] = pixel
+    report = backend.update(Observations(seen.ids, uv, seen.uv_right))
+    np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
+    right = uv[3:4] - [5.0, 0]
+    with pytest.raises(MeasurementError, match="pixel"):
+        backend.add(Observations(np.array([12345]), uv[3:4], right * 0.9))
 
 
 # --- consistency ---

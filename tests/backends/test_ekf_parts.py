@@ -19,7 +19,7 @@ from backends.ekf.angles import (
 from backends.ekf.covariance import CAMERA, Covariance
 from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks
 from backends.ekf.measurement import StereoMeasurement, innovation_covariances, stacked
-from backends.ekf.solve import Problem, _iterate, gate, solve
+from backends.ekf.solve import Problem, UnsolvableError, _iterate, gate, solve
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix, rotation
@@ -436,6 +436,14 @@ def test_more_iterations_never_raise_the_cost():
         costs.append(cost(problem, problem.prior + problem.covariance @ solution.s))
     assert costs[0] < cost(problem, problem.prior) and (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 2 * 36
+
+
+def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
+    """Where the mean does not move towards the measurements, the variance must not fall either."""
+    problem = far_off(5)
+    monkeypatch.setattr("backends.ekf.solve._descend", lambda problem, rows, now, target: (now, False))
+    with pytest.raises(UnsolvableError, match="cost"):
+        solve(problem, replace(gate(problem), used=np.ones(12, bool)))
 
 
 def test_conditional_distances_are_what_leaving_out_would_change():
