@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
-from backends.ekf.measurement import Linearisation, Measurement, stacked
+from backends.ekf.jacobian import Displacement, Jacobian
+from backends.ekf.measurement import Linearisation, Measurement
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.tracking.gating import chi_square_limits
@@ -65,11 +65,10 @@ class Problem:
     gauge_jacobian: Array | None = None
 
     @cached_property
-    def _rigid(self) -> tuple[Array, Array] | None:
-        """``(U, L)``: a change c of the mean displaces the world by ``ξ = L c``, and that changes the mean by ``U ξ``.
+    def displacement(self) -> Displacement | None:
+        """What nothing measures, or None where the landmarks are known exactly.
 
-        ξ is the displacement of all landmarks that explains their change best, given how well they are known to each
-        other.
+        It is that of all landmarks which explains their change best, given how well they are known to each other.
         """
         if self.gauge_jacobian is None:
             return None
@@ -80,21 +79,17 @@ class Problem:
         weighted = np.asarray(dpotrs(lower, U[6:], lower=1)[0])
         L = np.zeros(U.T.shape)
         L[:, 6:] = np.linalg.pinv(U[6:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
-        return U, L
+        return Displacement(U, L)
 
     def mean(self, change: Array) -> Array:
         """The mean (6 + 3M,) at which the model is asked after a change: without the world's displacement in it."""
-        if self._rigid is None or not change.any():
+        if not change.any() or self.displacement is None:
             return self.prior + change
-        U, L = self._rigid
-        return self.prior + (change - U @ (L @ change))
+        return self.prior + (change - self.displacement.change @ (self.displacement.share @ change))
 
-    def jacobian(self, H: Array, change: Array) -> Array:
-        """Derivatives by the change, from those (3M, 6 + 3M) by the mean."""
-        if self._rigid is None or not change.any():
-            return H
-        U, L = self._rigid
-        return H - (H @ U) @ L
+    def jacobian(self, line: Linearisation, rows: BoolArray, change: Array) -> Jacobian:
+        """Derivatives by the change, from those by the mean; zero where a row is not measured (mask (M, 3))."""
+        return Jacobian.of(line, rows, self.displacement if change.any() else None)
 
 
 @dataclass(frozen=True)
@@ -104,7 +99,7 @@ class Solution:
     Attributes:
         used: which landmarks (M,) it is made of.
         s: the correction is ``P[:, g] s``.
-        B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K) in Fortran order: the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
+        B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
         nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
     """
@@ -134,10 +129,19 @@ class _System:
     """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S, S = L Lᵀ."""
 
     rows: BoolArray
-    H: Array
+    H: Jacobian
     nu: Array
     S: Array
     L: Array
+
+    def only(self, rows: BoolArray, sigma: float) -> _System:
+        """With fewer rows (mask (M, 3))."""
+        if (rows == self.rows).all():
+            return self
+        kept = rows.reshape(-1)
+        S = np.where(kept[:, None] & kept, self.S, 0.0)
+        S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
+        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S, _factor(S))
 
 
 @dataclass(frozen=True)
@@ -191,7 +195,7 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     """
     used = gated.used
     while used.any():
-        solution = _iterate(problem, used, gated.start, gated.system if used.all() else None)
+        solution = _iterate(problem, used, gated.start, gated.system)
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
@@ -200,19 +204,19 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     return None
 
 
-def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System | None) -> Solution:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system at the start, if known.
+def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System) -> Solution:
+    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
     """
-    rows = first.rows if first else np.isfinite(problem.z) & used[:, None]
+    rows = first.rows & used[:, None]
     now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
-    system = first or _system(problem, rows, now)
+    system = first.only(rows, problem.sigma)
     for iteration in range(1, problem.iterations + 1):
         y = _solved(system)
-        s: Array = system.H.T @ y
+        s: Array = system.H.transposed_times(y[:, None])[:, 0]
         if not np.isfinite(s).all():
             raise UnsolvableError("the corrected state is not finite")
         if problem.iterations == 1:
@@ -229,13 +233,14 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
         if iteration == problem.iterations or following is now:
             break
         now, system = following, _system(problem, rows, following)
-    B = dtrsm(1.0, system.L, system.H.T, side=1, lower=1, trans_a=1)
+    inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
+    B = system.H.transposed_times(inverse.T)
     reduction = problem.covariance[:6] @ B
     if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
     measured = rows.reshape(-1)
-    B = B if measured.all() else np.asfortranarray(B[:, measured])
-    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y))
+    B = B if measured.all() else B[:, measured]
+    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(inverse, y))
 
 
 def _solved(system: _System) -> Array:
@@ -245,7 +250,7 @@ def _solved(system: _System) -> Array:
 
 def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterate) -> bool:
     """Whether the measurements changed between two iterates as the Jacobian said."""
-    expected = (system.H @ (following.change - now.change)).reshape(-1, 3)
+    expected = system.H.times((following.change - now.change)[:, None]).reshape(-1, 3)
     return bool(np.abs(following.z - now.z - expected)[system.rows].max() < _LINEAR * problem.sigma)
 
 
@@ -284,26 +289,35 @@ def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) ->
 
 def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
     line = line or problem.model.linearise(problem.mean(now.change))
-    H = problem.jacobian(stacked(line, rows), now.change)
+    H = problem.jacobian(line, rows, now.change)
     nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
     if now.change.any():
-        nu += H @ now.change
-    S = H @ problem.covariance @ H.T
+        nu += H.times(now.change[:, None])[:, 0]
+    S = H.sandwich(problem.covariance)
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    L, info = dpotrf(S.T, lower=1, clean=0)  # S is symmetric: its transpose is in the order that LAPACK wants
+    return _System(rows, H, nu, S, _factor(S))
+
+
+def _factor(S: Array) -> Array:
+    """The lower triangular L with ``L Lᵀ = S``."""
+    L, info = dpotrf(S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
     if info != 0:
         raise UnsolvableError("the innovation covariance is not positive definite")
-    return _System(rows, H, nu, S, L)
+    return np.asarray(L)
 
 
-def _conditional_distances(system: _System, y: Array) -> Array:
+def _conditional_distances(inverse: Array, y: Array) -> Array:
     """Squared distance (M,) of each landmark's innovation from what all other measurements predict for it.
 
     For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off by
-    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0.
+    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0. `inverse`
+    is the lower triangular ``L⁻¹``.
     """
-    inverse, _ = dpotri(system.L, lower=1)
-    return _squared_distances(y, _diagonal_blocks(inverse))
+    Q = np.empty((len(y) // 3, 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            Q[:, i, j] = Q[:, j, i] = np.einsum("nm,nm->m", inverse[:, i::3], inverse[:, j::3])
+    return _squared_distances(y, Q)
 
 
 def _squared_distances(nu: Array, covariances: Array) -> Array:

@@ -17,8 +17,9 @@ from backends.ekf.angles import (
     reanchor,
 )
 from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.jacobian import Displacement, Jacobian
 from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks
-from backends.ekf.measurement import StereoMeasurement, innovation_covariances, stacked
+from backends.ekf.measurement import StereoMeasurement, innovation_covariances
 from backends.ekf.solve import Problem, UnsolvableError, _iterate, gate, solve
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -114,6 +115,25 @@ def linearise(rig, world, pose, points):
     return model(rig, world).linearise(np.concatenate([pose, points.reshape(-1)]))
 
 
+def dense(line, rows: np.ndarray, displacement: Displacement | None = None) -> np.ndarray:
+    H = Jacobian.of(line, rows, displacement)
+    whole = H.times(np.eye(6 + 3 * len(rows)))
+    np.testing.assert_allclose(H.transposed_times(np.eye(3 * len(rows))).T, whole, atol=1e-9)
+    return whole
+
+
+def test_products_with_the_jacobian():
+    rng = np.random.default_rng(7)
+    points = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
+    line, rows = linearise(RIG, np.eye(3), np.zeros(6), points), np.ones((5, 3), bool)
+    rows[3] = rows[1, 2] = False
+    U, L, P = rng.standard_normal((21, 6)), rng.standard_normal((6, 21)), positive(21, rng)
+    plain, reduced = dense(line, rows), dense(line, rows, Displacement(U, L))
+    np.testing.assert_allclose(reduced, plain - plain @ U @ L, atol=1e-8)
+    H = Jacobian.of(line, np.ones((5, 3), bool), Displacement(U, L)).only(rows)
+    np.testing.assert_allclose(H.sandwich(P), reduced @ P @ reduced.T, rtol=1e-9, atol=1e-6)
+
+
 @pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
 @pytest.mark.parametrize("phi", ATTITUDES)
 def test_measurement_jacobians(rig, phi):
@@ -127,13 +147,13 @@ def test_measurement_jacobians(rig, phi):
     measured = model(rig, world).predict
     x = np.concatenate([r, phi, points.reshape(-1)])
     everything = np.ones((5, 3), bool)
-    np.testing.assert_allclose(stacked(line, everything), jacobian(measured, x), rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(dense(line, everything), jacobian(measured, x), rtol=1e-6, atol=1e-5)
 
 
 def test_rows_not_measured_are_zero():
     line = linearise(RIG, np.eye(3), np.zeros(6), np.array([[0.1, 0.2, 5.0], [0.3, -0.1, -4.0]]))
     rows = np.array([[True, True, False], [False] * 3])
-    H = stacked(line, rows)
+    H = dense(line, rows)
     assert np.isfinite(H).all() and (H[2:] == 0).all() and (H[:2, :9] != 0).any(axis=1).all()
 
 
@@ -142,7 +162,7 @@ def test_innovation_covariances_are_blocks_of_the_dense_ones():
     points = rng.uniform((-1, -1, 4), (1, 1, 10), (4, 3))
     line = linearise(RIG, np.eye(3), np.zeros(6), points)
     P = positive(6 + 12, rng)
-    H = stacked(line, np.ones((4, 3), bool))
+    H = dense(line, np.ones((4, 3), bool))
     S = H @ P @ H.T + 0.25 * np.eye(12)
     cross = P[6:, :6].reshape(4, 3, 6)
     blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
@@ -450,7 +470,8 @@ def test_conditional_distances_are_what_leaving_out_would_change():
     """A landmark's squared distance from what the others predict is the fall of the NIS when it is left out."""
     problem = far_off(1)
     everything = np.ones(12, bool)
-    whole = _iterate(problem, everything, gate(problem).start, None)
+    gated = gate(problem)
+    whole = _iterate(problem, everything, gated.start, gated.system)
     for j in (0, 5, 11):
-        without = _iterate(problem, np.arange(12) != j, gate(problem).start, None)
+        without = _iterate(problem, np.arange(12) != j, gated.start, gated.system)
         assert whole.nis - without.nis == pytest.approx(whole.distances[j], rel=1e-6)
