@@ -99,16 +99,26 @@ class Solution:
     Attributes:
         used: which landmarks (M,) it is made of.
         s: the correction is ``P[:, g] s``.
-        B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
+        H: the Jacobian of the last linearisation.
+        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
+        measured: which rows (3M,) are measured.
         nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
     """
 
     used: BoolArray
     s: Array
-    B: Array
+    H: Jacobian
+    inverse: Array
+    measured: BoolArray
     nis: float
     distances: Array
+
+    @cached_property
+    def B(self) -> Array:
+        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``."""
+        B = self.H.transposed_times(self.inverse.T)
+        return B if self.measured.all() else B[:, self.measured]
 
 
 @dataclass(frozen=True)
@@ -199,6 +209,7 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
+            _require_positive(problem, solution)
             return solution
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
@@ -234,13 +245,15 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
             break
         now, system = following, _system(problem, rows, following)
     inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
-    B = system.H.transposed_times(inverse.T)
-    reduction = problem.covariance[:6] @ B
+    distances = _conditional_distances(inverse, y)
+    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances)
+
+
+def _require_positive(problem: Problem, solution: Solution) -> None:
+    """Raise where rounding leaves a variance of the pose that is not positive."""
+    reduction = problem.covariance[:6] @ solution.B
     if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
-    measured = rows.reshape(-1)
-    B = B if measured.all() else B[:, measured]
-    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(inverse, y))
 
 
 def _solved(system: _System) -> Array:
