@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
+from backends.ekf.atomic import all_or_nothing
 from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import CAMERA, POSE, Covariance, SlotArray
 from backends.ekf.landmarks import COORDINATES, Landmarks, far_charts
@@ -70,9 +71,24 @@ class EkfBackend:
         self._objects = ObjectFilter(rig, models, self.config.iterations)
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
 
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        parts = (self._covariance.saved(), self._landmarks.saved(), self._objects.saved())
+        before, count, last = (self._camera, self._R_world_angles), len(self._stamps), self._poses[-1:]
+
+        def restore() -> None:
+            for part in parts:
+                part()
+            self._camera, self._R_world_angles = before
+            del self._stamps[count:], self._poses[count:]
+            self._poses[count - len(last) :] = last
+
+        return restore
+
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
         if not np.isfinite(stamp) or (self._stamps and stamp <= self._stamps[-1]):
@@ -85,6 +101,7 @@ class EkfBackend:
         return self._prediction()
 
     @one_blas_thread
+    @all_or_nothing
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
@@ -109,6 +126,7 @@ class EkfBackend:
         return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], solution.nis, dof)
 
     @one_blas_thread
+    @all_or_nothing
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._require_started("add")
@@ -125,6 +143,7 @@ class EkfBackend:
         h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         self._place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
 
+    @all_or_nothing
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
         ids = np.unique(np.asarray(ids, np.int64))
@@ -156,6 +175,7 @@ class EkfBackend:
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("ekf", ids, positions, covariances)
@@ -165,6 +185,7 @@ class EkfBackend:
             self._append(np.zeros((len(ids), 3, POSE)), D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
+    @all_or_nothing
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         self._require_started("place")
@@ -176,6 +197,7 @@ class EkfBackend:
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
@@ -183,6 +205,7 @@ class EkfBackend:
         camera = CameraBelief(T, pose_jacobian(T[:3, :3], self._camera[3:6]), columns)
         return self._objects.update(observations, self._stamps[-1], camera)
 
+    @all_or_nothing
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
         self._objects.remove(ids)
@@ -230,8 +253,9 @@ class EkfBackend:
 
     def _transition(self, dt: float) -> None:
         """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W."""
-        before = self._camera.copy()
-        self._camera[:POSE] += dt * self._camera[POSE:]
+        before = self._camera
+        self._camera = before.copy()
+        self._camera[:POSE] += dt * before[POSE:]
         if self._consistent and np.abs(self._camera[3:6] - before[3:6]).max() < _SMALL_TURN:
             self._turn_with(before)
         self._covariance.move_camera(dt, self._motion_noise(dt))
@@ -356,13 +380,13 @@ class EkfBackend:
             UnsolvableError: the new state is not finite.
         """
         covariance, solution = self._covariance, found.solution
+        change = covariance.times(slots, solution.s)
+        if found.noise is not None:
+            change[:CAMERA] += found.noise[:, :POSE] @ solution.s[:POSE]
+        if not np.isfinite(change).all():
+            raise UnsolvableError("the corrected state is not finite")
         if found.noise is not None:
             covariance.move_camera(0.0, found.noise)
-        change = covariance.times(slots, solution.s)
-        if not np.isfinite(change).all():
-            if found.noise is not None:
-                covariance.move_camera(0.0, -found.noise)
-            raise UnsolvableError("the corrected state is not finite")
         if self._objects.count:
             self._correct_objects(slots, solution)
         covariance.subtract(slots, solution.B)

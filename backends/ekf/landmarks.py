@@ -10,8 +10,8 @@ state has three numbers a landmark as before and everything else stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +148,11 @@ class Landmarks:
         self.gauge_jacobian: Array = np.zeros((0, 3, 6))
         self._slots: dict[int, int] = {}
 
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        before = vars(self).copy()
+        return lambda: vars(self).update(before)
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -168,7 +173,7 @@ class Landmarks:
         """Add landmarks at positions (M, 3); returns the derivatives (M, 3, 3) of their coordinates by these."""
         first, state = len(self), self.coordinates.of(anchors, points)
         inverse, gauge_jacobian = self._derivatives(anchors, state, points)
-        self._slots.update(zip(ids.tolist(), range(first, first + len(ids))))
+        self._slots = {**self._slots, **dict(zip(ids.tolist(), range(first, first + len(ids))))}
         self.ids = np.concatenate([self.ids, ids])
         self.anchors = np.concatenate([self.anchors, anchors])
         self.state = np.concatenate([self.state, state])
@@ -178,15 +183,17 @@ class Landmarks:
 
     def remove(self, ids: IdArray, holes: SlotArray, movers: SlotArray) -> None:
         """Forget landmarks; `holes` are filled from `movers`, as the covariance has done (`Covariance.drop`)."""
-        for i in ids.tolist():
-            del self._slots[i]
-        left = len(self) - len(ids)
-        for array in (self.ids, self.anchors, self.state, self.points, self.gauge_jacobian):
-            array[holes] = array[movers]
-        self._slots.update(zip(self.ids[holes].tolist(), holes.tolist()))
-        self.ids, self.anchors = self.ids[:left], self.anchors[:left]
-        self.state, self.points = self.state[:left], self.points[:left]
-        self.gauge_jacobian = self.gauge_jacobian[:left]
+        left, gone = len(self) - len(ids), set(ids.tolist())
+        moved = dict(zip(self.ids[movers].tolist(), holes.tolist()))
+        self._slots = {i: moved.get(i, slot) for i, slot in self._slots.items() if i not in gone}
+
+        def rest(array: NDArray[Any]) -> NDArray[Any]:
+            out = array[:left].copy()
+            out[holes] = array[movers]
+            return out
+
+        self.ids, self.anchors, self.state = rest(self.ids), rest(self.anchors), rest(self.state)
+        self.points, self.gauge_jacobian = rest(self.points), rest(self.gauge_jacobian)
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""
@@ -197,6 +204,7 @@ class Landmarks:
         """Let `gauge_jacobian` be that of the present coordinates; returns the change (M, 3, 6)."""
         now = self._derivatives(self.anchors[slots], self.state[slots], self.points[slots])[1]
         change = now - self.gauge_jacobian[slots]
+        self.gauge_jacobian = self.gauge_jacobian.copy()
         self.gauge_jacobian[slots] = now
         return np.asarray(change)
 
