@@ -55,10 +55,12 @@ class Covariance:
         self._Phi: Array = np.zeros((CAMERA, 0))
         self._Psi: Array = np.zeros((0, 0))
         self._undo: list[tuple[Array, slice, Array]] = []  # parts of arrays as they were before they were changed
+        self._mine = False  # whether P_LL and Φ may be changed in place
 
     def saved(self) -> Callable[[], None]:
         """A function that puts everything back as it is now."""
         undo = self._undo = []
+        self._mine = False
         before = vars(self).copy()
 
         def restore() -> None:
@@ -153,37 +155,35 @@ class Covariance:
         """``P ← P − W Wᵀ`` with ``W = P[:, g] B``, g as above; B (6 + 3M, K)."""
         g = self._rows(slots)
         W, V = B.T @ self._local[g], B.T @ self._Phi[g]  # transposed
-        self._local = self._local - W.T @ W
+        P, Phi = self._own()
+        P -= W.T @ W
         if V.size:
-            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=self._Phi.T, trans_b=1).T
+            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=Phi.T, trans_b=1, overwrite_c=1).T
             self._Psi = self._Psi + V.T @ V
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
-        P, Phi = self._local.copy(), self._Phi.copy()
+        P, Phi = self._own()
         P[:POSE] += dt * P[POSE:CAMERA]
         P[:, :POSE] += dt * P[:, POSE:CAMERA]
         P[:CAMERA, :CAMERA] = _symmetric(P[:CAMERA, :CAMERA] + noise)
         Phi[:POSE] += dt * Phi[POSE:CAMERA]
-        self._local, self._Phi = P, Phi
 
     def transform_camera(self, J: Array) -> None:
         """``P ← J P Jᵀ`` for a change of the camera's state (12, 12)."""
-        P, Phi = self._local.copy(), self._Phi.copy()
+        P, Phi = self._own()
         rows = J @ P[:CAMERA]
         rows[:, :CAMERA] = _symmetric(rows[:, :CAMERA] @ J.T)
         P[:CAMERA], P[:, :CAMERA] = rows, rows.T
         Phi[:CAMERA] = J @ Phi[:CAMERA]
-        self._local, self._Phi = P, Phi
 
     def transform_landmarks(self, K: Array) -> None:
         """``Y ← Y + K [r, φ]`` for a change of coordinates of those landmarks that became local last; K (M, 3, 6)."""
-        by_pose, P, Phi = K.reshape(-1, POSE), self._local.copy(), self._Phi.copy()
+        by_pose, (P, Phi) = K.reshape(-1, POSE), self._own()
         rows = slice(len(P) - len(by_pose), len(P))
         P[rows] += by_pose @ P[:POSE]
         P[:, rows] += P[:, :POSE] @ by_pose.T
         Phi[rows] += by_pose @ Phi[:POSE]
-        self._local, self._Phi = P, Phi
 
     def append(self, J: Array, noise: Array) -> None:
         """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
@@ -314,6 +314,12 @@ class Covariance:
         P[row + 3 : self.size, to : to + 3] = P[row + 3 : self.size, row : row + 3]
         P[to : to + 3, to : to + 3] = P[row : row + 3, row : row + 3]
         self._X[to : to + 3] = self._X[row : row + 3]
+
+    def _own(self) -> tuple[Array, Array]:
+        """P_LL and Φ, to be changed in place: copies, once after each `saved`."""
+        if not self._mine:
+            self._local, self._Phi, self._mine = self._local.copy(), self._Phi.copy(), True
+        return self._local, self._Phi
 
     def _note(self, array: Array, part: slice) -> None:
         """Note rows of an array that is about to be changed in place."""

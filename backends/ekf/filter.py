@@ -328,7 +328,8 @@ class EkfBackend:
     def _problem(self, observations: Observations, slots: SlotArray, guess: Array | None) -> Problem:
         """The update in the coordinates [r, φ, measured landmarks]."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
-        z = np.clip(np.where(np.isfinite(z), z, np.nan), -_PIXELS, _PIXELS)
+        if not (np.abs(z) < _PIXELS).all():
+            z = np.clip(np.where(np.isfinite(z), z, np.nan), -_PIXELS, _PIXELS)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
         marks = self._landmarks

@@ -232,6 +232,9 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
             raise UnsolvableError("the corrected state is not finite")
         if problem.iterations == 1:
             break
+        following = _visit(problem, rows, s, plain=True)
+        if following.cost <= now.cost and _linear(problem, system, now, following):
+            break
         following, whole = _descend(problem, rows, now, s)
         if whole and _linear(problem, system, now, following):
             break
@@ -282,9 +285,10 @@ def _towards_guess(problem: Problem) -> Array:
     return s
 
 
-def _visit(problem: Problem, rows: BoolArray, s: Array) -> _Iterate:
+def _visit(problem: Problem, rows: BoolArray, s: Array, plain: bool = False) -> _Iterate:
+    """The iterate with a correction; `plain`: with the world's displacement in it, which is less work."""
     change = problem.covariance @ s
-    z = problem.model.predict(problem.mean(change))
+    z = problem.model.predict(problem.prior + change if plain else problem.mean(change))
     return _Iterate(s, change, z, _cost(problem, rows, z, float(s @ change)))
 
 
