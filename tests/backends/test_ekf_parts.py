@@ -475,3 +475,29 @@ def test_conditional_distances_are_what_leaving_out_would_change():
     for j in (0, 5, 11):
         without = _iterate(problem, np.arange(12) != j, gated.start, gated.system)
         assert whole.nis - without.nis == pytest.approx(whole.distances[j], rel=1e-6)
+
+
+def test_a_large_displacement_of_the_world_changes_no_prediction():
+    """By metres, in coordinates that are not linear in it: nor does an update that is linearised there measure it."""
+    rng = np.random.default_rng(3)
+    world, phi = anchor(np.eye(3))
+    points = rng.uniform((-4, -2, 8), (4, 2, 30), (40, 3))
+    anchors, coordinates = np.tile(np.eye(3, 4), (40, 1, 1)), InverseDepth()
+    c = coordinates.of(anchors, points)
+    inverse = np.linalg.inv(coordinates.jacobian(anchors, c))
+    gauge_jacobian = np.zeros((126, 6))
+    gauge_jacobian[:3, :3] = np.eye(3)
+    gauge_jacobian[3:6, 3:] = np.linalg.inv(world @ rotation(phi) @ body_rate_matrix(phi))
+    gauge_jacobian[6:] = np.concatenate([inverse, -inverse @ se3.hat(points)], axis=2).reshape(-1, 6)
+    own = np.diag(np.concatenate([np.full(3, 0.1**2), np.full(3, 0.01**2), np.tile([1e-6, 1e-6, 1e-7], 40)]))
+    P = own + gauge_jacobian @ np.diag(np.repeat([3.0, 0.03], 3) ** 2) @ gauge_jacobian.T
+    prior = np.concatenate([np.zeros(3), phi, c.reshape(-1)])
+    measurement = StereoMeasurement(RIG, world, coordinates, anchors)
+    z = measurement.predict(prior)
+    problem = Problem(prior, 0.5 * (P + P.T), z, 0.5, measurement, 5, 0.999, gauge_jacobian=gauge_jacobian)
+    change = gauge_jacobian @ np.array([2.0, -1.0, 3.0, 0.03, -0.02, 0.05])
+    assert np.nanmax(np.abs(measurement.predict(prior + change) - z)) > 1.0
+    np.testing.assert_allclose(measurement.predict(problem.mean(change)), z, atol=1e-5)
+    there = change + np.linalg.cholesky(own) @ rng.standard_normal(126)
+    H = problem.jacobian(measurement.linearise(problem.mean(there)), np.ones((40, 3), bool), there)
+    np.testing.assert_allclose(H.times(gauge_jacobian), 0, atol=1e-4)  # [px/m], [px/rad]
