@@ -33,7 +33,7 @@ class FactorMaker:
     """Makes factors for one rig and one set of models.
 
     Args:
-        stereo: the rectified rectified_rig's projection.
+        stereo: the rectified rig's projection.
         models: noise, priors and motion.
     """
 

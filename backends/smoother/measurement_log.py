@@ -92,7 +92,7 @@ class Measurements:
 
     @property
     def z(self) -> Array:
-        """(uL, vL, uR) of the rectified rectified_rig (n, 3)."""
+        """(uL, vL, uR) of the rectified rig (n, 3)."""
         return self._z[: self.count]
 
     @property

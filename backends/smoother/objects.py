@@ -45,7 +45,7 @@ class ObjectSmoother:
     uncertainty of its points; from then on the pose is that of the motion since.
 
     Args:
-        stereo: the rig's rectified rectified_rig.
+        stereo: the rig's rectified rig.
         sigma: pixel noise in it [px].
         models: gate and motion of bodies.
     """
@@ -227,7 +227,7 @@ class ObjectSmoother:
 
 @dataclass(frozen=True)
 class _Measured:
-    """Observations of a body in the rectified rectified_rig.
+    """Observations of a body in the rectified rig.
 
     Attributes:
         ids: of the points (M,).

@@ -71,7 +71,7 @@ class Window:
         stamps: their times (n,) [s].
         T: poses T_world_object (n, 4, 4).
         scales: factors (n,) on the impulse before each.
-        z: measurements (n, p, 3) of the rectified rectified_rig, NaN where there is none.
+        z: measurements (n, p, 3) of the rectified rig, NaN where there is none.
         ids: of the points (p,).
         points: in body coordinates (p, 3).
         failures: how often running each point's observation was rejected (p,).
@@ -204,7 +204,7 @@ class Solver:
 
     Args:
         stereo: the projection.
-        sigma: pixel noise in the rectified rectified_rig [px].
+        sigma: pixel noise in the rectified rig [px].
         models: how bodies move.
         iterations: most linearisations.
     """

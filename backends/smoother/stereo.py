@@ -1,7 +1,7 @@
-"""Stereo measurements in the rectified rectified_rig: what gtsam's stereo factors understand.
+"""Stereo measurements in the rectified rig: what gtsam's stereo factors understand.
 
 A measurement is (uL, vL, uR) in rectified pixels, uR shifted so that both cameras share one u0; uR is NaN where there
-is no right pixel. The body frame is the rig's own left camera, the sensor its rectified rectified_rig.
+is no right pixel. The body frame is the rig's own left camera, the sensor its rectified rig.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class RectifiedStereo:
     """Projection by a rectified rig, and the way from the original rig's pixels to its.
 
     Attributes:
-        rectified_rig: the rectified rectified_rig.
+        rectified_rig: the rectified rig.
         f, u0, v0, baseline: of the rectified rig [px], [m].
         doffs: u0 of the right camera less that of the left [px].
         scale: rectified pixels per original pixel, on average over the image.

@@ -81,7 +81,7 @@ class SurfFrontend:
         return self._rectify(image, side)
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
-        """Image of the rectified rectified_rig's left (0) or right (1) camera."""
+        """Image of the rectified rig's left (0) or right (1) camera."""
         if self.rig.is_rectified:
             return image
         import cv2

@@ -1,4 +1,4 @@
-"""Two cameras: the general, unrectified stereo rig of paper A (Eqs. 5-10) and its rectified rectified_rig."""
+"""Two cameras: the general, unrectified stereo rig of paper A (Eqs. 5-10) and its rectified rig."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from slam.geometry.se3 import Array, nearest_rotation
 
 _ZERO_DISPARITY = 1024  # OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 
-_FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rectified_rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+_FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
 
 
 class RectificationMaps(NamedTuple):
@@ -181,7 +181,7 @@ class StereoRig:
 
     @cached_property
     def rectified(self) -> RectifiedTwin:
-        """The rectified rectified_rig: itself where `is_rectified`."""
+        """The rectified rig: itself where `is_rectified`."""
         return rectify(self)
 
 
@@ -236,7 +236,7 @@ class RectifiedTwin:
 
 
 def rectify(rig: StereoRig) -> RectifiedTwin:
-    """The rectified rectified_rig of a rig, by OpenCV's ``stereoRectify`` with only valid pixels (no black borders).
+    """The rectified rig of a rig, by OpenCV's ``stereoRectify`` with only valid pixels (no black borders).
 
     Raises:
         CalibrationError: the cameras look so far apart that no common rectified image is left.
