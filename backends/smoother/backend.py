@@ -78,6 +78,11 @@ class SmootherBackend:
         """CPU time spent in gtsam's solvers so far [s]: the least this back end could cost; the rest is overhead."""
         return self._graph.solver_seconds
 
+    @property
+    def rebuilds(self) -> int:
+        """How often the problem was put into a new solver so far, after a failure or a divergence."""
+        return self._graph.rebuilds
+
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread

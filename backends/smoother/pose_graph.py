@@ -11,7 +11,7 @@ from backends.smoother import uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
-from backends.smoother.lag import FixedLag
+from backends.smoother.lag import overdue, without_old
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -50,19 +50,20 @@ class PoseGraph:
 
     Attributes:
         measurement_log: poses, measurements and landmarks as they are believed now.
+        rebuilds: how often all was put into a new solver.
     """
 
     def __init__(self, make: FactorMaker, config: SmootherConfig) -> None:
         self.measurement_log = MeasurementLog()
         self._make = make
         self._config = config
-        self._lag = None if config.lag is None else FixedLag(self.measurement_log, config.lag, config.explicit)
-        self._factor_builder = FactorBuilder(make, config, self.measurement_log, self._lag)
+        self._factor_builder = FactorBuilder(make, config, self.measurement_log)
         self._often, self._seldom, self._last = (
             thresholds(make.stereo, config.relinearise, share) for share in (_OFF, 1.0, _LAST / config.relinearise)
         )
         self._solver = Solver(self._seldom)
         self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
+        self.rebuilds = 0
         self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
         self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
@@ -80,9 +81,10 @@ class PoseGraph:
         """Add a frame without measurements."""
         self.measurement_log.path.append(stamp, T_world_left)
         try:
-            self._enter_pose(self._change(), 1.0)
+            self._enter_pose(Change(), 1.0)
         except SolverError:
             self._recover()
+        self._advance()
 
     def append_measured_pose(
         self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array, impulse: float
@@ -102,7 +104,7 @@ class PoseGraph:
         marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count
         self.measurement_log.path.append(stamp, T_world_left)
         rows = self.measurement_log.measurements.append(z, frame, marks.serial[slots])
-        change = self._change()
+        change = Change()
         grown = self._factor_builder.grow(change, slots, rows, z)
         try:
             try:
@@ -114,6 +116,7 @@ class PoseGraph:
         except SolverError as error:
             self.measurement_log.take_back(slots, rows)
             self._recover()
+            self._advance()
             return str(error)
         marks.measured(slots, rows, frame)
         self.measurement_log.path.note_measured()
@@ -124,6 +127,7 @@ class PoseGraph:
         except SolverError:
             self._recover()
         self._factor_builder.finish_tracks(slots)
+        self._advance()
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
@@ -255,20 +259,13 @@ class PoseGraph:
     def _solved_poses(self) -> Array:
         """All poses, those that are variables as the solver has them."""
         poses = self.measurement_log.path.poses.copy()
-        first = 0 if self._lag is None else self._lag.first
+        first = self.measurement_log.history.first
         if len(poses):
             values = self._solver.values()
             poses[first:] = [values.atPose3(pose_key(i)).matrix() for i in range(first, len(poses))]
         return poses
 
     # --- factors ---
-
-    def _change(self) -> Change:
-        """The change that comes with the newest pose, empty but for what leaves."""
-        change = Change()
-        if self._lag is not None:
-            self._lag.advance(change)
-        return change
 
     def _enter_pose(self, change: Change, impulse: float) -> list[int]:
         """Add the newest pose with its prior or motion to the change, and solve; returns the new factors' slots."""
@@ -281,6 +278,32 @@ class PoseGraph:
         change.factors.add(pose_factor(self._make, path, i, impulse))
         self._window, self._solved = None, False
         return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
+
+    # --- the lag ---
+
+    def _advance(self) -> None:
+        """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
+        first = None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+        if first is None:
+            return
+        try:
+            rest = without_old(self.measurement_log, self._solver, first, self._config.explicit)
+            self._factor_builder.eliminate_late(rest.change, first, rest.gone)
+            solver = Solver(self._seldom)
+            new = solver.update(rest.change)
+            left = self._solver.poses(pose_key(i) for i in range(self.measurement_log.history.first, first))
+        except SolverError:
+            return
+        marks = self.measurement_log.landmarks
+        self.measurement_log.path.poses[first - len(left) : first] = left
+        marks.variable[np.isin(marks.variable, rest.gone)] = -1
+        for track in rest.finished:
+            track.restart()
+        for track in marks.tracks.values():
+            track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
+        self.measurement_log.advance(first, rest.gone, rest.prior)
+        self._seconds += self._solver.seconds
+        self._solver, self._window, self._carried = solver, None, None
 
     # --- the way back from the solver ---
 
@@ -363,6 +386,7 @@ class PoseGraph:
         Raises:
             SolverError: that cannot be solved either.
         """
+        self.rebuilds += 1
         change, places = whole_problem(self._make, self.measurement_log)
         start = time.process_time()
         try:
@@ -378,6 +402,4 @@ class PoseGraph:
             track.factor = new[place]
         self._seconds += self._solver.seconds
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
-        if self._lag is not None:
-            self._lag.restart()
         self._read_all()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -45,16 +45,12 @@ class Change:
         late: variables to eliminate late, those of the first set before those of the second: what will be touched
             again soon. Without it a landmark that was seen from many poses may be eliminated before them, and with it
             in between everything is touched by everything.
-        leaving: variables to marginalise after the update; all their factors stay as they are from then on.
-        staying: all other variables that were there before; only needed where some leave.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)
     late: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
-    leaving: list[int] = field(default_factory=list)
-    staying: list[int] = field(default_factory=list)
 
 
 class Solver:
@@ -91,14 +87,9 @@ class Solver:
             self._isam.params().setRelinearizeThreshold(thresholds)  # gtsam hands out its own, not a copy
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = change.removed
-        if change.leaving:
-            parameters.constrainedKeys = _groups(set(change.staying) - set().union(*change.late), *change.late)
-            parameters.extraReelimKeys = _key_list([*change.leaving, *change.staying])
-        elif any(change.late):
+        if any(change.late):
             parameters.constrainedKeys = _groups(*change.late)
         result = self._guarded(lambda: self._isam.update(change.factors, change.values, parameters))
-        if change.leaving:  # eliminated first of all, so they are leaves of the tree
-            self._guarded(lambda: self._isam.marginalizeLeaves(_key_list(change.leaving)))
         return result.getNewFactorsIndices()
 
     def converge(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
@@ -167,6 +158,13 @@ class Solver:
         """All variables, solved to the last."""
         return self._guarded(self._isam.calculateBestEstimate)
 
+    def factors(self) -> Iterator[tuple[int, gtsam.NonlinearFactor]]:
+        """All factors but those of the ballast, with their slots."""
+        graph = self._isam.getFactorsUnsafe()
+        for slot in range(_BALLAST, graph.size()):
+            if graph.exists(slot):
+                yield slot, graph.at(slot)
+
     def _guarded(self, call: Callable[[], _T]) -> _T:
         start = time.process_time()
         try:
@@ -185,13 +183,6 @@ def _groups(*late: set[int]) -> gtsam.KeyGroupMap:
         for key in keys:
             groups.insert2(key, number)
     return groups
-
-
-def _key_list(keys: list[int]) -> gtsam.KeyList:
-    out = gtsam.KeyList()
-    for key in keys:
-        out.push_back(key)
-    return out
 
 
 def _root_of(isam: gtsam.ISAM2, key: int) -> tuple[list[int], Array] | None:
