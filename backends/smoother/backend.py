@@ -22,6 +22,7 @@ from backends.smoother.prediction import (
     normalised_innovation,
     predict_points,
     predict_pose,
+    residual_noise,
 )
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
@@ -245,8 +246,7 @@ class SmootherBackend:
         self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, z: Array, guess: Array | None
     ) -> tuple[Array, BoolArray]:
         """First value of the newest pose, and which measurements agree with it."""
-        _, J = self._stereo.project(points.local)
-        noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
+        noise = residual_noise(self._stereo, self._make.sigma, points, z)
         known = self.measurement_log.landmarks.prior[
             slots
         ].any()  # what is known in the world does not move with the poses
