@@ -19,7 +19,7 @@ from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.uncertainty import PoseSet, WindowJacobians
 from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.tracking.gating import chi_square_gate
 
 #: What lies before the window is read back when the window's oldest pose has been revised by so much [m, or sine].
@@ -32,6 +32,9 @@ _SELDOM, _AT_ONCE = 0.01, 20
 #: Each time a variable is linearised anew, all that was seen since it was first seen is eliminated again, so it is done
 #: for many together: every so many frames. What is off by so many times as much is not left to wait.
 _EVERY, _OFF = 10, 10.0
+
+#: A landmark is solved anew where a single step would change its sum of squares by so much.
+_FAR = 1.0
 
 #: Steps that take landmarks to where their mended measurements put them.
 _REFINED = 3
@@ -247,13 +250,14 @@ class PoseGraph:
             self._recover()
         self._solved, self._window = True, None
 
-    def _read_all(self) -> None:
-        """Bring all poses and landmarks on record up to what the solver has."""
+    def _read_all(self, before: Array | None = None) -> None:
+        """Bring all poses and landmarks on record up to what the solver has; `before` are the poses as they were."""
         path = self.measurement_log.path
         if path.count:
+            before = path.poses.copy() if before is None else before
             path.poses[:] = self._solved_poses()
             if self.measurement_log.measurements.count:
-                self._place(self.measurement_log.landmarks.used())
+                self._place(self.measurement_log.landmarks.used(), before)
             self._moved, self._converged = 0.0, path.count
 
     def _solved_poses(self) -> Array:
@@ -315,41 +319,53 @@ class PoseGraph:
         """
         path = self.measurement_log.path
         first = max(0, path.count - self._config.window)
-        before = path.poses[first].copy()
+        before = path.poses.copy()
         path.poses[first:] = self._solver.poses(pose_key(i) for i in range(first, path.count))
-        self._moved += float(np.abs(path.poses[first] - before).max())
+        self._moved += float(np.abs(path.poses[first] - before[first]).max())
         waited = path.count - self._converged >= _SELDOM * path.count
         if self._moved > (_STALE if waited else _AT_ONCE * _STALE):
-            self._read_all()
+            self._read_all(before)
         else:
-            self._place(slots)
+            self._place(slots, before)
 
-    def _place(self, slots: IndexArray) -> None:
-        """Positions of landmarks that fit the poses on record."""
-        marks = self.measurement_log.landmarks
+    def _place(self, slots: IndexArray, before: Array | None = None) -> None:
+        """Positions of landmarks that fit the poses on record.
+
+        `before` (F, 4, 4) are the poses as they were; a landmark first goes with the last one that measured it.
+        """
+        r, marks = self.measurement_log, self.measurement_log.landmarks
         variables = marks.variable[slots]
         explicit = variables >= 0
+        others = slots[~explicit]
+        if before is not None:
+            last = marks.last[others]
+            moved = r.path.poses[last] @ inverse(before[last])
+            turned = moved[:, :3, :3] @ marks.position[others][:, :, None]
+            marks.position[others] = turned[:, :, 0] + moved[:, :3, 3]
         marks.position[slots[explicit]] = self._solver.points(variables[explicit].tolist())
-        marks.position[slots[~explicit]] += self._linearise(slots)[~explicit]
+        step, gain = self._linearise(slots)
+        far = ~explicit & (gain > _FAR)
+        if far.any():
+            marks.position[slots[far]] = uncertainty.refined(
+                self._make.stereo, self._make.sigma, r.path.poses, r.measurements, marks, slots[far]
+            )
+            step[far] = self._linearise(slots[far])[0]
+        near = ~explicit & (gain <= _FAR)
+        marks.position[slots[near]] += step[near]
 
-    def _linearise(self, slots: IndexArray) -> Array:
-        """Covariances of landmarks by their recent measurements; returns steps (M, 3) to better positions."""
+    def _linearise(self, slots: IndexArray) -> tuple[Array, Array]:
+        """Covariances of landmarks by their recent measurements; returns steps (M, 3) to better positions and gains."""
         r, marks = self.measurement_log, self.measurement_log.landmarks
+        position = marks.position[slots]
         E, residuals = uncertainty.linearise(
-            self._make.stereo,
-            self._make.sigma,
-            r.path.poses,
-            r.measurements,
-            marks.position[slots],
-            marks.recent[slots],
+            self._make.stereo, self._make.sigma, r.path.poses, r.measurements, position, marks.recent[slots]
         )
-        offset = marks.mean[slots] - marks.position[slots]
-        step, marks.covariance[slots] = uncertainty.position_step(
-            E, residuals, marks.older[slots], marks.prior[slots], offset
+        step, marks.covariance[slots], gain = uncertainty.position_step(
+            E, residuals, marks.older[slots], np.zeros_like(position), marks.prior[slots], marks.mean[slots] - position
         )
         marks.information[slots] = np.swapaxes(E, 2, 3) @ E
         self._carried = None
-        return step
+        return step, gain
 
     # --- failures ---
 
