@@ -50,6 +50,9 @@ class FactorBuilder:
         marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count - 1
         landmarks, poses = change.late
         poses.update(pose_key(i) for i in self.newest() if i >= first)
+        oldest = max(first, self.measurement_log.history.first)
+        if oldest:  # that one is held, and its covariance is asked for
+            poses.add(pose_key(oldest))
         recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
         landmarks.update(set(marks.variable[recent].tolist()).difference(gone))
 

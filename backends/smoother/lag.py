@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import gtsam
 
-from backends.smoother.marginal import MarginalPrior, marginal_prior
+from backends.smoother.marginal import Held, MarginalPrior, marginal_prior
 from backends.smoother.measurement_log import MeasurementLog, Track
-from backends.smoother.solver import Change, Solver
+from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of
 
 #: Poses leave once so many are there as the lag and one part in so many of it.
@@ -28,7 +28,8 @@ class Rest:
         gone: landmark variables that have left.
         finished: tracks whose factor has become part of the prior.
         prior: what has left, on what stays.
-        change: all factors and values for a new solver; the prior is the last of the factors.
+        held: the oldest pose.
+        change: all factors and values for a new solver.
         slots: places of the old solver's factors in the change.
     """
 
@@ -36,6 +37,7 @@ class Rest:
     gone: list[int]
     finished: list[Track]
     prior: MarginalPrior
+    held: Held
     change: Change
     slots: dict[int, int]
 
@@ -55,27 +57,53 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
     Raises:
         SolverError: what leaves cannot be marginalised.
     """
-    history, values, kept = measurement_log.history, solver.values(), Change()
+    history, kept = measurement_log.history, Change()
     gone = _old_landmarks(measurement_log, first, most)
     leaving = {*map(pose_key, range(history.first, first)), *gone}
     touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
     for slot, factor in solver.factors():
         keys = factor.keys()
+        if history.held is not None and keys == [history.held.key]:
+            continue
         if leaving.isdisjoint(keys):
             slots[slot] = kept.factors.size()
             kept.factors.add(factor)
         else:
             touched.add(factor)
             staying.update(keys)
+    values = _solved_together(kept.factors, touched, solver.values())
     ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
     prior = marginal_prior(touched, values, sorted(leaving), ordered)
+    held = prior.held(values.atPose3(pose_key(first)).matrix())
     kept.factors.add(prior.factor())
+    kept.factors.add(held.factor())
     for key in [*map(pose_key, range(first, measurement_log.path.count)), *history.explicit]:
         if key not in leaving:
             put(kept.values, key, values)
     oldest = pose_key(first)
     finished = [track for track in measurement_log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
-    return Rest(first, gone, finished, prior, kept, slots)
+    return Rest(first, gone, finished, prior, held, kept, slots)
+
+
+def _solved_together(
+    some: gtsam.NonlinearFactorGraph, others: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> gtsam.Values:
+    """One step of Gauss-Newton with all variables linearised where they stand; none where it gains nothing.
+
+    Raises:
+        SolverError: gtsam failed.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    graph.push_back(some)
+    graph.push_back(others)
+    mine = gtsam.Values()
+    for key in graph.keyVector():
+        put(mine, key, values)
+    try:
+        better = mine.retract(graph.linearize(mine).optimize())
+        return better if graph.error(better) < graph.error(mine) else mine
+    except FAILURES as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
 
 
 def _old_landmarks(measurement_log: MeasurementLog, first: int, most: int) -> list[int]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -26,7 +27,45 @@ from slam.geometry.se3 import Array, adjoint, hat, inverse
 
 #: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
 _JITTER = (1e-13, 1e-11, 1e-9)
+_FIRMER = 1e4  # information with which a pose is held, as a multiple of what is known of it
 _NOTHING = 1e-12  # information [1/m², 1/rad²] that is none
+
+
+@dataclass(frozen=True)
+class Held:
+    """A pose that is held much firmer than it is known, so that the others do not move through the world with it.
+
+    What is measured says next to nothing of where all variables stand together in the world. What it seems to say,
+    where not all of them were linearised at the same values, would move them about. So the reference pose is held, and
+    let go for a moment when poses leave: then all are linearised together.
+
+    Attributes:
+        key: its variable.
+        T: where it is held (4, 4).
+        information: what is known of it in truth (6, 6).
+    """
+
+    key: int
+    T: Array
+    information: Array
+
+    def factor(self) -> gtsam.NonlinearFactor:
+        """What holds it."""
+        noise = gtsam.noiseModel.Gaussian.Information(_FIRMER * self.information)
+        return gtsam.PriorFactorPose3(self.key, gtsam.Pose3(self.T), noise)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """What is known of it in truth (6, 6)."""
+        return np.asarray(np.linalg.inv(self.information))
+
+    def let_go(self, P: Array, by_held: Array, held: Array) -> Array:
+        """A covariance P (..., n, n) as it is while the pose is not held.
+
+        `by_held` (..., n, 6) is the covariance with the held pose, `held` (6, 6) the held pose's own in the solver.
+        """
+        K = by_held @ np.linalg.inv(held)
+        return np.asarray(P + K @ (self.covariance - held) @ np.swapaxes(K, -1, -2))
 
 
 @dataclass(frozen=True)
@@ -93,6 +132,11 @@ class MarginalPrior:
             return self.R @ delta - self.d
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(self.R)), list(self.keys), error)
+
+    def held(self, T_reference: Array) -> Held:
+        """The reference pose held where it stands, `T_reference` (4, 4)."""
+        known = self.of_reference()
+        return Held(self.poses[0], T_reference, known.R.T @ known.R)
 
     def of_reference(self) -> MarginalPrior:
         """What is known of the reference pose alone."""

@@ -15,7 +15,7 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
 if TYPE_CHECKING:
-    from backends.smoother.marginal import MarginalPrior
+    from backends.smoother.marginal import Held, MarginalPrior
 
 IndexArray = NDArray[np.intp]
 
@@ -199,6 +199,7 @@ class History:
         owner: serial number of the landmark of each variable.
         first: frame of the oldest pose that is a variable.
         prior: what those before it have left behind; None while there are none.
+        held: the oldest pose, where there is a prior.
         places: where each of those was believed to be at first.
         variables: number of landmark variables that were ever made, for their names.
         known: what was known of landmarks beforehand, by serial number.
@@ -212,6 +213,7 @@ class History:
         self.owner: dict[int, int] = {}
         self.first = 0
         self.prior: MarginalPrior | None = None
+        self.held: Held | None = None
         self.places: dict[int, Array] = {}
         self.known: dict[int, Known] = {}
         self.impulses: list[float] = []
@@ -371,13 +373,13 @@ class MeasurementLog:
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
-    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior) -> None:
+    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held) -> None:
         """Let go of the poses before frame `first` and of the landmark variables `gone`: `prior` holds what they said.
 
         Measurements that no factor and no landmark refers to any more are forgotten.
         """
         history, frame = self.history, self.measurements.frame
-        history.first, history.prior = first, prior
+        history.first, history.prior, history.held = first, prior, held
         history.finished = [rows for rows in history.finished if frame[rows].min() >= first]
         for key in gone:
             del history.explicit[key], history.places[key], history.owner[key]

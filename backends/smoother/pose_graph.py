@@ -12,6 +12,7 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
 from backends.smoother.lag import overdue, without_old
+from backends.smoother.marginal import Held
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -64,7 +65,7 @@ class PoseGraph:
         self._often, self._seldom, self._last = (
             thresholds(make.stereo, config.relinearise, share) for share in (_OFF, 1.0, _LAST / config.relinearise)
         )
-        self._solver = Solver(self._seldom)
+        self._solver = self._new_solver()
         self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
         self.rebuilds = 0
         self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
@@ -203,13 +204,23 @@ class PoseGraph:
         """Joint covariance of poses; where the solver cannot give it, the last one carried on by the motion model."""
         keys = [pose_key(i) for i in frames.tolist()]
         try:
-            return self._solver.joint_covariance(keys)
+            return self._covariance_of(keys)
         except SolverError:
             self._recover()
         try:
-            return self._solver.joint_covariance(keys)
+            return self._covariance_of(keys)
         except SolverError:
             return carried_covariance(self._make.models, self.measurement_log.path, self._last_window, frames)
+
+    def _covariance_of(self, keys: list[int]) -> Array:
+        """Joint covariance of poses as it is while none is held."""
+        held = self.measurement_log.history.held
+        if held is None:
+            return self._solver.joint_covariance(keys)
+        others = [key for key in keys if key != held.key]
+        P = self._solver.joint_covariance([held.key, *others])
+        P = held.let_go(P, P[:, :6], P[:6, :6])
+        return P if len(others) < len(keys) else P[6:, 6:]
 
     def landmarks_by_window(self, slots: IndexArray) -> Array:
         """Jacobians (M, 3, 6 W) of landmark positions by the poses of the window."""
@@ -225,10 +236,14 @@ class PoseGraph:
         older than the window to move with its oldest pose, which makes them a little too large.
         """
         marks = self.measurement_log.landmarks
+        if not self.measurement_log.path.count:  # a map that is known, and no pose in it yet
+            return marks.covariance[slots]
         P = uncertainty.quadratic(self.landmarks_by_window(slots), self.window().covariance) + marks.covariance[slots]
         variables = marks.variable[slots].tolist()
         try:
-            exact = self._solver.point_covariances(variables, pose_key(self.measurement_log.path.count - 1))
+            exact = self._solver.point_covariances(
+                variables, pose_key(self.measurement_log.path.count - 1), self.measurement_log.history.held
+            )
         except SolverError:
             self._recover()
             return P
@@ -269,6 +284,11 @@ class PoseGraph:
             poses[first:] = [values.atPose3(pose_key(i)).matrix() for i in range(first, len(poses))]
         return poses
 
+    def _new_solver(self) -> Solver:
+        """An empty solver for as many variables as there will be."""
+        c = self._config
+        return Solver(self._seldom, None if c.lag is None else 2 * (c.lag + c.explicit))
+
     # --- factors ---
 
     def _enter_pose(self, change: Change, impulse: float) -> list[int]:
@@ -293,7 +313,7 @@ class PoseGraph:
         try:
             rest = without_old(self.measurement_log, self._solver, first, self._config.explicit)
             self._factor_builder.eliminate_late(rest.change, first, rest.gone)
-            solver = Solver(self._seldom)
+            solver = self._new_solver()
             new = solver.update(rest.change)
             left = self._solver.poses(pose_key(i) for i in range(self.measurement_log.history.first, first))
         except SolverError:
@@ -305,7 +325,7 @@ class PoseGraph:
             track.restart()
         for track in marks.tracks.values():
             track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
-        self.measurement_log.advance(first, rest.gone, rest.prior)
+        self.measurement_log.advance(first, rest.gone, rest.prior, rest.held)
         self._seconds += self._solver.seconds
         self._solver, self._window, self._carried = solver, None, None
 
@@ -408,10 +428,14 @@ class PoseGraph:
         try:
             if solved:
                 change.values = optimise(change)
+            held = self._held(change)
         finally:
             self._seconds += time.process_time() - start
-        solver = Solver(self._seldom)
+        if held is not None:
+            change.factors.add(held.factor())
+        solver = self._new_solver()
         new = solver.update(change)
+        self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():
             track.factor = -1
         for track, place in places:
@@ -419,3 +443,8 @@ class PoseGraph:
         self._seconds += self._solver.seconds
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
         self._read_all()
+
+    def _held(self, change: Change) -> Held | None:
+        """The oldest pose of a bounded problem, held where it stands now."""
+        prior = self.measurement_log.history.prior
+        return None if prior is None else prior.held(change.values.atPose3(prior.poses[0]).matrix())

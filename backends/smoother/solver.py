@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -15,6 +15,9 @@ from scipy.linalg import solve_triangular
 from backends.smoother.variables import ballast_key, size_of
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
+
+if TYPE_CHECKING:
+    from backends.smoother.marginal import Held
 
 _T = TypeVar("_T")
 
@@ -58,12 +61,13 @@ class Solver:
 
     Args:
         thresholds: how far each kind of variable may move before it is linearised anew.
+        variables: about so many there will be at most; None for no end of them.
 
     Attributes:
         seconds: CPU time spent in gtsam so far.
     """
 
-    def __init__(self, thresholds: gtsam.ISAM2ThresholdMap) -> None:
+    def __init__(self, thresholds: gtsam.ISAM2ThresholdMap, variables: int | None = None) -> None:
         self.seconds = 0.0
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(thresholds)
@@ -71,7 +75,8 @@ class Solver:
         parameters.findUnusedFactorSlots = True
         parameters.cacheLinearizedFactors = True
         self._isam = gtsam.ISAM2(parameters)
-        self._guarded(lambda: self._isam.update(*_ballast()))
+        self._ballast = _BALLAST if variables is None else min(variables, _BALLAST)
+        self._guarded(lambda: self._isam.update(*_ballast(self._ballast)))
 
     def update(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap | None = None) -> list[int]:
         """One step; returns the slots of the new factors, in their order.
@@ -128,23 +133,29 @@ class Solver:
             raise SolverError("gtsam: a covariance is not finite and positive")
         return P
 
-    def point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+    def point_covariances(self, keys: list[int], newest: int, held: Held | None = None) -> dict[int, Array]:
         """Covariances (3, 3) of those point variables that were eliminated together with the newest pose, or after it.
+
+        As they are while the pose `held` is not.
 
         Raises:
             SolverError: gtsam failed.
         """
-        return self._guarded(lambda: self._point_covariances(keys, newest))
+        return self._guarded(lambda: self._point_covariances(keys, newest, held))
 
-    def _point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+    def _point_covariances(self, keys: list[int], newest: int, held: Held | None) -> dict[int, Array]:
         root = _root_of(self._isam, newest)
-        if root is None:
+        if root is None or (held is not None and held.key not in root[0]):
             return {}
         variables, R = root
         starts = dict(zip(variables, np.cumsum([0, *map(size_of, variables)]).tolist()))
         half = np.asarray(solve_triangular(R, np.eye(len(R))))
         rows = {key: half[starts[key] : starts[key] + 3] for key in keys if key in starts}
-        return {key: part @ part.T for key, part in rows.items()}
+        if held is None:
+            return {key: part @ part.T for key, part in rows.items()}
+        own = half[starts[held.key] : starts[held.key] + 6]
+        P = own @ own.T
+        return {key: held.let_go(part @ part.T, part @ own.T, P) for key, part in rows.items()}
 
     def _joint_covariance(self, keys: list[int]) -> Array:
         root = _root_of(self._isam, keys[-1])
@@ -161,7 +172,7 @@ class Solver:
     def factors(self) -> Iterator[tuple[int, gtsam.NonlinearFactor]]:
         """All factors but those of the ballast, with their slots."""
         graph = self._isam.getFactorsUnsafe()
-        for slot in range(_BALLAST, graph.size()):
+        for slot in range(self._ballast, graph.size()):
             if graph.exists(slot):
                 yield slot, graph.at(slot)
 
@@ -217,11 +228,11 @@ def _covariance_in(variables: list[int], R: Array, keys: list[int]) -> Array:
     return half.T @ half
 
 
-def _ballast() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _ballast(count: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Variables that nothing depends on, with their factors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
-    for i in range(_BALLAST):
+    for i in range(count):
         key = ballast_key(i)
         values.insert(key, np.zeros(1))
         graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
