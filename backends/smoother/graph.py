@@ -46,7 +46,7 @@ class FactorMaker:
         self._parameters = gtsam.SmartProjectionParams()
         # The other mode gives the same information, but throws where a landmark lies behind a camera.
         self._parameters.setLinearizationMode(gtsam.LinearizationMode.JACOBIAN_SVD)
-        # Without refinement the linear triangulation of a far point can be so far off that a step goes astray by metres.
+        # A far point's linear triangulation alone can be so far off that a step goes astray by metres.
         self._parameters.setEnableEPI(True)
         rectified = stereo.rectified_rig.original.is_rectified
         self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)

@@ -71,7 +71,9 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
         else:
             touched.add(factor)
             staying.update(keys)
-    values = _solved_together(kept.factors, touched, solver.values())
+    values = solver.values()
+    if history.held is not None and history.held.pulled(values.atPose3(history.held.key).matrix()):
+        values = _solved_together(kept.factors, touched, values)
     ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
     prior = marginal_prior(touched, values, sorted(leaving), ordered)
     held = prior.held(values.atPose3(pose_key(first)).matrix())

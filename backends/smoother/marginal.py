@@ -28,6 +28,7 @@ from slam.geometry.se3 import Array, adjoint, hat, inverse
 #: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
 _JITTER = (1e-13, 1e-11, 1e-9)
 _FIRMER = 1e4  # information with which a pose is held, as a multiple of what is known of it
+_PULLED = 0.25  # squared standard deviations
 _NOTHING = 1e-12  # information [1/m², 1/rad²] that is none
 
 
@@ -53,6 +54,11 @@ class Held:
         """What holds it."""
         noise = gtsam.noiseModel.Gaussian.Information(_FIRMER * self.information)
         return gtsam.PriorFactorPose3(self.key, gtsam.Pose3(self.T), noise)
+
+    def pulled(self, T: Array) -> bool:
+        """Whether it would move by a good part of its standard deviation if let go, when it stands at T (4, 4) now."""
+        x = gtsam.Pose3.Logmap(gtsam.Pose3(self.T).between(gtsam.Pose3(T)))
+        return bool(_FIRMER**2 * x @ self.information @ x > _PULLED)
 
     @cached_property
     def covariance(self) -> Array:
