@@ -117,12 +117,15 @@ class Measurements:
         self._z[rows], self._frame[rows], self._landmark[rows] = z, frame, landmarks
         return rows
 
+    def shift_right(self, shift: float) -> None:
+        """Move all right pixels by `shift`."""
+        self._z = self._z + np.array([0.0, 0.0, shift])
+
     def keep(self, rows: NDArray[np.bool_]) -> None:
         """Forget all but some of the rows (n,); the others move up."""
         count = int(rows.sum())
         for name in ("_z", "_frame", "_landmark"):
-            array = getattr(self, name)
-            array[:count] = array[: self.count][rows]
+            setattr(self, name, grown(getattr(self, name)[: self.count][rows], max(1024, count)))
         self.count = count
 
 
@@ -367,7 +370,7 @@ class MeasurementLog:
 
     def shift_right(self, shift: float, point: Callable[[list[float]], Any]) -> None:
         """Move all right pixels by `shift`; `point` makes the solver's measurements of rows (uL, vL, uR)."""
-        self.measurements.z[:, 2] += shift
+        self.measurements.shift_right(shift)
         for track in self.landmarks.tracks.values():
             track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
@@ -381,10 +384,10 @@ class MeasurementLog:
         history, frame = self.history, self.measurements.frame
         history.first, history.prior, history.held = first, prior, held
         history.finished = [rows for rows in history.finished if frame[rows].min() >= first]
-        for key in gone:
-            del history.explicit[key], history.places[key], history.owner[key]
-        for rows in history.explicit.values():
-            rows[:] = [row for row in rows if frame[row] >= first]
+        for name in ("explicit", "places", "owner"):
+            kept = {key: value for key, value in getattr(history, name).items() if key not in gone}
+            setattr(history, name, kept)
+        history.explicit = {key: [row for row in rows if frame[row] >= first] for key, rows in history.explicit.items()}
         self._forget_unused_known()
         self._forget_unused_measurements()
 
@@ -407,8 +410,9 @@ class MeasurementLog:
         number = np.where(used, np.cumsum(used) - 1, -1)  # −1 stays −1
         marks.recent[:] = number[np.where(marks.ids[:, None] >= 0, marks.recent, -1)]
         history.finished = [number[rows] for rows in history.finished]
-        for rows in lists:
-            rows[:] = number[rows].tolist()
+        history.explicit = {key: number[rows].tolist() if rows else [] for key, rows in history.explicit.items()}
+        for track in marks.tracks.values():
+            track.rows = number[track.rows].tolist() if track.rows else []
         self.measurements.keep(used[:-1])
 
     def forget_measurements(self) -> None:

@@ -69,6 +69,7 @@ class PoseGraph:
         self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
         self.rebuilds = 0
         self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
+        self._broken = False  # whether a call was interrupted since
         self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
         self._converged = 0  # number of frames then
@@ -80,6 +81,16 @@ class PoseGraph:
     def solver_seconds(self) -> float:
         """CPU time spent in gtsam's solvers [s]."""
         return self._seconds + self._solver.seconds
+
+    def interrupted(self) -> None:
+        """Note that the solver may hold what is not on record: it is made anew before anything else is done."""
+        self._broken, self._window, self._carried = True, None, None
+
+    def mend(self) -> None:
+        """Make the solver anew after an interruption."""
+        if self._broken:
+            self._recover()
+            self._broken = False
 
     def append_pose(self, stamp: float, T_world_left: Array) -> None:
         """Add a frame without measurements."""
@@ -435,6 +446,7 @@ class PoseGraph:
             change.factors.add(held.factor())
         solver = self._new_solver()
         new = solver.update(change)
+        self._broken = True  # until all of the following has been done
         self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():
             track.factor = -1
@@ -443,6 +455,7 @@ class PoseGraph:
         self._seconds += self._solver.seconds
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
         self._read_all()
+        self._broken = False
 
     def _held(self, change: Change) -> Held | None:
         """The oldest pose of a bounded problem, held where it stands now."""
