@@ -28,7 +28,7 @@ class Rest:
         gone: landmark variables that have left.
         finished: tracks whose factor has become part of the prior.
         prior: what has left, on what stays.
-        held: the oldest pose.
+        held: the oldest pose, where it is held.
         change: all factors and values for a new solver.
         slots: places of the old solver's factors in the change.
     """
@@ -37,7 +37,7 @@ class Rest:
     gone: list[int]
     finished: list[Track]
     prior: MarginalPrior
-    held: Held
+    held: Held | None
     change: Change
     slots: dict[int, int]
 
@@ -76,15 +76,23 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
         values = _solved_together(kept.factors, touched, values)
     ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
     prior = marginal_prior(touched, values, sorted(leaving), ordered)
-    held = prior.held(values.atPose3(pose_key(first)).matrix())
+    held = held_pose(measurement_log, prior, values)
     kept.factors.add(prior.factor())
-    kept.factors.add(held.factor())
+    if held is not None:
+        kept.factors.add(held.factor())
     for key in [*map(pose_key, range(first, measurement_log.path.count)), *history.explicit]:
         if key not in leaving:
             put(kept.values, key, values)
     oldest = pose_key(first)
     finished = [track for track in measurement_log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
     return Rest(first, gone, finished, prior, held, kept, slots)
+
+
+def held_pose(measurement_log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
+    """The oldest pose, held where it stands; None where landmarks that are known in the world tell where that is."""
+    if any(known.frame is None for known in measurement_log.history.known.values()):
+        return None
+    return prior.held(values.atPose3(prior.poses[0]).matrix())
 
 
 def _solved_together(

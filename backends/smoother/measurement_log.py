@@ -376,7 +376,7 @@ class MeasurementLog:
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
-    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held) -> None:
+    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held | None) -> None:
         """Let go of the poses before frame `first` and of the landmark variables `gone`: `prior` holds what they said.
 
         Measurements that no factor and no landmark refers to any more are forgotten.

@@ -11,8 +11,7 @@ from backends.smoother import uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
-from backends.smoother.lag import overdue, without_old
-from backends.smoother.marginal import Held
+from backends.smoother.lag import held_pose, overdue, without_old
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -439,7 +438,8 @@ class PoseGraph:
         try:
             if solved:
                 change.values = optimise(change)
-            held = self._held(change)
+            prior = self.measurement_log.history.prior
+            held = None if prior is None else held_pose(self.measurement_log, prior, change.values)
         finally:
             self._seconds += time.process_time() - start
         if held is not None:
@@ -456,8 +456,3 @@ class PoseGraph:
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
         self._read_all()
         self._broken = False
-
-    def _held(self, change: Change) -> Held | None:
-        """The oldest pose of a bounded problem, held where it stands now."""
-        prior = self.measurement_log.history.prior
-        return None if prior is None else prior.held(change.values.atPose3(prior.poses[0]).matrix())

@@ -174,7 +174,7 @@ def test_landmarks_seen_again_tie_the_trajectory_together():
 
 def test_a_fixed_lag_keeps_the_path_and_bounds_the_problem():
     data = drive(80, points=400)
-    full, lagged = SmootherBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, lag=15, window=10, explicit=30)
+    full, lagged = SmootherBackend(RIG, MODELS, lag=None), SmootherBackend(RIG, MODELS, lag=15, window=10, explicit=30)
     run(full, data)
     known: set[int] = set()
     sizes = []
