@@ -13,8 +13,7 @@ landmark at p in the reference camera ``δ_l = R_rᵀ ξ_l + [p]× ω_r − v_r`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -43,12 +42,20 @@ class Held:
     Attributes:
         key: its variable.
         T: where it is held (4, 4).
-        information: what is known of it in truth (6, 6).
+        information: what is known of it by all that left (6, 6).
+        covariance: what is known of it in truth, by what is measured from the others as well (6, 6).
     """
 
     key: int
     T: Array
     information: Array
+    covariance: Array
+
+    def informed(self, P: Array) -> Held:
+        """With the truth from its covariance P (6, 6) in a solver that holds it, all linearised at the same values."""
+        Q = np.linalg.inv(P) - _FIRMER * self.information
+        Q = 0.5 * (Q + Q.T)
+        return replace(self, covariance=np.linalg.inv(Q)) if np.linalg.eigvalsh(Q).min() > 0 else self
 
     def factor(self) -> gtsam.NonlinearFactor:
         """What holds it."""
@@ -59,11 +66,6 @@ class Held:
         """Whether it would move by a good part of its standard deviation if let go, when it stands at T (4, 4) now."""
         x = gtsam.Pose3.Logmap(gtsam.Pose3(self.T).between(gtsam.Pose3(T)))
         return bool(_FIRMER**2 * x @ self.information @ x > _PULLED)
-
-    @cached_property
-    def covariance(self) -> Array:
-        """What is known of it in truth (6, 6)."""
-        return np.asarray(np.linalg.inv(self.information))
 
     def let_go(self, P: Array, by_held: Array, held: Array) -> Array:
         """A covariance P (..., n, n) as it is while the pose is not held.
@@ -142,7 +144,8 @@ class MarginalPrior:
     def held(self, T_reference: Array) -> Held:
         """The reference pose held where it stands, `T_reference` (4, 4)."""
         known = self.of_reference()
-        return Held(self.poses[0], T_reference, known.R.T @ known.R)
+        information = known.R.T @ known.R
+        return Held(self.poses[0], T_reference, information, np.linalg.inv(information))
 
     def of_reference(self) -> MarginalPrior:
         """What is known of the reference pose alone."""

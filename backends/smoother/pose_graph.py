@@ -12,6 +12,7 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
 from backends.smoother.lag import held_pose, overdue, without_old
+from backends.smoother.marginal import Held
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -325,6 +326,7 @@ class PoseGraph:
             self._factor_builder.eliminate_late(rest.change, first, rest.gone)
             solver = self._new_solver()
             new = solver.update(rest.change)
+            held = _informed(rest.held, solver)
             left = self._solver.poses(pose_key(i) for i in range(self.measurement_log.history.first, first))
         except SolverError:
             return
@@ -335,7 +337,7 @@ class PoseGraph:
             track.restart()
         for track in marks.tracks.values():
             track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
-        self.measurement_log.advance(first, rest.gone, rest.prior, rest.held)
+        self.measurement_log.advance(first, rest.gone, rest.prior, held)
         self._seconds += self._solver.seconds
         self._solver, self._window, self._carried = solver, None, None
 
@@ -446,6 +448,7 @@ class PoseGraph:
             change.factors.add(held.factor())
         solver = self._new_solver()
         new = solver.update(change)
+        held = _informed(held, solver)
         self._broken = True  # until all of the following has been done
         self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():
@@ -456,3 +459,8 @@ class PoseGraph:
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
         self._read_all()
         self._broken = False
+
+
+def _informed(held: Held | None, solver: Solver) -> Held | None:
+    """What is known of the pose that is held, by a solver that is new."""
+    return None if held is None else held.informed(solver.joint_covariance([held.key]))
