@@ -98,7 +98,7 @@ class Observations:
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, or a left pixel is not finite.
+        MeasurementError: shapes differ, an id stands twice, a left pixel is not finite, or a right one is infinite.
     """
 
     ids: IdArray
@@ -115,6 +115,8 @@ class Observations:
             raise MeasurementError("observations: a landmark id stands twice")
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError("observations: a left pixel is not finite")
+        if np.isinf(self.uv_right).any():
+            raise MeasurementError("observations: a right pixel is infinite; NaN says that there is none")
 
     def __len__(self) -> int:
         return len(self.ids)
