@@ -235,7 +235,7 @@ class SmootherBackend:
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
-        """What is done within either happens or, where it is interrupted, does not: then the measurement_log go back."""
+        """What is done within either happens or, where it is interrupted, does not: the measurement log is restored."""
         self._graph.mend()
         restore, predicted = snapshot(self.measurement_log), self._predicted
         try:
