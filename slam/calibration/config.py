@@ -16,10 +16,9 @@ class SelfCalibrationConfig:
 
     Attributes:
         enabled: False leaves all measurements as they are.
-        prior_scale: factor on all standard deviations of the prior; small for a rig that was calibrated with care.
         pixel_sigma: noise of a left pixel [px]; only its ratio to `disparity_sigma` matters, the scale is estimated.
         disparity_sigma: noise of a disparity [px].
-        systematic: error of the matching in row and disparity that all frames of a recording share [px].
+        systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
         kept_share: two views are compared once less than this share of the first view's features is matched.
         minimum_common: least number of features matched in both views.
         minimum_parallax: least median of what translation moves the features by between two views [px].
@@ -27,11 +26,10 @@ class SelfCalibrationConfig:
     """
 
     enabled: bool = True
-    prior_scale: float = 1.0
     pixel_sigma: float = 0.4
     disparity_sigma: float = 0.2
     systematic: float = 0.05
-    kept_share: float = 0.5
+    kept_share: float = 0.3
     minimum_common: int = 30
     minimum_parallax: float = 4.0
     inflation: float = 4.0

@@ -8,11 +8,11 @@ import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
-from slam.calibration.evidence import Accumulator
+from slam.calibration.evidence import Accumulator, Evidence
 from slam.calibration.model import RigModel
 from slam.calibration.motion import pair_evidence, parallax
-from slam.calibration.posterior import RigPosterior, solve
-from slam.calibration.prior import prior_information
+from slam.calibration.posterior import RigPosterior, Solution, solve
+from slam.calibration.prior import prior_information, residual_variance, systematic_variance
 from slam.calibration.rows import row_evidence
 from slam.calibration.views import View, match, pair_of
 from slam.data import StereoFeatures
@@ -20,6 +20,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: times over which errors are surely correlated
+_SPACING = 0.5  # a view waits from when the last one has lost this part of what it loses until it is compared
+_FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
 _MOST_ROWS = 250  # of a frame: more say little more
 
 
@@ -40,11 +42,14 @@ class SelfCalibration:
         self.config = config
         self.model = RigModel(rig)
         n = len(self.model.names)
-        self._prior = prior_information(self.model, config.prior_scale)
-        self._rows = Accumulator(n, config.inflation, _BLOCK_OF_ROWS)
-        self._motion = Accumulator(n, config.inflation, _BLOCK_OF_PAIRS)
-        self._mean, self._covariance = np.zeros(n), np.linalg.inv(self._prior)
-        self._first: View | None = None
+        self._prior = prior_information(self.model)
+        self._systematic = systematic_variance(self.model, config.systematic)
+        self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
+        self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
+        start = np.linalg.inv(self._prior)
+        self._solution = Solution(np.zeros(n), start, start)
+        self._waiting: list[View] = []
+        self._open: Evidence | None = None  # of a pair that is not complete
         self._seen = 0
         self.unsolved = 0
         self.applied = RigCorrection(self.model, np.zeros(n))
@@ -57,12 +62,8 @@ class SelfCalibration:
     @property
     def posterior(self) -> RigPosterior:
         """What is believed of the rig's error now."""
-        model = self.model
-        covariance = self._covariance.copy()
-        for name in ("right_cx", "right_cy"):
-            i = model.names.index(name)
-            covariance[i, i] += (self.config.systematic / model.focal) ** 2
-        return RigPosterior(model.names, model.units, self._mean.copy(), covariance)
+        covariance = self._solution.covariance + np.diag(self._systematic)
+        return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
@@ -71,15 +72,16 @@ class SelfCalibration:
         would change by less than `least` standard deviations (root mean square over the image), features are corrected
         as before.
         """
-        step = self._mean - self.applied.parameters
-        if not self.config.enabled or not self.pairs or not step.any():
+        mean = self._solution.mean
+        step = mean - self.applied.parameters
+        if not self.config.enabled or not step.any():
             return None
         if least:
-            far = self.model.field(self._far())[:, 2]
-            variance = np.einsum("ni,ij,nj->n", far, self.posterior.covariance, far).mean()
+            far = self.model.field(self.model.far())[:, 2]
+            variance = np.einsum("ni,ij,nj->n", far, self._solution.covariance, far).mean()
             if np.square(far @ step).mean() <= least**2 * variance:
                 return None
-        before, self.applied = self.applied, RigCorrection(self.model, self._mean.copy())
+        before, self.applied = self.applied, RigCorrection(self.model, mean.copy())
         return Revision(before, self.applied)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
@@ -102,41 +104,51 @@ class SelfCalibration:
         if len(view) < self.config.minimum_common:
             return
         some = np.linspace(0, len(view) - 1, min(len(view), _MOST_ROWS)).astype(int)
-        self._rows.add(row_evidence(self.model, view.points[some], view.vertical[some], self._mean))
-        if self._first is None:
-            self._first = view
-            return
-        common = len(match(self._first, view)[0])
-        if common > max(self.config.kept_share * len(self._first), self.config.minimum_common):
-            return
-        if common >= self.config.minimum_common:
-            self._learn(self._first, view)
-        self._first = view
+        self._rows.add(row_evidence(self.model, view.points[some], view.vertical[some], self._solution.mean))
+        self._compare(view)
+        if self.pairs or self._open is not None:
+            self._update()
+
+    def _compare(self, view: View) -> None:
+        """Compare a view with the earlier ones that wait for a partner."""
+        c, self._open = self.config, None
+        common = [len(match(first, view)[0]) for first in self._waiting]
+        shares = [n / len(first) for n, first in zip(common, self._waiting)]
+        done = [n <= max(c.kept_share * len(first), c.minimum_common) for n, first in zip(common, self._waiting)]
+        apart = not self._waiting or shares[-1] < 1 - _SPACING * (1 - c.kept_share)
+        for first, n, ends in zip(self._waiting, common, done):
+            if ends and n >= c.minimum_common:
+                evidence = self._evidence(first, view)
+                if evidence is not None:
+                    self._motion.add(evidence)
+        if self._waiting and not done[0] and self.pairs < _FEW:
+            self._open = self._evidence(self._waiting[0], view)
+        self._waiting = [first for first, ends in zip(self._waiting, done) if not ends]
+        if apart:
+            self._waiting.append(view)
 
     def summary(self) -> dict[str, Any]:
-        """What has been found, as plain types: the posterior without the residual fields, and what it rests on."""
-        posterior = self.posterior.marginal(self.model.physical)
-        return {"pairs": self.pairs, "unsolved_pairs": self.unsolved, **posterior.to_json()}
+        """What has been found, as plain types."""
+        return {"pairs": self.pairs, "unsolved_pairs": self.unsolved, **self.posterior.to_json()}
 
-    def _learn(self, first: View, second: View) -> None:
-        """Bayes' rule with what a pair of views and all rows so far say."""
+    def _evidence(self, first: View, second: View) -> Evidence | None:
+        """What a pair of views says; None where it is nothing."""
         c = self.config
-        pair = pair_of(self.model, first, second, self._mean, self._seen)
+        pair = pair_of(self.model, first, second, self._solution.mean, self._seen)
         if len(pair.first) < c.minimum_common:
             self.unsolved += 1
-            return
+            return None
         if parallax(self.model, pair) < c.minimum_parallax:
-            return
-        evidence = pair_evidence(self.model, pair, self._mean, c.pixel_sigma, c.disparity_sigma)
-        if evidence is None:
-            self.unsolved += 1
-            return
-        self._motion.add(evidence)
-        for part in (self._rows, self._motion):
-            part.judge(self._mean, self._covariance)
-        self._mean, self._covariance = solve(self._prior, [self._rows.total(), self._motion.total()])
+            return None
+        evidence = pair_evidence(self.model, pair, self._solution.mean, c.pixel_sigma, c.disparity_sigma)
+        self.unsolved += evidence is None
+        return evidence
 
-    def _far(self) -> Array:
-        """Far points (N, 3) [px] spread over the image."""
-        grid = self.model.grid()
-        return np.column_stack([self.model.focal * grid, np.zeros(len(grid))])
+    def _update(self) -> None:
+        """Bayes' rule with what all pairs of views and all rows so far say."""
+        for part in (self._rows, self._motion):
+            part.judge(self._solution.mean, self._solution.inner)
+        evidence = self._rows.total() + self._motion.total()
+        if self._open is not None:
+            evidence.append(self._open.scaled(1 / self._motion.inflation))
+        self._solution = solve(self._prior, residual_variance(), evidence)

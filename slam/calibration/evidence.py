@@ -18,10 +18,20 @@ class Evidence(NamedTuple):
     Attributes:
         S: information (n, n).
         e: information times mean (n,).
+        cross: information that the parameters share with the residual fields (n, m).
     """
 
     S: Array
     e: Array
+    cross: Array
+
+    def scaled(self, factor: float) -> Evidence:
+        """The same with `factor` times the information."""
+        return Evidence(*(factor * x for x in self))
+
+    def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
+        """What both say together."""
+        return Evidence(*(a + b for a, b in zip(self, other)))
 
 
 class Accumulator:
@@ -33,13 +43,11 @@ class Accumulator:
     are joined: so the blocks grow with the run, and with them the time over which correlations are counted.
 
     Args:
-        n: number of parameters.
         inflation: factor on variances before anything is known of the scatter.
         length: likelihoods in a block at first.
     """
 
-    def __init__(self, n: int, inflation: float, length: int) -> None:
-        self._n = n
+    def __init__(self, inflation: float, length: int) -> None:
         self._prior = inflation
         self._blocks: list[Evidence] = []
         self._length = length
@@ -50,11 +58,10 @@ class Accumulator:
     def add(self, evidence: Evidence) -> None:
         """Take in a likelihood."""
         if not self._blocks or self._in_last == self._length:
-            self._blocks.append(Evidence(np.zeros((self._n, self._n)), np.zeros(self._n)))
+            self._blocks.append(evidence)
             self._in_last = 0
-        S, e = self._blocks[-1]
-        S += evidence.S
-        e += evidence.e
+        else:
+            self._blocks[-1] += evidence
         self._in_last += 1
         self.count += 1
         if len(self._blocks) > _MOST_BLOCKS:
@@ -62,25 +69,31 @@ class Accumulator:
 
     def _join(self) -> None:
         """Blocks of twice the length."""
-        pairs = zip(self._blocks[::2], [*self._blocks[1::2], None])
-        odd = len(self._blocks) % 2
-        self._blocks = [Evidence(a.S + b.S, a.e + b.e) if b is not None else a for a, b in pairs]
-        self._in_last += 0 if odd else self._length
+        even, odd = self._blocks[::2], self._blocks[1::2]
+        if len(even) == len(odd):
+            self._in_last += self._length
+        self._blocks = [a + b for a, b in zip(even, odd)] + even[len(odd) :]
         self._length *= 2
 
-    def total(self) -> Evidence:
-        """The sum, with its information reduced by the inflation."""
-        S, e = np.zeros((self._n, self._n)), np.zeros(self._n)
-        for block in self._blocks:
-            S += block.S
-            e += block.e
-        return Evidence(S / self.inflation, e / self.inflation)
+    def total(self) -> list[Evidence]:
+        """The sum, with its information reduced by the inflation; none where nothing was taken in."""
+        if not self._blocks:
+            return []
+        whole = self._blocks[0]
+        for block in self._blocks[1:]:
+            whole += block
+        return [whole.scaled(1 / self.inflation)]
 
     def judge(self, mean: Array, covariance: Array) -> None:
-        """Estimate the inflation anew from the scatter about the posterior's `mean` (n,), in units of `covariance`."""
+        """Estimate the inflation anew from the scatter of the blocks' gradients.
+
+        Args:
+            mean: of the parameters (n,).
+            covariance: of the parameters, residual fields left out (n, n).
+        """
         count = len(self._blocks)
         scatter = terms = 0.0
-        for S, e in self._blocks:
+        for S, e, _ in self._blocks:
             gradient = e - S @ mean
             scatter += float(gradient @ covariance @ gradient)
             terms += float(np.sum(S * covariance))

@@ -28,18 +28,22 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 #: Products of Legendre polynomials in x and y, up to these degrees, for what no lens model holds. Constant and linear
 #: ones are left out: `LENS` and `POSE` have them.
 _DEGREES = 5, 3
-_RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
+RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
 _BEYOND = 1.1  # polynomials are held constant beyond the image, this many half widths from its centre
 
 
 class RigModel:
     """The parameters of a rig's error, and the fields that they make.
 
-    The order is: left camera (`LENS`, then residual fields of x and of y), right camera (the same), `POSE`.
+    The order is: left camera (`LENS`), right camera (the same), `POSE`. Besides, there are residual fields, of which
+    only the size is known: they are not corrected, but make the parameters less certain.
 
     Args:
         rig: the cameras as calibrated.
     """
+
+    names = (*(f"{side}_{name}" for side in ("left", "right") for name in LENS), *POSE)
+    units = tuple(_UNITS.get(name.removeprefix("left_").removeprefix("right_"), "1") for name in names)
 
     def __init__(self, rig: StereoRig) -> None:
         self.rig = rig
@@ -50,29 +54,11 @@ class RigModel:
         half = 0.5 * np.array([rig.width - 1, rig.height - 1])
         self._centre, self._half = (half - self.origin) / self.focal, half / self.focal
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of all parameters (n,)."""
-        residual = [f"{axis}{i}{j}" for axis in "xy" for i, j in _RESIDUAL]
-        cameras = [f"{side}_{name}" for side in ("left", "right") for name in (*LENS, *residual)]
-        return (*cameras, *POSE)
-
-    @cached_property
-    def physical(self) -> Array:
-        """Indices of the parameters that are not residual fields."""
-        known = {f"{side}_{name}" for side in ("left", "right") for name in LENS} | set(POSE)
-        return np.array([i for i, name in enumerate(self.names) if name in known])
-
-    @cached_property
-    def units(self) -> tuple[str, ...]:
-        """Units of all parameters (n,); the residual fields' are focal lengths."""
-        bare = [name.partition("_")[2] or name for name in self.names]
-        return tuple("1" if b in (*LENS, *POSE) and b not in _UNITS else _UNITS.get(b, "focal lengths") for b in bare)
-
-    def grid(self, columns: int = 15, rows: int = 7) -> Array:
-        """Points (N, 2) [focal lengths] spread evenly over the left image."""
+    def far(self, columns: int = 15, rows: int = 7) -> Array:
+        """Points at infinity ``(x, y, 0)`` (N, 3) [px] spread evenly over the left image."""
         x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
-        return np.asarray(self._centre + self._half * np.column_stack([x.ravel(), y.ravel()]))
+        xy = self._centre + self._half * np.column_stack([x.ravel(), y.ravel()])
+        return self.focal * np.column_stack([xy, np.zeros(len(xy))])
 
     def points(self, z: Array) -> Array:
         """Points ``(x, y, d)`` (N, 3) [px from the principal point] of rectified rows (uL, vL, uR) (N, 3)."""
@@ -99,21 +85,21 @@ class RigModel:
     @cached_property
     def _gauge(self) -> Array:
         """Rotation of the ideal rig (3, n) that takes back what the parameters turn the left image by."""
-        grid = np.column_stack([self.focal * self.grid(), np.zeros(len(self.grid()))])
+        far = self.far()
         turned, moved = (
-            rows[:, :2].reshape(2 * len(grid), -1) for rows in (_turn(grid, self.focal), self._unturned(grid))
+            rows[:, :2].reshape(2 * len(far), -1) for rows in (_turn(far, self.focal), self._unturned(far))
         )
-        return -np.linalg.lstsq(turned, moved, rcond=None)[0]
+        return -np.asarray(np.linalg.lstsq(turned, moved, rcond=None)[0])
 
     def _unturned(self, points: Array) -> Array:
         """`field` without the rotation."""
         x, y, d = points.T / self.focal
-        left, right = self._lens(x, y), self._lens(x - d, y)
+        left, right = _lens(x, y), _lens(x - d, y)
         turn = np.stack([(x - d) * y, 1 + (x - d) ** 2, -y], axis=1)
-        none = np.zeros((len(points), right[0].shape[1] + len(POSE)))
+        none = np.zeros((len(points), len(LENS) + len(POSE)))
         along_d = [left[0], -right[0], -turn, 0 * x[:, None], (d * (x - d))[:, None]]
         rows = [[left[0], none], [left[1], none], along_d]
-        return self.focal * np.stack([np.concatenate(row, axis=1) for row in rows], axis=1)
+        return np.asarray(self.focal * np.stack([np.concatenate(row, axis=1) for row in rows], axis=1))
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
@@ -122,27 +108,37 @@ class RigModel:
         ``d · (forward · y - down)``, which the correction takes away.
         """
         x, y, d = points.T / self.focal
-        left, right = self._lens(x, y)[1], self._lens(x - d, y)[1]
+        left, right = _lens(x, y)[1], _lens(x - d, y)[1]
         turn = np.stack([1 + y**2, (x - d) * y, x - d], axis=1)
         return np.asarray(self.focal * np.concatenate([-left, right, turn, d[:, None], (-d * y)[:, None]], axis=1))
 
-    def _lens(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Change of x and of y (N, m each) [focal lengths] by the parameters of one camera."""
-        none, r2 = 0 * x, x * x + y * y
-        along_x = [none + 1, none, x, none, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x]
-        along_y = [none, none + 1, y, y, y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y]
-        residual = self._polynomials(x, y)
-        zero = 0 * residual
-        return (
-            np.concatenate([np.stack(along_x, axis=1), residual, zero], axis=1),
-            np.concatenate([np.stack(along_y, axis=1), zero, residual], axis=1),
-        )
+    def residual_field(self, points: Array) -> Array:
+        """As `field`, by the residual fields (N, 3, m): of x and y of the left camera, then of the right one."""
+        x, y, d = points.T / self.focal
+        left, right = self._polynomials(x, y), self._polynomials(x - d, y)
+        none = 0 * left
+        rows = [[left, none, none, none], [none, left, none, none], [left, none, -right, none]]
+        return np.asarray(self.focal * np.stack([np.concatenate(row, axis=1) for row in rows], axis=1))
+
+    def residual_vertical(self, points: Array) -> Array:
+        """As `vertical`, by the residual fields (N, m)."""
+        x, y, d = points.T / self.focal
+        left, right = self._polynomials(x, y), self._polynomials(x - d, y)
+        return np.asarray(self.focal * np.concatenate([0 * left, -left, 0 * left, right], axis=1))
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
         at = [np.clip((v - c) / h, -_BEYOND, _BEYOND) for v, c, h in zip((x, y), self._centre, self._half)]
         a, b = (legvander(v, n) * np.sqrt(2 * np.arange(n + 1) + 1) for v, n in zip(at, _DEGREES))
-        return np.stack([a[:, i] * b[:, j] for i, j in _RESIDUAL], axis=1)
+        return np.stack([a[:, i] * b[:, j] for i, j in RESIDUAL], axis=1)
+
+
+def _lens(x: Array, y: Array) -> tuple[Array, Array]:
+    """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera."""
+    none, r2 = 0 * x, x * x + y * y
+    along_x = [none + 1, none, x, none, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x]
+    along_y = [none, none + 1, y, y, y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y]
+    return np.stack(along_x, axis=1), np.stack(along_y, axis=1)
 
 
 def _turn(points: Array, focal: float) -> Array:

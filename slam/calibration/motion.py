@@ -77,8 +77,8 @@ def pair_evidence(
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
         points = first + (back @ W @ (residual - change)[..., None])[..., 0]
         if np.abs(change).max() < _CONVERGED:
-            J_rig = model.field(moved) - J_point @ model.field(points)
-            return _eliminated(J_motion, J_rig, weighted, residual, parameters)
+            J_rig, J_residual = (f(moved) - J_point @ f(points) for f in (model.field, model.residual_field))
+            return _eliminated(J_motion, -J_rig, -J_residual, weighted, residual, parameters)
     return None
 
 
@@ -89,16 +89,18 @@ def parallax(model: RigModel, pair: Pair) -> float:
     return float(np.median(np.linalg.norm((there - turned)[:, :2], axis=1)))
 
 
-def _eliminated(J_motion: Array, J_rig: Array, weights: Array, residual: Array, parameters: Array) -> Evidence:
+def _eliminated(
+    J_motion: Array, J_rig: Array, J_residual: Array, weights: Array, residual: Array, parameters: Array
+) -> Evidence:
     """The likelihood of the parameters with the motion marginalised out (Schur complement)."""
     root = np.swapaxes(np.linalg.cholesky(weights), 1, 2)
-    J = (root @ np.concatenate([J_motion, -J_rig], axis=2)).reshape(-1, 6 + J_rig.shape[2])
-    r = (root @ residual[..., None]).ravel()
-    normal, gradient = J.T @ J, J.T @ r
-    motion = np.linalg.solve(normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6), normal[:6])
-    S = normal[6:, 6:] - normal[6:, :6] @ motion[:, 6:]
-    S = 0.5 * (S + S.T)
-    return Evidence(S, S @ parameters + gradient[6:] - motion[:, 6:].T @ gradient[:6])
+    n = 6 + J_rig.shape[2]
+    J = (root @ np.concatenate([J_motion, J_rig, J_residual], axis=2)).reshape(-1, n + J_residual.shape[2])
+    normal, gradient = J[:, :n].T @ J, J[:, :n].T @ (root @ residual[..., None]).ravel()
+    motion = np.linalg.solve(normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6), normal[:6, 6:n])
+    reduced = normal[6:] - motion.T @ normal[:6]
+    S = reduced[:, 6:n]
+    return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], reduced[:, n:])
 
 
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:

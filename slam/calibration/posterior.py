@@ -77,8 +77,23 @@ class RigPosterior:
         return cls(names, units, mean, covariance)
 
 
-def solve(prior: Array, evidence: Sequence[Evidence]) -> tuple[Array, Array]:
-    """Posterior mean (n,) and covariance (n, n), averaged over how large a calibration's errors are.
+@dataclass(frozen=True)
+class Solution:
+    """What evidence makes of the prior.
+
+    Attributes:
+        mean: (n,).
+        inner: covariance (n, n), were there no residual fields.
+        covariance: with what the residual fields may have moved the mean by (n, n).
+    """
+
+    mean: Array
+    inner: Array
+    covariance: Array
+
+
+def solve(prior: Array, residual: float, evidence: Sequence[Evidence]) -> Solution:
+    """Posterior, averaged over how large a calibration's errors are.
 
     The prior `N(0, s² prior⁻¹)` has a scale s that is not known. The scales' probabilities follow from the evidence
     (the marginal likelihood), so a calibration that nothing speaks against is left as it is, instead of following the
@@ -86,20 +101,24 @@ def solve(prior: Array, evidence: Sequence[Evidence]) -> tuple[Array, Array]:
 
     Args:
         prior: its information (n, n) at the scale 1.
+        residual: variance of the residual fields' coefficients.
         evidence: of the data.
     """
-    S, e = sum(x.S for x in evidence), sum(x.e for x in evidence)
+    whole = evidence[0]
+    for more in evidence[1:]:
+        whole += more
     logs, means, covariances = [], [], []
     for scale in _SCALES:
         information = prior / scale**2
-        total = information + S
+        total = information + whole.S
         covariance = np.linalg.inv(total)
-        mean = covariance @ e
-        logs.append(0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + mean @ e))
+        mean = covariance @ whole.e
+        logs.append(0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + mean @ whole.e))
         means.append(mean)
         covariances.append(covariance)
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    mean = sum(w * m for w, m in zip(weights, means))
-    spread = [C + np.outer(m - mean, m - mean) for m, C in zip(means, covariances)]
-    return np.asarray(mean), np.asarray(sum(w * C for w, C in zip(weights, spread)))
+    mean = np.asarray(sum(w * m for w, m in zip(weights, means)))
+    inner = np.asarray(sum(w * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covariances)))
+    moved = sum(w * scale * C for w, scale, C in zip(weights, _SCALES, covariances)) @ whole.cross
+    return Solution(mean, inner, inner + residual * moved @ moved.T)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.calibration.model import LENS, POSE, RigModel
+from slam.calibration.model import RESIDUAL, RigModel
 from slam.geometry.se3 import Array
 
 #: Standard deviations of the corrections, dimensionless [rad, focal lengths, 1]. A chess board fixes combinations of
@@ -19,32 +19,41 @@ SIGMAS = {
 }  # fmt: skip
 
 #: Root mean square over the image of what no lens model holds [focal lengths]: a fifth of a pixel at 1000 px.
-RESIDUAL = 2e-4
+_RESIDUAL = 2e-4
 
 #: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
 #: [focal lengths]. Cameras that are knocked or warmed up turn by less than a milliradian.
 MEAN_DISPARITY = 7e-4
 MEAN_VERTICAL = 1.4e-3
 
+_NEAR = 0.05  # disparity [focal lengths] of points that are near
 
-def prior_information(model: RigModel, scale: float = 1.0) -> Array:
-    """Information (n, n) of the prior; its mean is zero, the calibration as delivered.
 
-    Args:
-        model: the parameters.
-        scale: factor on all standard deviations.
-    """
-    residual = (len(model.names) - 2 * len(LENS) - len(POSE)) // 4
-    each = RESIDUAL / np.sqrt(residual)
-    sigmas = np.array([SIGMAS.get(_bare(name), each) for name in model.names])
+def prior_information(model: RigModel) -> Array:
+    """Information (n, n) of the prior; its mean is zero, the calibration as delivered."""
+    sigmas = np.array([SIGMAS[name.removeprefix("left_").removeprefix("right_")] for name in model.names])
     information = np.diag(sigmas**-2)
-    far = np.column_stack([model.focal * model.grid(), np.zeros(len(model.grid()))])
-    for means, sigma in ((model.field(far)[:, 2], MEAN_DISPARITY), (model.vertical(far), MEAN_VERTICAL)):
-        mean = means.mean(axis=0) / model.focal
+    far = model.far()
+    for changes, sigma in ((model.field(far)[:, 2], MEAN_DISPARITY), (model.vertical(far), MEAN_VERTICAL)):
+        mean = changes.mean(axis=0) / model.focal
         information += np.outer(mean, mean) / sigma**2
-    return np.asarray(information / scale**2)
+    return np.asarray(information)
 
 
-def _bare(name: str) -> str:
-    """A parameter's name without its camera."""
-    return name.removeprefix("left_").removeprefix("right_")
+def residual_variance() -> float:
+    """Variance of each coefficient of the residual fields [focal lengths²]."""
+    return _RESIDUAL**2 / len(RESIDUAL)
+
+
+def systematic_variance(model: RigModel, error: float) -> Array:
+    """Variances (n,) of the parameters by an error of the matching that all frames of a recording share.
+
+    Each parameter may be off by what moves rows and disparities by `error` [px] (root mean square over the image, of
+    far points and of points at a twentieth of the focal length). Pixels of repeated structure, of slanted surfaces and
+    of moving shadows are matched with such a bias; it does not average out.
+    """
+    far = model.far()
+    near = far + np.array([0.0, 0.0, _NEAR * model.focal])
+    points = np.concatenate([far, near])
+    effect = np.square(model.field(points)[:, 2]) + np.square(model.vertical(points))
+    return np.asarray(error**2 / effect.mean(axis=0))

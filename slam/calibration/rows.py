@@ -27,4 +27,4 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     noise = max(float(np.median(residual**2)) / _MEDIAN, _LEAST_NOISE**2) if len(residual) else 1.0
     weights = (_DEGREES + 1) / (_DEGREES + residual**2 / noise) / noise
     weighted = A * weights[:, None]
-    return Evidence(A.T @ weighted, -(weighted.T @ vertical))
+    return Evidence(weighted.T @ A, -(weighted.T @ vertical), weighted.T @ model.residual_vertical(points))

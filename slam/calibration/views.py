@@ -94,9 +94,9 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed:
     near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
     rig = model.rig.rectified.rig
     if near.sum() >= 3:
-        rows = [model.rows(p[near]) for p in ideal]
-        local = rig.triangulate(rows[0][:, :2], rows[0][:, [2, 1]])
-        found = find_consensus(rig, local, rows[1], inverse(T), _AGREES, _HYPOTHESES, seed)
+        before, after = (model.rows(p[near]) for p in ideal)
+        local = rig.triangulate(before[:, :2], before[:, [2, 1]])
+        found = find_consensus(rig, local, after, inverse(T), _AGREES, _HYPOTHESES, seed)
         T = inverse(found.T_world_left)
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
     with np.errstate(divide="ignore", invalid="ignore"):
