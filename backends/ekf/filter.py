@@ -194,6 +194,31 @@ class EkfBackend:
         if len(ids):
             self._place(ids, local, covariances)
 
+    # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
+
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
+
+        The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
+        were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
+        """
+        marks, rectified_rig = self._landmarks, self.rig.rectified
+        if not len(marks) or not self._poses:
+            return
+        T = self._poses[-1] @ rectified_rig.T_left_rectified
+        z, _ = rectified_rig.rig.project_stereo(se3.transform(se3.inverse(T), marks.points), jacobian=False)
+        rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
+        z = mend(z[rows])
+        if not np.isfinite(z).all():
+            raise MeasurementError("ekf: a mended measurement is not finite")
+        points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))
+        good = np.isfinite(points).all(axis=1)
+        change = np.zeros_like(marks.state)
+        rows, points = rows[good], points[good]
+        change[rows] = marks.coordinates.of(marks.anchors[rows], points) - marks.state[rows]
+        if np.isfinite(change).all():
+            marks.move(change)
+
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
     @one_blas_thread

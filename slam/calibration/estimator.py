@@ -78,7 +78,7 @@ class SelfCalibration:
             return None
         if least:
             far = self.model.field(self.model.far())[:, 2]
-            variance = np.einsum("ni,ij,nj->n", far, self._solution.covariance, far).mean()
+            variance = np.einsum("ni,ij,nj->n", far, self._solution.inner, far).mean()
             if np.square(far @ step).mean() <= least**2 * variance:
                 return None
         before, self.applied = self.applied, RigCorrection(self.model, mean.copy())
