@@ -126,7 +126,13 @@ class ObjectBackend(Protocol):
 
 @runtime_checkable
 class RevisingBackend(Protocol):
-    """What a back end offers besides, where it can mend measurements that it was given long ago."""
+    """What a back end offers besides, where it can mend measurements that it was given long ago.
+
+    Attributes:
+        revises_path: whether the path follows; else only the landmarks before the camera do.
+    """
+
+    revises_path: bool
 
     def revise(self, mend: Callable[[Array], Array]) -> None:
         """Mend all measurements so far: `mend` takes rectified rows (uL, vL, uR) (N, 3) [px] to better ones.

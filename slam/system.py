@@ -252,13 +252,12 @@ class StereoSlam:
 
         As all its measurements are then weighed anew, that waits for a change that is significant.
         """
-        if not isinstance(self.backend, RevisingBackend):
-            change = self.calibration.apply()
-            if change is not None:
-                self._uncertainty.corrected(change.after.parameters - change.before.parameters)
-            return None
-        self.calibration.apply(_REVISION)
-        if self.calibration.applied is self._given:
+        revising = isinstance(self.backend, RevisingBackend)
+        change = self.calibration.apply(_REVISION if revising else 0.0)
+        if not (isinstance(self.backend, RevisingBackend) and self.backend.revises_path) and change is not None:
+            step = change.after.parameters - change.before.parameters
+            self._uncertainty.path_keeps(step, self.backend.positions, landmarks_follow=revising)
+        if not isinstance(self.backend, RevisingBackend) or self.calibration.applied is self._given:
             return None
         revision = Revision(self._given, self.calibration.applied)
         self.backend.revise(revision.rows)

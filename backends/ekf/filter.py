@@ -196,6 +196,8 @@ class EkfBackend:
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
+    revises_path = False
+
     def revise(self, mend: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
 

@@ -208,6 +208,8 @@ class SmootherBackend:
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
+    revises_path = True
+
     @one_blas_thread
     def revise(self, mend: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: all is solved anew, as long as a run of so many frames."""

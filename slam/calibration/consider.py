@@ -17,6 +17,7 @@ landmarks are measured again, J goes back to what it was when they were first se
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,10 +118,23 @@ class RigUncertainty:
         )
         self._landmarks = both.select(np.argsort(both.ids, kind="stable"))
 
-    def corrected(self, step: Array) -> None:
-        """The applied correction changed by `step` (n,), and the back end keeps what the old one made of the past."""
+    def path_keeps(self, step: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
+        """The applied correction changes by `step` (n,), but the path stays as the old correction made it.
+
+        Args:
+            step: of the parameters.
+            positions: gives the positions (M, 3) [m] of landmarks by their ids (M,).
+            landmarks_follow: the landmarks move to where the new correction sees them from the present pose.
+        """
+        if self._T_world is None:
+            return
         self._pose[:, -1] += self._pose[:, :-2] @ step
-        self._landmarks.by_rig[:, :, -1] += self._landmarks.by_rig[:, :, :-2] @ step
+        marks = self._landmarks
+        if not landmarks_follow:
+            marks.by_rig[:, :, -1] += marks.by_rig[:, :, :-2] @ step
+        elif len(marks.ids):
+            local = transform(inverse(self._T_world), positions(marks.ids))
+            marks.by_rig[:, :, -1] = (self._T_world[:3, :3] @ _by_pose(local) @ self._pose[:, -1:])[:, :, 0]
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
