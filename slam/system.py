@@ -209,6 +209,7 @@ class StereoSlam:
             self.objects.restart()
         if stage not in (None, "predict"):
             self.landmarks = self._mapper.reconcile(self.backend, self.landmarks)
+            self._uncertainty.keep(np.zeros(0, np.int64) if self.landmarks is None else self.landmarks.ids)
         self._stages = Stages()
 
     def trajectory(self) -> Trajectory:

@@ -118,6 +118,10 @@ class RigUncertainty:
         )
         self._landmarks = both.select(np.argsort(both.ids, kind="stable"))
 
+    def keep(self, ids: IdArray) -> None:
+        """Forget all landmarks but these (M,)."""
+        self._landmarks = self._landmarks.select(np.isin(self._landmarks.ids, ids))
+
     def path_keeps(self, step: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
         """The applied correction changes by `step` (n,), but the path stays as the old correction made it.
 

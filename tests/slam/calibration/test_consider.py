@@ -1,0 +1,115 @@
+"""The rig's uncertainty in poses and landmarks: its sensitivities against what a wrong rig really does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.calibration import RigModel, RigUncertainty, SelfCalibrationConfig
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from slam.geometry.se3 import inverse, log
+from slam.mapping.config import MapConfig
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from tests.slam.scene import RIG, Cloud, path
+
+BACKENDS = ("ekf", "smoother")
+NEVER_LEARNS = SelfCalibrationConfig(minimum_common=10_000)
+CONFIG = SystemConfig(
+    models=EstimatorModels(pixel_sigma=0.3),
+    map=MapConfig(target_in_view=60, max_depth_error=0.3),
+    self_calibration=NEVER_LEARNS,
+)
+MODEL = RigModel(RIG)
+
+
+def with_error(features: StereoFeatures, delta: np.ndarray) -> StereoFeatures:
+    """What a rig that is off by `delta` sees: the correction by it gives the ideal pixels."""
+    z = np.column_stack([features.uv_left, features.uv_right[:, 0]])
+    points = MODEL.points(z)
+    z = MODEL.rows(points - MODEL.field(points) @ delta)
+    return replace(features, uv_left=z[:, :2].copy(), uv_right=np.column_stack([z[:, 2], z[:, 1]]))
+
+
+def error_of(name: str, size: float) -> np.ndarray:
+    delta = np.zeros(len(MODEL.names))
+    delta[MODEL.names.index(name)] = size
+    return delta
+
+
+def run(backend: str, delta: np.ndarray, frames: int = 45) -> tuple[StereoSlam, np.ndarray]:
+    cloud, system = Cloud(150), StereoSlam(RIG, None, backend, config=CONFIG)
+    truth = path(frames)
+    for k, T in enumerate(truth):
+        system.process_features(with_error(cloud.features(T, k / 30)[0], delta))
+    return system, truth[-1]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("name", "size", "share"),
+    # The estimators go on weighing landmarks that the sensitivity takes as first seen. Errors of the disparity are the
+    # same in every view; what grows with the distance from the centre of the image changes as a landmark moves through.
+    [("right_cx", 1e-3, 0.35), ("yaw", 1e-3, 0.35), ("right_f", 2e-3, 0.8), ("right_k1", 5e-3, 0.8)],
+)
+def test_the_pose_moves_as_its_sensitivity_says(backend, name, size, share):
+    delta = error_of(name, size)
+    system, T_true = run(backend, delta)
+    T = system.backend.estimate(landmarks=False).T_world_left
+    actual = log(inverse(T) @ T_true)
+    predicted = system._uncertainty._pose[:, : len(delta)] @ delta
+    assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
+    assert np.linalg.norm(predicted - actual) < share * np.linalg.norm(actual)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_landmarks_move_as_their_sensitivities_say(backend):
+    delta = error_of("right_cx", 1e-3)
+    cloud, truth = Cloud(150), path(10)
+    system = StereoSlam(RIG, None, backend, config=CONFIG)
+    points = {}
+    for k, T in enumerate(truth):
+        features, ids = cloud.features(T, k / 30)
+        result = system.process_features(with_error(features, delta))
+        points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
+    marks = system._uncertainty._landmarks
+    estimated = system.backend.positions(marks.ids)
+    actual = cloud.points[[points[i] for i in marks.ids.tolist()]] - estimated
+    predicted = marks.by_rig[:, :, : len(delta)] @ delta
+    assert np.linalg.norm(predicted - actual) < 0.2 * np.linalg.norm(actual)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_is_known_of_the_rig_is_in_the_covariances(backend):
+    system, _ = run(backend, np.zeros(len(MODEL.names)), frames=20)
+    plain, whole = system.backend.estimate(), system.estimate()
+    extra = whole.covariance - plain.covariance
+    assert np.linalg.eigvalsh(extra).min() > -1e-12
+    assert np.trace(extra[3:, 3:]) > 0
+    assert (np.linalg.eigvalsh(whole.covariances - plain.covariances) > -1e-9).all()
+    exact = replace(CONFIG, self_calibration=replace(NEVER_LEARNS, enabled=False))
+    other = StereoSlam(RIG, None, backend, config=exact)
+    cloud = Cloud(150)
+    for k, T in enumerate(path(20)):
+        result = other.process_features(cloud.features(T, k / 30)[0])
+    np.testing.assert_array_equal(result.estimate.covariance, other.backend.estimate(landmarks=False).covariance)
+
+
+def test_a_known_error_stays_in_a_path_that_is_not_revised():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(2, 6, 40)])
+    ids = np.arange(40)
+    uncertainty = RigUncertainty(MODEL, 0.3)
+    none = np.zeros(0, np.int64)
+    for T in path(10):
+        uncertainty.observe(T, ids, points)
+        uncertainty.change(ids, points, none)
+    step = error_of("right_cx", 1e-3)
+    before = uncertainty._pose[:, : len(step)] @ step
+    uncertainty.path_keeps(step, lambda wanted: points[wanted], landmarks_follow=True)
+    np.testing.assert_allclose(uncertainty._pose[:, -1], before, atol=1e-12)
+    uncertainty.observe(path(10)[-1], ids, points)  # the landmarks moved with the pose: nothing brings it back
+    np.testing.assert_allclose(uncertainty._pose[:, -1], before, atol=1e-9)
