@@ -61,8 +61,8 @@ def pictures(group: Group) -> list[Picture]:
         text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims (shaded)."
         found.append(Picture("errors", "Error over time", text, partial(draw_errors, group)))
         text = (
-            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and means of an honest estimator are "
-            "in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
+            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and an honest estimator is in "
+            "the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
         found.append(Picture("nees", "NEES over time", text, partial(draw_nees, group)))
     text = "Time per frame by stage, median of the trials, one thread; it depends on the machine."
