@@ -55,7 +55,7 @@ def pictures(group: Group) -> list[Picture]:
     main = known.get("ate_online_m") or known.get("gps_m")
     found = [Picture("paths", "Paths from above", f"Paths from above, seed {seed}.", partial(draw_paths, group))]
     if main is not None:
-        text = f"{main.label} of every trial; lines join the back ends' runs on the same recording."
+        text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
         found.insert(0, Picture("trials", main.label, text, partial(draw_pairs, group, main)))
     if "nees_per_dof" in known:
         text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims (shaded)."
@@ -166,6 +166,7 @@ def draw_nees(group: Group) -> Figure:
         nees = np.ma.masked_invalid([s["nees"][1:length] for s in every])
         t = (every[0]["stamp"] - every[0]["stamp"][0])[1:length]
         axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colours(group)[name], lw=1.2, label=name)
+    axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
     axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {fewest}")
     axis.set_yscale("log")

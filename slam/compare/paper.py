@@ -13,7 +13,7 @@ from slam.compare.plan import Plan, short_name
 from slam.compare.statistics import LEVEL, Difference
 from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
-from slam.compare.wording import measurements, shown_interval, shown_mean, shown_p
+from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
 
 TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
 
@@ -105,7 +105,7 @@ def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], cap
     lines = [" & ".join(row) + " \\\\" for row in rows]
     return "\n    ".join(
         [
-            "\\begin{table}\n  \\centering\n  \\small\n"
+            "\\begin{table}\n  \\centering\n  \\small\n  \\setlength{{\\tabcolsep}}{{4pt}}\n"
             f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\begin{{tabular}}{{{columns}}}",
             "\\toprule",
             " & ".join(head) + " \\\\",
@@ -120,8 +120,7 @@ def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
     mean, sd, low, high = (metric.scale * x for x in mean_figures(group.finite(backend, metric.key)))
     if not np.isfinite(mean):
         return "-- & --"
-    largest = max(abs(x) for x in (mean, low, high) if np.isfinite(x))
-    digits = max(0, 2 - int(np.floor(np.log10(largest)))) if largest > 0 else 0
+    digits = decimals(mean)
     shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
     return f"{shown[0]} $\\pm$ {shown[1]} & [{shown[2]}, {shown[3]}]" if np.isfinite(sd) else f"{shown[0]} & --"
 
@@ -129,7 +128,12 @@ def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
 def _difference_cells(d: Difference) -> list[str]:
     interval = shown_interval(d, ", ")
     bounds = latex(interval if interval == "–" else f"[{interval}]")
-    return [latex(shown_mean(d)), bounds, latex(shown_p(d.p)), latex(shown_p(d.p_holm)), str(d.pairs)]
+    return [
+        latex(shown_mean(d)),
+        bounds,
+        *(latex(shown_p(p)) if d.varies else "--" for p in (d.p, d.p_holm)),
+        str(d.pairs),
+    ]
 
 
 def _what(group: Group) -> str:
@@ -142,7 +146,7 @@ def _given(group: Group) -> str:
 
 
 def _label(group: Group) -> str:
-    return "_".join(short_name(text) for text in (group.sequence, group.variant.name, group.mode))
+    return "_".join([short_name(group.sequence), short_name(group.variant.name), group.mode.replace(" ", "_")])
 
 
 def _lower(text: str) -> str:

@@ -29,6 +29,7 @@ from slam.compare.wording import (
     shown_interval,
     shown_mean,
     shown_p,
+    shown_spread,
     worth_saying,
 )
 
@@ -189,7 +190,7 @@ def _row(group: Group, metric: Metric, differences: dict[str, Difference]) -> di
     means = []
     for backend in group.runs:
         mean, sd, _, _ = mean_figures(group.finite(backend, metric.key))
-        means.append((metric.show(mean), f"± {metric.show(sd)}" if np.isfinite(sd) else ""))
+        means.append(shown_spread(metric, mean, sd))
     return {"label": metric.title, "means": means, "failed": [0] * len(means), "cells": cells}
 
 
@@ -205,8 +206,8 @@ def _cells(d: Difference) -> dict[str, str]:
         "words": words,
         "mean": shown_mean(d),
         "interval": shown_interval(d),
-        "p": shown_p(d.p),
-        "p_holm": shown_p(d.p_holm),
+        "p": shown_p(d.p) if d.varies else "–",
+        "p_holm": shown_p(d.p_holm) if d.varies else "–",
     }
 
 

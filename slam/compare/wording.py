@@ -30,12 +30,14 @@ class Line:
     """A line of a headline.
 
     Attributes:
-        text: in words.
+        text: a sentence.
+        short: who, and which figures; `direction` and `verdict` say the rest.
         direction: "better" or "worse", of the other back end; empty where neither.
         verdict: how sure that is.
     """
 
     text: str
+    short: str
     direction: str
     verdict: Verdict
 
@@ -51,12 +53,13 @@ def headline(differences: Sequence[Difference], reference: str, other: str) -> l
             own = [d for d in differences if d.verdict is verdict and d.better is wins and _is_named(d)]
             if own:
                 text = f"{other} {_VERB[verdict]} {direction} than {reference}, {strength}: {_listed(own)}."
-                lines.append(Line(text, direction, verdict))
+                lines.append(Line(text, f"{other}: {_listed(own)}", direction, verdict))
     rest = [d for d in differences if worth_saying(d)]
     for verdict, text in ((Verdict.OPEN, "No difference can be concluded in"), (Verdict.NONE, "Nothing to compare in")):
         names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
         if names:
-            lines.append(Line(f"{text} {' and '.join(filter(None, [', '.join(names[:-1]), names[-1]]))}.", "", verdict))
+            listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+            lines.append(Line(f"{text} {listed}.", f"{other}: {listed}", "", verdict))
     return lines
 
 
@@ -150,8 +153,16 @@ def measurements(mode: str, reference: str) -> str:
 
 
 def shown_mean(d: Difference) -> str:
-    """The mean difference for people; of figures that should be one, the ratio of the factors by which they are off."""
-    return f"× {10**d.mean:.3f}" if d.metric.better == "one" and np.isfinite(d.mean) else d.metric.show(d.mean)
+    """The mean difference for people, with the digits of its interval.
+
+    Of figures that should be one it is the ratio of the factors by which they are off.
+    """
+    if d.metric.better == "one" and np.isfinite(d.mean):
+        return f"× {10**d.mean:.3f}"
+    if not np.isfinite(d.low):
+        return d.metric.show(d.mean)
+    digits = decimals(d.metric.scale * max(abs(d.low), abs(d.high)))
+    return f"{d.metric.scale * d.mean:.{digits}f}".replace("-", "−")
 
 
 def shown_interval(d: Difference, between: str = " … ") -> str:
@@ -168,9 +179,23 @@ def shown_bounds(metric: Metric, low: float, high: float, between: str = " … "
     if not np.isfinite(low):
         return "–"
     low, high = metric.scale * low, metric.scale * high
-    largest = max(abs(low), abs(high))
-    digits = max(0, 2 - int(np.floor(np.log10(largest)))) if largest > 0 else 0
+    digits = decimals(max(abs(low), abs(high)))
     return f"{low:.{digits}f}{between}{high:.{digits}f}".replace("-", "−")
+
+
+def shown_spread(metric: Metric, mean: float, sd: float) -> tuple[str, str]:
+    """Mean and standard deviation for people, with as many digits as the mean needs; empty where there is none."""
+    mean, sd = metric.scale * mean, metric.scale * sd
+    if not np.isfinite(mean):
+        return "–", ""
+    digits = decimals(mean)
+    shown = f"{mean:.{digits}f}".replace("-", "−")
+    return shown, f"± {sd:.{digits}f}" if np.isfinite(sd) else ""
+
+
+def decimals(value: float) -> int:
+    """Digits after the point that show three of a value; at most six."""
+    return min(6, max(0, 2 - int(np.floor(np.log10(abs(value)))))) if value else 0
 
 
 def shown_p(p: float) -> str:
@@ -210,7 +235,7 @@ def _equals(p: float) -> str:
 
 def _name(metric: Metric) -> str:
     """A label that can stand in a list."""
-    return metric.label.replace(", ", " ").removesuffix(" (1 is honest)")
+    return metric.label.replace(", ", " ").removesuffix(" (expected 1)")
 
 
 def _listed(differences: Sequence[Difference]) -> str:
@@ -232,4 +257,4 @@ def _less(d: Difference) -> str:
 
 
 def _digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 0.1 else f"{value:.1g}"
