@@ -48,7 +48,7 @@ def means_table(group: Group) -> str:
     """Mean, standard deviation and confidence interval of every figure of each back end."""
     names = list(group.runs)
     head = ["figure", *(f"{latex(name)} & {round(100 * LEVEL)} \\% CI" for name in names)]
-    rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.metrics]
+    rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.shown]
     caption = (
         f"{_what(group)}: mean $\\pm$ standard deviation over the completed of {group.trials} trials, and the "
         f"{round(100 * LEVEL)} \\% bootstrap confidence interval (BCa) of the mean. {_given(group)}."
@@ -65,7 +65,7 @@ def differences_table(group: Group, tests: int) -> str:
     """
     first, *others = group.runs
     rows = []
-    for metric in group.metrics:
+    for metric in group.shown:
         for other, d in group.differences(metric).items():
             if metric.better:
                 rows.append([latex(metric.title), *([latex(other)] if len(others) > 1 else []), *_difference_cells(d)])
@@ -105,8 +105,8 @@ def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], cap
     lines = [" & ".join(row) + " \\\\" for row in rows]
     return "\n    ".join(
         [
-            "\\begin{table}\n  \\centering\n  \\small\n  \\setlength{{\\tabcolsep}}{{4pt}}\n"
-            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\begin{{tabular}}{{{columns}}}",
+            "\\begin{table}\n  \\centering\n  \\small\n  \\setlength{\\tabcolsep}{4pt}\n"
+            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n  \\begin{{tabular}}{{{columns}}}",
             "\\toprule",
             " & ".join(head) + " \\\\",
             "\\midrule",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slam.compare import figures
-from slam.compare.measure import COMPLETED, UNTRACKED, Metric, number
+from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
 from slam.compare.statistics import LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
@@ -169,15 +169,12 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
 
 def _table(group: Group) -> dict[str, Any]:
     first = next(iter(group.runs))
-    shown = [
-        m for m in group.metrics if m.key not in UNTRACKED or any(group.finite(b, m.key).any() for b in group.runs)
-    ]
     reasons = {f"{b}, seed {r.trial.seed}: {r.outcome}" for b, rs in group.runs.items() for r in rs if not r.completed}
     return {
         "title": f"{measurements(group.mode, first)}",
-        "rows": [_row(group, metric, group.differences(metric)) for metric in shown],
+        "rows": [_row(group, metric, group.differences(metric)) for metric in group.shown],
         "honesty": _honesty(group),
-        "sentences": [sentence(d, first, b) for m in shown if m.better for b, d in group.differences(m).items()],
+        "sentences": [sentence(d, first, b) for m in group.shown if m.better for b, d in group.differences(m).items()],
         "reasons": sorted(reasons),
     }
 
