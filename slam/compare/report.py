@@ -169,7 +169,12 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
 
 def _table(group: Group) -> dict[str, Any]:
     first = next(iter(group.runs))
-    reasons = {f"{b}, seed {r.trial.seed}: {r.outcome}" for b, rs in group.runs.items() for r in rs if not r.completed}
+    reasons = {
+        f"{b}, seed {r.trial.seed}: {r.outcome.removeprefix('failed: ')}"
+        for b, rs in group.runs.items()
+        for r in rs
+        if not r.completed
+    }
     return {
         "title": f"{measurements(group.mode, first)}",
         "rows": [_row(group, metric, group.differences(metric)) for metric in group.shown],

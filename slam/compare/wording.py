@@ -103,7 +103,7 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
         )
         judged = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
         lines.append(
-            f"{backend}: {judged}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2g} to {high:.2g} by chance "
+            f"{backend}: {judged}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
             f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
         )
     return lines
@@ -248,7 +248,8 @@ def _brief(d: Difference) -> str:
     share = ""
     if d.metric.better == "lower" and d.reference > 0:
         share = f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    return f"{_name(d.metric)} {d.metric.show(d.reference)} → {d.metric.show(d.other)}{unit}{share}"
+    values = [shown_spread(d.metric, value, np.nan)[0] for value in (d.reference, d.other)]
+    return f"{_name(d.metric)} {' → '.join(values)}{unit}{share}"
 
 
 def _less(d: Difference) -> str:
@@ -257,4 +258,4 @@ def _less(d: Difference) -> str:
 
 
 def _digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 0.1 else f"{value:.1g}"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2f}"

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -55,6 +58,12 @@ def test_words_have_their_thresholds_in_one_place():
     assert "Holm-adjusted p ≤ 0.05" in STRENGTH[Verdict.CERTAIN]
     assert "p ≤ 0.05" in STRENGTH[Verdict.LIKELY]
     assert "p ≤ 0.1" in STRENGTH[Verdict.HINT]
+    page = (Path(__file__).parents[3] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    assert f"| certain | leaves out zero | Holm-adjusted p ≤ {ALPHA:g} |" in page
+    assert f"| likely | leaves out zero | p ≤ {ALPHA:g} before the adjustment |" in page
+    assert f"| a hint | leaves out zero | p ≤ {HINT_ALPHA:g} before the adjustment |" in page
+    trials = re.search(r"with (\d+) trials, 20 tests with (\d+), 70 with (\d+), 300 with\s(\d+)", page)
+    assert [int(n) for n in trials.groups()] == [fewest(1), fewest(20), fewest(70), fewest(300)]
 
 
 def test_holm_is_that_of_his_paper():
@@ -203,10 +212,10 @@ def test_mean_nees_stands_beside_what_is_to_be_expected():
     values = {"nees_per_dof": {"ekf": 3500 / 6, "smoother": 1.2}, "nees_10m_per_dof": {"ekf": np.nan, "smoother": 0.1}}
     frightening, cautious = honesty(values, 6)
     assert frightening.startswith(
-        "ekf: overconfident. NEES / 6 from the start is 583, expected 1, 0.59 to 1.5 by chance"
+        "ekf: overconfident. NEES / 6 from the start is 583, expected 1, 0.59 to 1.51 by chance"
     )
     assert "errors are 24 times as large" in frightening
-    assert cautious.startswith("smoother: too cautious. NEES / 6 over 10 m of path is 0.1")
+    assert cautious.startswith("smoother: too cautious. NEES / 6 over 10 m of path is 0.10")
     assert honesty({"nees_per_dof": {"ekf": 1.2}}, 6)[0].startswith("ekf: consistent")
     assert honesty({}, 6) == []
 
