@@ -161,6 +161,7 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
                 "title": f"{first.sequence}{variant}",
                 "tables": [_table(group) for group in own],
                 "pictures": _pictures(first),
+                "given": measurements(first.mode, plan.backends[0]),
                 "map": figures.map_data(first) if figures.example(first) else None,
             }
         )

@@ -45,7 +45,7 @@ def test_the_headlines_name_what_is_certainly_worse_beside_what_is_better(three)
     assert "ATE RMSE final" in lines["smoother", "better", Verdict.CERTAIN]
     assert "RPE RMSE over 1 s" in lines["smoother", "worse", Verdict.CERTAIN]
     assert "NEES / 6 over 10 m" in lines["batch", "worse", Verdict.CERTAIN]
-    assert "frames tracked 100 → 90 %" in lines["batch", "worse", Verdict.CERTAIN]
+    assert "frames tracked 100 → 90.0 %" in lines["batch", "worse", Verdict.CERTAIN]
     assert "1 of 12 of smoother" in found.failed
     assert any("batch: overconfident. NEES / 6 over 10 m of path is 58, expected 1" in line for line in found.full)
     assert found.short[0] == found.failed
@@ -154,3 +154,15 @@ def test_one_trial_and_nothing_that_completed(tmp_path):
     text = write_report(of, runs, tmp_path, "here").read_text()
     assert "4 of 4 runs failed" in text
     assert not list((tmp_path / "figures").iterdir())
+
+
+def test_one_trial_says_that_it_proves_nothing(tmp_path):
+    of = plan(1)
+    runs = make(tmp_path, of)
+    every = groups(of, runs)
+    found = conclusions(every)[0]
+    assert {line.verdict for line in found.headlines} <= {Verdict.SINGLE, Verdict.OPEN}
+    assert any(line.startswith("smoother was better than ekf, in one trial") for line in found.short)
+    assert count_tests(every) > 0  # as many as more trials would have
+    text = write_report(of, runs, tmp_path, "here").read_text()
+    assert "One trial cannot tell a difference from chance" in text
