@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import TrajectoryError
+from slam.files import read_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
 
 
@@ -123,8 +124,9 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # an empty file is an error below
-            rows = np.loadtxt(path, delimiter=delimiter, ndmin=2, comments="#")
-    except (OSError, ValueError) as error:
+            text = read_text(path, error=TrajectoryError)
+            rows = np.loadtxt(text.splitlines(), delimiter=delimiter, ndmin=2, comments="#")
+    except ValueError as error:
         raise TrajectoryError(f"{path}: cannot be read as a trajectory: {error}") from error
     if rows.shape[1] < columns or not len(rows):
         raise TrajectoryError(f"{path}: a trajectory has {columns} columns, found {rows.shape}")

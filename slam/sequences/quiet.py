@@ -1,0 +1,81 @@
+"""Silence for what image and video libraries print on standard error: their faults are reported by us, once."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+_STDERR = 2
+
+#: How lines of libpng, libjpeg, libtiff, OpenCV and ffmpeg begin; other lines, of other threads, are passed on.
+_LIBRARIES = re.compile(
+    rb"libpng |Corrupt JPEG|Premature end of JPEG|Invalid (JPEG|SOS|crop|component)|Unsupported (marker|JPEG)|"
+    rb"Not a JPEG|JPEG |Bogus |Inconsistent |Warning: unknown JFIF|TIFF|\[ *(WARN|ERROR|INFO)|\[[\w,/ ]+ @ 0x|"
+    rb"OpenCV|VIDEOIO|moov atom|.*: (Invalid data found|No such file)|(Error|Could not|Cannot) |imdecode_|global "
+)
+
+_lock = threading.Lock()
+_inside = 0
+_kept = -1  # the real standard error meanwhile
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Keep OpenCV, and the libraries below it, from printing what is about to be reported as an error of ours.
+
+    They write to descriptor 2 itself, which all threads share: whoever comes first turns it aside, whoever leaves last
+    turns it back, and lines that are not the libraries' are printed then.
+    """
+    from cv2.utils import logging
+
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    _enter()
+    try:
+        yield
+    finally:
+        _leave()
+        logging.setLogLevel(level)
+
+
+def _enter() -> None:
+    global _inside, _kept
+    with _lock:
+        _inside += 1
+        if _inside > 1:
+            return
+        with suppress(OSError):  # standard error is closed: nothing can be printed there
+            _kept = os.dup(_STDERR)
+            aside = _anonymous_file()
+            os.dup2(aside, _STDERR)
+            os.close(aside)
+
+
+def _leave() -> None:
+    global _inside, _kept
+    with _lock:
+        _inside -= 1
+        if _inside or _kept < 0:
+            return
+        with suppress(OSError):
+            length = os.lseek(_STDERR, 0, os.SEEK_CUR)
+            os.lseek(_STDERR, 0, os.SEEK_SET)
+            printed = os.read(_STDERR, min(length, 2**20)) if length else b""
+            os.dup2(_kept, _STDERR)
+            os.close(_kept)
+            others = [line for line in printed.splitlines(keepends=True) if not _LIBRARIES.match(line)]
+            if others:
+                os.write(_STDERR, b"".join(others))
+        _kept = -1
+
+
+def _anonymous_file() -> int:
+    """A file without a name, open for reading and writing: in memory where the system can do that."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("standard error")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
