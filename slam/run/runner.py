@@ -31,6 +31,8 @@ from slam.system import StereoSlam
 
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
+_MOST_FRAMES = 10**12  # of a sequence: more than any has
+
 #: Is shown each step: its images, what came of it, and the system after it.
 Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
 
@@ -354,6 +356,9 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
     try:
         if not colon:
             raise ValueError
-        return int(first or 0), int(last) if last else None
+        start, stop = int(first or 0), int(last) if last else None
     except ValueError:
         raise SlamError(f"frames {text!r} is not of the form A:B") from None
+    if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
+        raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
+    return start, stop

@@ -13,9 +13,10 @@ _STDERR = 2
 
 #: How lines of libpng, libjpeg, libtiff, OpenCV and ffmpeg begin; other lines, of other threads, are passed on.
 _LIBRARIES = re.compile(
-    rb"libpng |Corrupt JPEG|Premature end of JPEG|Invalid (JPEG|SOS|crop|component)|Unsupported (marker|JPEG)|"
-    rb"Not a JPEG|JPEG |Bogus |Inconsistent |Warning: unknown JFIF|TIFF|\[ *(WARN|ERROR|INFO)|\[[\w,/ ]+ @ 0x|"
-    rb"OpenCV|VIDEOIO|moov atom|.*: (Invalid data found|No such file)|(Error|Could not|Cannot) |imdecode_|global "
+    rb"libpng |Corrupt JPEG|Premature end of JPEG|Invalid (JPEG|SOS|crop|component)|Not a JPEG|JPEG |Bogus |"
+    rb"Inconsistent |Warning: unknown JFIF|TIFF|\[ *(WARN|ERROR|INFO)|\[[\w,/ ]+ @ 0x|OpenCV|VIDEOIO|Unexpected |"
+    rb"[Uu]nsupported |[Ff]rame size|moov atom|.*: (Invalid data found|No such file)|(Error|Could not|Cannot) |"
+    rb"imdecode_|global "
 )
 
 _lock = threading.Lock()

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.fuzz import readers
+from tests.fuzz import readers, settings
 
-SUBJECTS = (*readers.SUBJECTS,)
+SUBJECTS = (*readers.SUBJECTS, *settings.SUBJECTS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import cv2
@@ -51,7 +51,7 @@ T: [ -0.2, 0., 0. ]
 _OXTS = "49.0 8.4 112.8 0.02 0.01 -1.2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 4 9 4 4 0\n"
 
 
-@lru_cache(maxsize=None)
+@cache
 def image(seed: int, ending: str = ".png") -> bytes:
     """A small image file."""
     pixels = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
@@ -89,7 +89,9 @@ def raw() -> Files:
         times = "".join(f"2011-09-26 13:10:{51 + 0.1 * k:.9f}\n" for k in range(FRAMES))
         files[f"image_{c}/timestamps.txt"] = times.encode()
     P = "S_rect_{0}: 64 48\nP_rect_{0}: 50 0 31.5 {1} 0 50 23.5 0 0 0 1 0\n"
-    files["calib_cam_to_cam.txt"] = (P.format("00", 0) + P.format("01", -25) + "R_rect_00: 1 0 0 0 1 0 0 0 1\n").encode()
+    files["calib_cam_to_cam.txt"] = (
+        P.format("00", 0) + P.format("01", -25) + "R_rect_00: 1 0 0 0 1 0 0 0 1\n"
+    ).encode()
     for name in ("velo_to_cam", "imu_to_velo"):
         files[f"calib_{name}.txt"] = b"R: 1 0 0 0 1 0 0 0 1\nT: 0.1 0.2 0.3\n"
     files["oxts/timestamps.txt"] = files["image_00/timestamps.txt"]
@@ -100,7 +102,9 @@ def raw() -> Files:
 
 def folders() -> Files:
     """Two folders of images with OpenCV's calibration."""
-    files = {f"{side}/{k:03d}.png": image(10 * i + k) for i, side in enumerate(("left", "right")) for k in range(FRAMES)}
+    files = {
+        f"{side}/{k:03d}.png": image(10 * i + k) for i, side in enumerate(("left", "right")) for k in range(FRAMES)
+    }
     files["calibration.yaml"] = _STORAGE.encode()
     files["times.txt"] = "".join(f"{0.1 * k}\n" for k in range(FRAMES)).encode()
     return files
@@ -222,15 +226,21 @@ def hostile_image(rng: np.random.Generator, data: bytes) -> bytes:
     kind = int(rng.integers(6))
     if kind == 0:
         size = choose(rng, ((30_000, 30_000), (2**31 - 1, 1), (0, 0), (WIDTH, 60_000), (WIDTH, HEIGHT), (1, 1)))
-        return png(size, choose(rng, (b"", rng.bytes(50), zlib.compress(bytes(WIDTH * HEIGHT)))), int(choose(rng, (8, 16, 3))))
+        return png(
+            size, choose(rng, (b"", rng.bytes(50), zlib.compress(bytes(WIDTH * HEIGHT)))), int(choose(rng, (8, 16, 3)))
+        )
     if kind == 1:
-        extra = chunk(choose(rng, (b"iCCP", b"gAMA", b"tEXt", b"zTXt", b"sRGB", b"PLTE", b"IDAT", b"tRNS")), rng.bytes(20))
+        extra = chunk(
+            choose(rng, (b"iCCP", b"gAMA", b"tEXt", b"zTXt", b"sRGB", b"PLTE", b"IDAT", b"tRNS")), rng.bytes(20)
+        )
         return data[:33] + extra + data[33:]
     if kind == 2:
         ending = choose(rng, (".jpg", ".bmp", ".tiff", ".webp", ".pgm", ".jp2"))
         return broken_bytes(rng, image(1, ending)) if rng.random() < 0.8 else image(1, ending)
     if kind == 3:
-        return choose(rng, (b"P5\n60000 60000\n255\n", b"P5 64 48 255\n", b"P2 64 48 65535\n1 2", b"BM" + rng.bytes(60)))
+        return choose(
+            rng, (b"P5\n60000 60000\n255\n", b"P5 64 48 255\n", b"P2 64 48 65535\n1 2", b"BM" + rng.bytes(60))
+        )
     return broken_bytes(rng, data)
 
 
@@ -258,7 +268,9 @@ def special(rng: np.random.Generator, root: Path) -> None:
     elif kind == 1:
         path.mkdir()
     else:
-        path.symlink_to(choose(rng, ("/dev/zero", "/dev/full", path.name, "nowhere", "/proc/self/mem", "/proc/kmsg", "/")))
+        path.symlink_to(
+            choose(rng, ("/dev/zero", "/dev/full", path.name, "nowhere", "/proc/self/mem", "/proc/kmsg", "/"))
+        )
 
 
 def write(files: Files, root: Path) -> None:
