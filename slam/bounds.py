@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
@@ -73,7 +73,7 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
 
 
 @lru_cache(maxsize=64)
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Hashable) -> dict[str, Any]:
     """Types of a dataclass's fields."""
     return get_type_hints(kind)
 
@@ -95,6 +95,9 @@ def _type_fault(value: Any, hint: Any) -> str:
         return "" if good else "a whole number" if hint is int else "a number"
     if get_origin(hint) is tuple:
         return _tuple_fault(value, get_args(hint))
+    if get_origin(hint) is dict:
+        good = isinstance(value, dict) and all(isinstance(key, str) for key in value)
+        return "" if good else "a mapping of names to values"
     if isinstance(hint, type) and is_dataclass(hint):
         return "" if isinstance(value, hint) else f"of type {hint.__name__}"
     return ""

@@ -98,21 +98,22 @@ def reason(fault: OSError) -> str:
     return fault.strerror or str(fault)
 
 
-def require_target(path: Path) -> None:
+def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
     """Raise where a file could not be written for certain, before work is done for it.
 
     Raises:
-        SlamError: there is no folder for it, or there is something at its place that is not a regular file.
+        SlamError: of type `error`, where there is no folder for it, or something at its place that is not a regular
+            file: a device or a pipe is never replaced.
     """
     try:
         if not path.parent.is_dir():
-            raise SlamError(f"{path}: there is no folder {path.parent}")
+            raise error(f"{path}: cannot be written: there is no folder {path.parent}")
         if path.exists() and not path.is_file():
-            raise SlamError(f"{path}: not written: there is something that is not a regular file")
+            raise error(f"{path}: cannot be written: there is something that is not a regular file")
     except OSError as fault:
-        raise SlamError(f"{path}: {reason(fault)}") from fault
+        raise error(f"{path}: cannot be written: {reason(fault)}") from fault
     except ValueError as fault:
-        raise SlamError(f"{path}: no possible file name") from fault
+        raise error(f"{path}: no possible file name") from fault
 
 
 @contextmanager
@@ -123,7 +124,7 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
         SlamError: of type `error`, where it cannot be written; nothing is left of it then.
     """
     place = Path(path)
-    require_target(place)
+    require_target(place, error)
     temporary = None
     try:
         place = place.resolve()  # a link stays a link

@@ -52,6 +52,11 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     @classmethod
+    def empty(cls) -> Trajectory:
+        """No pose."""
+        return cls(np.zeros(0), np.zeros((0, 4, 4)))
+
+    @classmethod
     def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
         """Paths that follow each other in time, as one."""
         return cls(np.concatenate([p.stamps for p in parts]), np.concatenate([p.poses for p in parts]))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,8 +17,9 @@ import numpy as np
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, StereoFrame
-from slam.errors import SlamError
+from slam.errors import SlamError, one_line
 from slam.evaluation.summary import consistency, evaluate
+from slam.files import require_target
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
@@ -28,6 +31,8 @@ from slam.run.recording import save_recording
 from slam.run.replay import RecordedFrame, Recording, replay
 from slam.sequences import Sequence
 from slam.system import StereoSlam
+
+logger = logging.getLogger("slam.run")
 
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
@@ -124,8 +129,10 @@ def run(
         SlamError: bad input; one line says what and where.
     """
     for target in (options.record, options.save_map):
-        if target is not None and not target.parent.is_dir():
-            raise SlamError(f"{target}: there is no folder {target.parent}")
+        if target is not None:
+            require_target(target)
+    if options.record is not None and options.record == options.save_map:
+        raise SlamError(f"{options.record}: the recording and the map cannot be one file")
     if options.known_map is not None and options.record is not None:
         raise SlamError("a run that starts in a known map cannot be recorded: the recording would lack the map")
     if options.config.map.monocular and options.record is not None:
@@ -168,16 +175,21 @@ def _drive(
     record: RunRecord,
     on_frame: Callable[[FrameResult], None] | None,
 ) -> dict[str, Any]:
-    """Write what each frame gives, and in the end the rest, however it ends; returns the summary."""
+    """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
+
+    Raises:
+        SlamError: a file cannot be written; all others are.
+    """
     tape: list[RecordedFrame] = []
     score = score_for(sequence)
+    last = LastFiles()
     ended = "completed"
     with RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
         try:
             for number, result in results:
-                record.add(number, result)
                 files.write_frame(number, result)
+                record.add(number, result)
                 if score is not None:
                     score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
@@ -185,15 +197,34 @@ def _drive(
                 if on_frame is not None:
                     on_frame(result)
         except BaseException as error:
-            ended = f"stopped: {error or type(error).__name__}"
+            ended = f"stopped: {one_line(str(error)) or type(error).__name__}"
             raise
         finally:
-            summary = _finish(sequence, options, system, record, files, ended, score)
-            if options.record is not None:
-                save_recording(_recording(sequence, options, system, tape), options.record)
-            if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
-                save_map(options.save_map, system)
+            summary = _finish(sequence, options, system, record, files, ended, score, last)
+            _write_copies(sequence, options, system, record, tape, last)
+            if last.failures:
+                summary["failures"] = last.lines
+                with last.each():
+                    files.write_json("summary.json", summary)
+            last.report(raising=ended == "completed")
     return summary
+
+
+def _write_copies(
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    tape: list[RecordedFrame],
+    last: LastFiles,
+) -> None:
+    """The recording and the map, where they were asked for."""
+    if options.record is not None:
+        with last.each():
+            save_recording(_recording(sequence, options, system, tape), options.record)
+    if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
+        with last.each():
+            save_map(options.save_map, system)
 
 
 def _recording(
@@ -265,8 +296,9 @@ def _finish(
     files: RunFiles,
     ended: str,
     score: ObjectScore | None,
+    last: LastFiles,
 ) -> dict[str, Any]:
-    """Write the last files and return the summary."""
+    """Write the last files, each whether or not another fails, and return the summary."""
     summary: dict[str, Any] = {
         "sequence": sequence.name,
         "format": sequence.format,
@@ -278,30 +310,82 @@ def _finish(
         "warnings": list(sequence.warnings),
     }
     if record.stamps:
-        final = system.trajectory()
-        files.write_final(final, system.estimate(), system.landmarks, record.numbers)
-        summary["path_length_m"] = record.trajectory.length
-        summary["landmarks"] = 0 if system.landmarks is None else len(system.landmarks)
-        summary["observations"] = {"used": record.used, "rejected": record.rejected}
-        summary["accuracy"] = {
-            "online": evaluate(record.trajectory, sequence),
-            "final": evaluate(final, sequence),
-        }
-        summary["consistency"] = {
-            "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(record.trajectory, np.array(record.covariances), sequence),
-        }
-        if isinstance(system, StereoSlam):
-            summary["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
-        if score is not None:
-            summary["objects"] = score.summary()
-        summary["milliseconds"] = _timings(record)
-        summary["frames_per_second"] = _rate(record)
+        final = Trajectory.empty()
+        with last.each():
+            final = system.trajectory()
+            files.write_trajectory(final)
+        with last.each():
+            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+        with last.each():
+            summary.update(_results(sequence, system, record, final, score))
     summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
     summary["configuration"] = options.config.to_json()
     summary["versions"] = versions()
-    files.write_json("summary.json", summary)
+    with last.each():
+        files.write_json("summary.json", summary)
     return summary
+
+
+def _results(
+    sequence: Sequence | Recording,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    final: Trajectory,
+    score: ObjectScore | None,
+) -> dict[str, Any]:
+    """The part of a summary that says how good the run was."""
+    found: dict[str, Any] = {
+        "path_length_m": record.trajectory.length,
+        "landmarks": 0 if system.landmarks is None else len(system.landmarks),
+        "observations": {"used": record.used, "rejected": record.rejected},
+        "accuracy": {"online": evaluate(record.trajectory, sequence), "final": evaluate(final, sequence)},
+        "consistency": {
+            "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
+            **consistency(record.trajectory, np.array(record.covariances), sequence),
+        },
+    }
+    if isinstance(system, StereoSlam):
+        found["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+    if score is not None:
+        found["objects"] = score.summary()
+    return {**found, "milliseconds": _timings(record), "frames_per_second": _rate(record)}
+
+
+class LastFiles:
+    """Does each of the last things although another one fails, and says in the end which did."""
+
+    def __init__(self) -> None:
+        self.failures: list[Exception] = []
+
+    @contextmanager
+    def each(self) -> Iterator[None]:
+        """One of them."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 `report` raises it
+            self.failures.append(error)
+
+    @property
+    def lines(self) -> list[str]:
+        """What failed, a line each."""
+        return [one_line(f"{error}") or type(error).__name__ for error in self.failures]
+
+    def report(self, raising: bool) -> None:
+        """Raise what failed; where another error is on its way already, warn instead.
+
+        Raises:
+            SlamError: a file could not be written.
+            Exception: a defect of the program, as it is.
+        """
+        if not raising:
+            for line in self.lines:
+                logger.warning("%s", line)
+            return
+        for error in self.failures:
+            if not isinstance(error, SlamError):
+                raise error
+        if self.failures:
+            raise SlamError("; ".join(dict.fromkeys(self.lines)))
 
 
 def _rate(record: RunRecord) -> float | None:

@@ -49,7 +49,7 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
         times = _times(folder / "times.txt", faults)
         if times is None:
-            stamps = left.keys / RATE
+            stamps = left.keys.astype(np.float64) / RATE
         else:
             keep, stamps = stamped(left.keys, times, folder / "times.txt", faults)
             left, right_names = left.select(keep), [right_names[i] for i in keep]

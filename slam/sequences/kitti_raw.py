@@ -49,7 +49,7 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         path = left.folder.parent / "timestamps.txt"
         origin, times = _times(path, faults)
         if times is None:
-            stamps = left.keys / RATE
+            stamps = left.keys.astype(np.float64) / RATE
         else:
             keep, stamps = stamped(left.keys, times, path, faults)
             left, right_names = left.select(keep), [right_names[i] for i in keep]

@@ -77,7 +77,8 @@ def _require_small(path: Path, text: str) -> None:
         long = isinstance(event, yaml.ScalarEvent) and len(event.value) > _LONGEST
         if depth > _DEEPEST or values > _VALUES or long:
             what = "nested too deeply" if depth > _DEEPEST else "a value too long" if long else "too many values"
-            raise CalibrationError(f"{path}, row {event.start_mark.line + 1}: {what} for a calibration")
+            row = event.start_mark.line + 1  # type: ignore[union-attr]
+            raise CalibrationError(f"{path}, row {row}: {what} for a calibration")
 
 
 def _written_out(node: Any, known: dict[int, int]) -> int:

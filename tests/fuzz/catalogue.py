@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.fuzz import readers, settings
+from tests.fuzz import library, readers, runs, saved, settings
 
-SUBJECTS = (*readers.SUBJECTS, *settings.SUBJECTS)
+SUBJECTS = (*readers.SUBJECTS, *settings.SUBJECTS, *saved.SUBJECTS, *runs.SUBJECTS, *library.SUBJECTS)

@@ -129,7 +129,7 @@ def _run(config: SystemConfig, backend: str) -> None:
 
 SUBJECTS = (
     Subject(
-        "configuration classes", "hostile values in every field of every configuration class", 
+        "configuration classes", "hostile values in every field of every configuration class",
         "refused in one line, or four frames with it end well", construct, quiet=False, short=60,
     ),
     Subject(
