@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from types import NoneType, UnionType
@@ -49,7 +49,7 @@ def require_not_negative(config: object, ranges: Ranges | None = None, owner: st
 
 def _require(config: object, ranges: Ranges, owner: str, positive: bool) -> None:
     mark = f"{owner}: " if owner else ""
-    hints = _hints(type(config))
+    hints = _hints(type(config))  # type: ignore[arg-type]
     for f in fields(config):  # type: ignore[arg-type]
         value = getattr(config, f.name)
         fault = _type_fault(value, hints[f.name])
@@ -73,7 +73,7 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
 
 
 @lru_cache(maxsize=64)
-def _hints(kind: Hashable) -> dict[str, Any]:
+def _hints(kind: type) -> dict[str, Any]:
     """Types of a dataclass's fields."""
     return get_type_hints(kind)
 

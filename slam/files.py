@@ -105,6 +105,8 @@ def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
         SlamError: of type `error`, where there is no folder for it, or something at its place that is not a regular
             file: a device or a pipe is never replaced.
     """
+    if "\0" in str(path):
+        raise error(f"{path}: no possible file name")
     try:
         if not path.parent.is_dir():
             raise error(f"{path}: cannot be written: there is no folder {path.parent}")
@@ -112,8 +114,6 @@ def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
             raise error(f"{path}: cannot be written: there is something that is not a regular file")
     except OSError as fault:
         raise error(f"{path}: cannot be written: {reason(fault)}") from fault
-    except ValueError as fault:
-        raise error(f"{path}: no possible file name") from fault
 
 
 @contextmanager

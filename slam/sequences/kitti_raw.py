@@ -48,9 +48,8 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
         path = left.folder.parent / "timestamps.txt"
         origin, times = _times(path, faults)
-        if times is None:
-            stamps = left.keys.astype(np.float64) / RATE
-        else:
+        stamps: Array = left.keys / RATE
+        if times is not None:
             keep, stamps = stamped(left.keys, times, path, faults)
             left, right_names = left.select(keep), [right_names[i] for i in keep]
         source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names)

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from tests.fuzz import library, readers, runs, saved, settings
+from tests.fuzz import commands, library, readers, runs, saved, settings
 
-SUBJECTS = (*readers.SUBJECTS, *settings.SUBJECTS, *saved.SUBJECTS, *runs.SUBJECTS, *library.SUBJECTS)
+SUBJECTS = (
+    *readers.SUBJECTS,
+    *settings.SUBJECTS,
+    *saved.SUBJECTS,
+    *commands.SUBJECTS,
+    *runs.SUBJECTS,
+    *library.SUBJECTS,
+)

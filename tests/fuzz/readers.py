@@ -187,8 +187,8 @@ def mutate(rng: np.random.Generator, files: Files) -> None:
             files["x"] = b""
     elif kind == 1:
         stem = choose(rng, (*NUMBERS, "0" * 200 + "7", "9999999999", "9" * 19, "x", "1e3", "١٢"))
-        ending = os.path.splitext(name)[1]
-        files[f"{os.path.dirname(name)}/{stem[:200]}{ending}".lstrip("/")] = files.pop(name)
+        old = Path(name)
+        files[f"{old.parent}/{stem[:200]}{old.suffix}".removeprefix("./")] = files.pop(name)
     elif kind == 2 and name.endswith((".csv", ".txt")):
         files[name] = hostile_truth(rng, files[name].decode("utf-8", "replace")).encode("utf-8", "replace")
     elif name.endswith((".png", ".avi")):

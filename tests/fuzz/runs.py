@@ -149,9 +149,11 @@ def require_whole(folder: Path, out: Path) -> None:
     if any(p.name.endswith(".part") for p in folder.rglob("*")):
         raise Broken("a temporary file is left")
     readers = {
-        out / "summary.json": lambda p: json.loads(p.read_text()), out / "config.json": lambda p: json.loads(p.read_text()),
-        folder / "a.npz": load_recording, folder / "a.map": load_map,
-    }  # fmt: skip
+        out / "summary.json": _json,
+        out / "config.json": _json,
+        folder / "a.npz": load_recording,
+        folder / "a.map": load_map,
+    }
     for path, read in readers.items():
         if path.is_file():
             read(path)
@@ -163,6 +165,10 @@ def require_whole(folder: Path, out: Path) -> None:
         with frames.open(newline="") as file:
             if any(len(row) != len(FRAME_COLUMNS) for row in csv.reader(file)):
                 raise Broken("a row is there in part")
+
+
+def _json(path: Path) -> object:
+    return json.loads(path.read_text())
 
 
 SUBJECTS = (
