@@ -49,7 +49,7 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
             _require_plain(members, len(data))
             return {m.filename: file.read(m) for m in members}
     except _DAMAGED as fault:
-        raise error(f"{source}: cannot be unpacked: {_text(fault)}") from fault
+        raise error(f"{source}: damaged, or no archive of arrays: {_text(fault)}") from fault
 
 
 def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:

@@ -6,7 +6,6 @@ beside their place and moved there: a full disk or a kill leaves the old file or
 
 from __future__ import annotations
 
-import errno
 import os
 import secrets
 import stat
@@ -35,28 +34,24 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
         SlamError: of type `error`, where the file is missing, not a regular file, unreadable or too large.
     """
     try:
-        with os.fdopen(os.open(path, os.O_RDONLY | _not_blocking()), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise error(f"{path}: not a regular file")
-            size = os.fstat(file.fileno()).st_size
-            data = b"" if size > limit else _content(file, size, limit)
+        descriptor = os.open(path, os.O_RDONLY | _not_blocking())
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
     except ValueError as fault:  # a NUL or a lone surrogate in the name
         raise error(f"{path}: no possible file name") from fault
-    if max(size, len(data)) > limit:
-        raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
-    return data
-
-
-def _content(file: BinaryIO, size: int, limit: int) -> bytes:
-    """All that is in a file, up to a little more than `limit`: those of /proc say no size, others may grow."""
-    data = file.read(size + 1)
-    if data is None:
-        raise BlockingIOError(errno.EAGAIN, "nothing to read there")
-    while len(data) > size and len(data) <= limit and (more := file.read(_MEBI)):
-        data += more
-    return data
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise error(f"{path}: not a regular file")
+        if status.st_size > limit:
+            raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
+        # No further than it says: what /proc holds has no size, may have no end, and may be waited for.
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            return file.read(status.st_size) or b""
+    except OSError as fault:
+        raise error(f"{path}: {reason(fault)}") from fault
+    finally:
+        os.close(descriptor)
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] = SequenceError) -> str:

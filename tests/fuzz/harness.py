@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -104,12 +105,15 @@ def limits() -> Iterator[None]:
     handlers = {n: signal.signal(n, _out_of_time) for n in (signal.SIGALRM, signal.SIGPROF)}
     if used:
         resource.setrlimit(resource.RLIMIT_AS, (used + GIGABYTES * 2**30, hard))
-    signal.setitimer(signal.ITIMER_REAL, BLOCKED)
+    # To this very thread: a signal that another thread takes would not end a call that waits.
+    clock = threading.Timer(BLOCKED, signal.pthread_kill, (threading.get_ident(), signal.SIGALRM))
+    clock.daemon = True
+    clock.start()
     signal.setitimer(signal.ITIMER_PROF, 1.2 * SECONDS)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        clock.cancel()
         signal.setitimer(signal.ITIMER_PROF, 0)
         for n, handler in handlers.items():
             signal.signal(n, handler)

@@ -16,12 +16,15 @@ import numpy as np
 
 from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode, load_map
+from slam.objects.config import ObjectsConfig
+from slam.objects.procedure1 import ObjectDatabase
+from slam.run.figures import RunData, read_objects
 from slam.run.recording import load_recording, save_recording
 from slam.run.replay import record
 from slam.run.runner import RunOptions, run_recording
 from slam.system import StereoSlam
 from tests.fuzz.harness import Subject
-from tests.fuzz.hostile import VALUES, broken_bytes, choose
+from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
 from tests.fuzz.settings import scene
 
 Members = dict[str, bytes]
@@ -127,6 +130,49 @@ def read_recording(rng: np.random.Generator, folder: Path) -> None:
     backend = choose(rng, _BACKENDS)
     config = replace(SystemConfig.for_kind(recording.kind, None, backend), models=recording.models)
     run_recording(recording, RunOptions(backend, "recording", config, folder / "out"))
+
+
+def read_database(rng: np.random.Generator, folder: Path) -> None:
+    """A mutated database of an object's features, and a run that looks for the object."""
+    rig, frames = scene()
+    path = folder / "a.npz"
+    ObjectDatabase.of(frames[0], np.arange(len(frames[0])) < 20, rig, np.eye(4)).save(path)
+    data = path.read_bytes()
+    path.write_bytes(broken_bytes(rng, data) if rng.random() < 0.2 else _pack(rng, _mutated(rng, _unpack(data))))
+    config = SystemConfig(objects=ObjectsConfig(mode="procedure1", database=str(path)))
+    system = StereoSlam(rig, None, "ekf", config=config)
+    for features in frames[:3]:
+        system.process_features(features)
+
+
+def read_run(rng: np.random.Generator, folder: Path) -> None:
+    """The files of a run, mutated, as the pictures and the viewer read them."""
+    for name, data in _run_files().items():
+        (folder / name).write_bytes(data)
+    for _ in range(int(rng.integers(1, 3))):
+        path = choose(rng, sorted(folder.iterdir()))
+        kind = int(rng.integers(6))
+        if kind == 0:
+            path.unlink()
+            path.mkdir()
+        elif kind == 1:
+            path.write_bytes(broken_bytes(rng, path.read_bytes() if path.is_file() else b""))
+            continue
+        elif path.is_file():
+            text = path.read_text(errors="replace")
+            path.write_text(broken_text(rng, text), errors="replace")
+    RunData.read(folder, "run")
+    read_objects(folder)
+
+
+@lru_cache(maxsize=1)
+def _run_files() -> Members:
+    """The files of a short run."""
+    out = Path(_temporary())
+    path = out / "a.npz"
+    path.write_bytes(_run()[1])
+    run_recording(load_recording(path), RunOptions("ekf", "recording", SystemConfig(), out / "out"))
+    return {p.name: p.read_bytes() for p in (out / "out").iterdir()}
 
 
 def _unpack(data: bytes) -> Members:
@@ -256,4 +302,8 @@ SUBJECTS = (
             quiet=False, short=25),
     Subject("recordings", "mutated recordings, replayed into both back ends", "a run or one line", read_recording,
             quiet=False, short=50),
+    Subject("databases", "mutated databases of an object's features, and runs that look for it", "a run or one line",
+            read_database, quiet=False, short=25),
+    Subject("run folders", "mutated files of a run, read for pictures and the viewer", "a run or one line", read_run,
+            quiet=False, short=40),
 )  # fmt: skip

@@ -87,7 +87,16 @@ def test_no_more_is_read_than_allowed(tmp_path):
     for device in ("/dev/zero", "/dev/full", "/proc/self/mem"):
         with pytest.raises(SlamError):
             read_bytes(device, 10)
-    assert read_bytes("/proc/self/stat", 100_000)
+    assert read_bytes("/proc/self/stat", 100_000) == b""  # whatever it holds, it says no size
+
+
+def test_nothing_stays_open(tmp_path):
+    before = len(os.listdir("/proc/self/fd"))
+    for path in (tmp_path, "/dev/zero", "/dev/full", tmp_path / "nothing"):
+        for _ in range(5):
+            with pytest.raises(SlamError):
+                read_bytes(path, 10)
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 # --- a folder ---
