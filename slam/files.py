@@ -59,19 +59,22 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] 
     return read_bytes(path, limit, error).decode("utf-8-sig", errors="replace")
 
 
-def require_regular(path: Path, error: type[SlamError] = SequenceError) -> None:
-    """Raise where a path is something else than a regular file.
+def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
+    """Raise where a path, for a library that opens it by itself, is no regular file with something in it.
 
     Raises:
         SlamError: of type `error`.
     """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise error(f"{path}: not a regular file")
+        status = path.stat()
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
     except ValueError as fault:
         raise error(f"{path}: no possible file name") from fault
+    if not stat.S_ISREG(status.st_mode):
+        raise error(f"{path}: not a regular file")
+    if not status.st_size:
+        raise error(f"{path}: the file is empty")
 
 
 def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:

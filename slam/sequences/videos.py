@@ -13,7 +13,7 @@ import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.files import require_regular
+from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import MOST_PIXELS, Size
@@ -93,7 +93,7 @@ def open_video(path: Path) -> Iterator[Any]:
     """
     import cv2
 
-    require_regular(path)  # a pipe would be waited for
+    require_content(path)  # a pipe would be waited for
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
     with quiet_libraries():
         capture = cv2.VideoCapture(str(path))

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -84,19 +85,19 @@ def test_no_more_is_read_than_allowed(tmp_path):
     assert len(read_bytes(tmp_path / "a", 11)) == 11
     with pytest.raises(SlamError, match="larger than"):
         read_bytes(tmp_path / "a", 10)
-    for device in ("/dev/zero", "/dev/full", "/proc/self/mem"):
+    for device in ("/dev/zero", "/dev/full"):
         with pytest.raises(SlamError):
             read_bytes(device, 10)
     assert read_bytes("/proc/self/stat", 100_000) == b""  # whatever it holds, it says no size
 
 
 def test_nothing_stays_open(tmp_path):
-    before = len(os.listdir("/proc/self/fd"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
     for path in (tmp_path, "/dev/zero", "/dev/full", tmp_path / "nothing"):
         for _ in range(5):
             with pytest.raises(SlamError):
                 read_bytes(path, 10)
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 # --- a folder ---

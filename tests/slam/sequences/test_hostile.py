@@ -132,9 +132,13 @@ def test_what_is_no_regular_file_is_never_waited_for(kitti, name, what):
     assert time.monotonic() - started < 20
 
 
-def test_a_pipe_in_place_of_a_video(two_folders):
+@pytest.mark.parametrize("what", ["pipe", "/dev/zero", "/proc/self/status"])
+def test_a_pipe_in_place_of_a_video(two_folders, what):
     for side in ("left", "right"):
-        os.mkfifo(two_folders / f"{side}.avi")
+        if what == "pipe":
+            os.mkfifo(two_folders / f"{side}.avi")
+        else:
+            (two_folders / f"{side}.avi").symlink_to(what)
     refused(f"{two_folders}?left=left.avi&right=right.avi", SequenceError)
 
 
