@@ -6,10 +6,11 @@ import os
 import re
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 _STDERR = 2
+_SILENT = 0  # OpenCV's log level
 
 #: How lines of libpng, libjpeg, libtiff, OpenCV and ffmpeg begin; other lines, of other threads, are passed on.
 _LIBRARIES = re.compile(
@@ -31,16 +32,24 @@ def quiet_libraries() -> Iterator[None]:
     They write to descriptor 2 itself, which all threads share: whoever comes first turns it aside, whoever leaves last
     turns it back, and lines that are not the libraries' are printed then.
     """
-    from cv2.utils import logging
-
-    level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    get, set_ = _log_level()
+    level = get()
+    set_(_SILENT)
     _enter()
     try:
         yield
     finally:
         _leave()
-        logging.setLogLevel(level)
+        set_(level)
+
+
+def _log_level() -> tuple[Callable[[], int], Callable[[int], int]]:
+    """What asks for and what sets OpenCV's log level: the place differs between its versions."""
+    import cv2
+
+    if hasattr(cv2, "setLogLevel"):
+        return cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined, unused-ignore]
+    return cv2.utils.logging.getLogLevel, cv2.utils.logging.setLogLevel
 
 
 def _enter() -> None:
