@@ -68,8 +68,9 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
     text = "positive and finite" if positive else "finite and not negative"
     if not (whole or np.isfinite(number)) or number < 0 or (positive and number == 0):
         return text
-    least, most = limits or (LEAST if positive and not whole else 0, _COUNTS if whole else MOST)
-    return "" if least <= number <= most else f"{text}, from {least:g} to {most:g}"
+    least, most = limits or (0 if whole else LEAST, _COUNTS if whole else MOST)
+    zero = number == 0 and limits is None and not positive
+    return "" if zero or least <= number <= most else f"{text}, from {least:g} to {most:g}"
 
 
 @lru_cache(maxsize=64)

@@ -25,6 +25,9 @@ _RANGES = (
     "1:2:3", "9" * 5000 + ":", "٣:", "0.5:", " 0 : 1 ",
 )  # fmt: skip
 
+#: Paths that lead nowhere outside of the folder that a case works in.
+_RELATIVE = tuple(path for path in PATHS if not path.startswith(("/", "~", "..")))
+
 
 def command(rng: np.random.Generator, folder: Path) -> None:
     """One command line."""
@@ -54,26 +57,24 @@ def _arguments(rng: np.random.Generator, folder: Path) -> list[str]:
     name = choose(rng, ("run", "run", "run", "run", "replay", "render", "view", "nothing"))
     out = str(folder / "out")
     if name == "replay":
-        return ["replay", choose(rng, (sequence, "/dev/null", *PATHS)), "--out", out, "--quiet"]
+        return ["replay", choose(rng, (sequence, *PATHS)), "--out", out, "--quiet"]
     if name == "view":
         return ["view", choose(rng, (out, *PATHS)), "--to", str(folder / "a.rrd")]
     if name == "nothing":
         return [choose(rng, (*PATHS, "--x", "list"))]
-    values: dict[str, Any] = {"--frames": (*_RANGES,), "--out": (out, *PATHS[5:])}
+    values: dict[str, Any] = {"--frames": (*_RANGES,), "--out": (out, *_RELATIVE)}
     if name == "run":
-        paths = (*PATHS, "/dev/full", "/dev/null", str(folder), str(folder / ("x" * 250)))
+        (folder / "device").symlink_to("/dev/full")  # never a device itself: a fault would replace it
+        paths = (*_RELATIVE, str(folder / "device"), str(folder), str(folder / ("x" * 250)))
         key = choose(rng, ("map.grid", "models.pixel_sigma", "frontend.features", "backend.iterations"))
         values |= dict.fromkeys(("--record", "--save-map", "--map"), paths)
         values |= dict.fromkeys(("--kind", "--format"), PATHS)
         values |= {"--backend": (*PATHS, "ekf", "smoother"), "--frontend": (*PATHS, "surf")}
-        values |= {"--draw": ("/dev/full", "a\0b", "/proc/x", "x" * 300)}
+        values |= {"--draw": (str(folder / "device"), "a\0b", "/proc/x", "x" * 300)}
         values |= {"--set": tuple(f"{key}={text}" for text in _TEXTS)}
     chosen = {choose(rng, list(values)) for _ in range(int(rng.integers(1, 3)))}
     options = [part for key in sorted(chosen - {"--out"}) for part in (key, choose(rng, values[key]))]
     place = choose(rng, values["--out"]) if "--out" in chosen else out
-    place = (
-        place if place.startswith(("/proc", "/dev/", str(folder))) or "\0" in place else str(folder / place.strip("/~"))
-    )
     sequence = choose(rng, PATHS) if rng.random() < 0.1 else sequence
     return [name, sequence, "--out", place, "--quiet", *options]
 

@@ -152,13 +152,14 @@ def read_run(rng: np.random.Generator, folder: Path) -> None:
     for _ in range(int(rng.integers(1, 3))):
         path = choose(rng, sorted(folder.iterdir()))
         kind = int(rng.integers(6))
+        if path.is_dir():
+            continue
         if kind == 0:
             path.unlink()
             path.mkdir()
         elif kind == 1:
-            path.write_bytes(broken_bytes(rng, path.read_bytes() if path.is_file() else b""))
-            continue
-        elif path.is_file():
+            path.write_bytes(broken_bytes(rng, path.read_bytes()))
+        else:
             text = path.read_text(errors="replace")
             path.write_text(broken_text(rng, text), errors="replace")
     RunData.read(folder, "run")
