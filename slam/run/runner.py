@@ -183,13 +183,13 @@ def _drive(
     tape: list[RecordedFrame] = []
     score = score_for(sequence)
     last = LastFiles()
-    ended = "completed"
+    ended, stopped_by = "completed", None
     with RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
         try:
             for number, result in results:
-                files.write_frame(number, result)
                 record.add(number, result)
+                files.write_frame(number, result)
                 if score is not None:
                     score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
@@ -197,7 +197,7 @@ def _drive(
                 if on_frame is not None:
                     on_frame(result)
         except BaseException as error:
-            ended = f"stopped: {one_line(str(error)) or type(error).__name__}"
+            ended, stopped_by = f"stopped: {one_line(str(error)) or type(error).__name__}", error
             raise
         finally:
             summary = _finish(sequence, options, system, record, files, ended, score, last)
@@ -206,7 +206,7 @@ def _drive(
                 summary["failures"] = last.lines
                 with last.each():
                     files.write_json("summary.json", summary)
-            last.report(raising=ended == "completed")
+            last.report(stopped_by)
     return summary
 
 
@@ -370,22 +370,25 @@ class LastFiles:
         """What failed, a line each."""
         return [one_line(f"{error}") or type(error).__name__ for error in self.failures]
 
-    def report(self, raising: bool) -> None:
-        """Raise what failed; where another error is on its way already, warn instead.
+    def report(self, stopped_by: BaseException | None) -> None:
+        """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
 
         Raises:
             SlamError: a file could not be written.
             Exception: a defect of the program, as it is.
         """
-        if not raising:
-            for line in self.lines:
+        if not self.failures:
+            return
+        if stopped_by is not None and not isinstance(stopped_by, SlamError):
+            for line in dict.fromkeys(self.lines):
                 logger.warning("%s", line)
             return
         for error in self.failures:
             if not isinstance(error, SlamError):
                 raise error
-        if self.failures:
-            raise SlamError("; ".join(dict.fromkeys(self.lines)))
+        first = [] if stopped_by is None else [str(stopped_by)]
+        kind = SlamError if stopped_by is None else type(stopped_by)
+        raise kind("; ".join(dict.fromkeys([*first, *self.lines]))) from stopped_by
 
 
 def _rate(record: RunRecord) -> float | None:

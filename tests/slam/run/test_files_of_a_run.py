@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import stat
 import subprocess
@@ -135,6 +136,26 @@ def test_a_full_disk_is_one_line_and_what_is_there_is_whole(tmp_path, bytes_, ba
         run(tmp_path, backend, record=tmp_path / "a.npz", save_map=tmp_path / "a.map")
     assert "\n" not in str(caught.value)
     require_whole(tmp_path, tmp_path / "out")
+
+
+def test_a_disk_that_fills_up_half_way(tmp_path):
+    """Rows before are there, the small last files too, and what failed stands in one line."""
+    out = tmp_path / "out"
+
+    def fill(frame, result, system):
+        if frame.index == 3:  # frames.csv can grow no more
+            hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+            resource.setrlimit(resource.RLIMIT_FSIZE, ((out / "frames.csv").stat().st_size + 10, hard))
+
+    options = RunOptions("ekf", "none", SystemConfig(), out)
+    words = r"out: File too large; .*summary\.json: cannot be written: File too large$"
+    with pytest.raises(SlamError, match=words) as caught, disk_of(10**6):
+        runner.run(Scripted(None, 0), options, frontend=_Frontend(), watches=[fill])
+    assert "\n" not in str(caught.value)
+    assert (out / "trajectory.txt").read_text().count("\n") == 4
+    assert (out / "frames.csv").read_text().count("\n") == 5
+    assert (out / "landmarks.csv").read_text().count("\n") > 1
+    assert not (out / "summary.json").exists()
 
 
 @pytest.mark.parametrize("bad", [*LAST, "a.npz", "a.map"])
