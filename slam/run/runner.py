@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,13 +24,12 @@ from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.run.last_files import LastFiles
 from slam.run.outputs import STAGES, RunFiles
 from slam.run.recording import save_recording
 from slam.run.replay import RecordedFrame, Recording, replay
 from slam.sequences import Sequence
 from slam.system import StereoSlam
-
-logger = logging.getLogger("slam.run")
 
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
@@ -349,46 +346,6 @@ def _results(
     if score is not None:
         found["objects"] = score.summary()
     return {**found, "milliseconds": _timings(record), "frames_per_second": _rate(record)}
-
-
-class LastFiles:
-    """Does each of the last things although another one fails, and says in the end which did."""
-
-    def __init__(self) -> None:
-        self.failures: list[Exception] = []
-
-    @contextmanager
-    def each(self) -> Iterator[None]:
-        """One of them."""
-        try:
-            yield
-        except Exception as error:  # noqa: BLE001 `report` raises it
-            self.failures.append(error)
-
-    @property
-    def lines(self) -> list[str]:
-        """What failed, a line each."""
-        return [one_line(f"{error}") or type(error).__name__ for error in self.failures]
-
-    def report(self, stopped_by: BaseException | None) -> None:
-        """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
-
-        Raises:
-            SlamError: a file could not be written.
-            Exception: a defect of the program, as it is.
-        """
-        if not self.failures:
-            return
-        if stopped_by is not None and not isinstance(stopped_by, SlamError):
-            for line in dict.fromkeys(self.lines):
-                logger.warning("%s", line)
-            return
-        for error in self.failures:
-            if not isinstance(error, SlamError):
-                raise error
-        first = [] if stopped_by is None else [str(stopped_by)]
-        kind = SlamError if stopped_by is None else type(stopped_by)
-        raise kind("; ".join(dict.fromkeys([*first, *self.lines]))) from stopped_by
 
 
 def _rate(record: RunRecord) -> float | None:
