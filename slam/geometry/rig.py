@@ -182,6 +182,7 @@ class StereoRig:
         _, J = self.project_stereo(points)
         out = np.full((len(points), 3, 3), np.nan)
         good = np.isfinite(J).all(axis=(1, 2))
+        good[good] = np.linalg.det(J[good]) != 0  # of points so far away that nothing tells their depth: NaN
         inverse = np.linalg.inv(J[good]) * np.broadcast_to(sigma, (3,))
         out[good] = inverse @ np.swapaxes(inverse, 1, 2)
         return out
