@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
+from slam.files import read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 
@@ -46,7 +49,18 @@ class RunData:
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
-        """Read the files of a finished run."""
+        """Read the files of a finished run.
+
+        Raises:
+            SlamError: the folder does not hold a finished run.
+        """
+        try:
+            return cls._read(folder, name)
+        except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:
+            raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
+
+    @classmethod
+    def _read(cls, folder: Path, name: str) -> RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
@@ -63,8 +77,20 @@ class RunData:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
+
+
+def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
+    """Stamp [s], id and position [m] of every row of objects.csv.
+
+    Raises:
+        SlamError: the file is missing or damaged.
+    """
+    path = folder / "objects.csv"
+    try:
+        return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
+        raise SlamError(f"{path}: no list of objects: {error}") from error
 
 
 def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
