@@ -19,8 +19,8 @@ from slam.geometry.se3 import Array
 #: and tangential distortion.
 LENS = ("cx", "cy", "f", "aspect", "k1", "k2", "p1", "p2")
 
-#: How the right camera stands to the left: rotation about its x, y and z axis; the direction of the baseline, down and
-#: forward.
+#: How the right camera stands to the left: the rotation about its x, y and z axis that makes it parallel; the
+#: direction of the baseline from left to right, down and forward for each unit along the rows.
 POSE = ("pitch", "yaw", "roll", "down", "forward")
 
 _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "rad", "roll": "rad"}
@@ -95,7 +95,7 @@ class RigModel:
         """`field` without the rotation."""
         x, y, d = points.T / self.focal
         left, right = _lens(x, y), _lens(x - d, y)
-        turn = np.stack([(x - d) * y, 1 + (x - d) ** 2, -y], axis=1)
+        turn = np.stack([-(x - d) * y, 1 + (x - d) ** 2, -y], axis=1)
         none = np.zeros((len(points), len(LENS) + len(POSE)))
         along_d = [left[0], -right[0], -turn, 0 * x[:, None], (d * (x - d))[:, None]]
         rows = [[left[0], none], [left[1], none], along_d]
@@ -109,7 +109,7 @@ class RigModel:
         """
         x, y, d = points.T / self.focal
         left, right = _lens(x, y)[1], _lens(x - d, y)[1]
-        turn = np.stack([1 + y**2, (x - d) * y, x - d], axis=1)
+        turn = np.stack([-1 - y**2, (x - d) * y, x - d], axis=1)
         return np.asarray(self.focal * np.concatenate([-left, right, turn, d[:, None], (-d * y)[:, None]], axis=1))
 
     def residual_field(self, points: Array) -> Array:

@@ -247,7 +247,7 @@ def test_right_pixels_are_mended_afterwards(options):
     known: list[set[int]] = [set(), set(), set()]
     for k, (stamp, _, seen) in enumerate(data):
         if k == 14:
-            mended.shift_right(0.8)
+            mended.revise(lambda z: z + [0.0, 0.0, 0.8])
         early = off_by(seen, -0.8) if k < 14 else seen
         for backend, ids, given in zip((right, mended, spoilt), known, (seen, early, early)):
             step(backend, stamp, given, ids)
@@ -265,11 +265,12 @@ def test_right_pixels_are_mended_afterwards(options):
 
 def test_mending_needs_nothing_to_mend():
     backend = SmootherBackend(RIG, MODELS)
-    backend.shift_right(0.1)
+    backend.revise(lambda z: z)
     backend.predict(0.0)
-    backend.shift_right(0.1)
+    backend.revise(lambda z: z)
+    backend.add(next(iter(drive(2)))[2])
     with pytest.raises(MeasurementError, match="finite"):
-        backend.shift_right(np.nan)
+        backend.revise(lambda z: z + np.nan)
 
 
 def test_no_two_landmarks_share_a_variable(monkeypatch):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import slam
+from slam.calibration.posterior import Solution
 from slam.data import FrameStatus, Observations
 from slam.errors import MeasurementError, SequenceError
 from slam.geometry.trajectory import Trajectory
@@ -53,22 +54,30 @@ def test_a_run_replayed_into_the_same_back_end_is_the_same_run(desk):
 
 
 def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkeypatch):
-    offsets = {8: 0.3, 11: 0.2}  # what the self-calibration believes from a frame on
+    offsets = {8: 0.3, 11: 0.2}  # what the self-calibration believes from a frame on [px]
     system = StereoSlam(desk.rig, None, "smoother")
-    results = []
+    calibration, results = system.calibration, []
+    monkeypatch.setattr(calibration, "observe", lambda *_: None)
+    column = calibration.model.names.index("right_cx")
     for k in range(FRAMES):
-        system.calibration._mean = offsets.get(k, system.calibration._mean)
-        system.calibration._information = 1e4
+        if k in offsets:
+            mean, tight = np.zeros(len(calibration.model.names)), 1e-9 * np.eye(len(calibration.model.names))
+            mean[column] = offsets[k] / calibration.model.focal
+            calibration._solution = Solution(mean, tight, tight)
         results.append(system.process_features(desk.observations(k)))
-    shifts = [r.shift for r in results]
-    assert np.flatnonzero(shifts).tolist() == [8, 11]
-    assert sum(shifts) == pytest.approx(system.calibration.applied)
+    revisions = [r.revision for r in results]
+    assert [k for k, r in enumerate(revisions) if r is not None] == [8, 11]
     save_recording(record(results, desk.rig, system.config.models), tmp_path / "run.npz")
     recorded = load_recording(tmp_path / "run.npz")
     backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
-    monkeypatch.setattr(backend, "shift_right", lambda shift: given.append((len(backend.records.path.stamps), shift)))
-    assert [r.shift for r in replay(recorded, backend)] == shifts
-    assert given == [(8, shifts[8]), (11, shifts[11])]
+    z = np.array([[200.0, 100.0, 180.0]])
+    monkeypatch.setattr(backend, "revise", lambda mend: given.append((len(backend.records.path.stamps), mend(z))))
+    again = [r.revision for r in replay(recorded, backend)]
+    assert [k for k, _ in given] == [8, 11]
+    for k, mended in given:
+        np.testing.assert_array_equal(mended, revisions[k].rows(z))
+        np.testing.assert_array_equal(again[k].after.parameters, revisions[k].after.parameters)
+    assert given[0][1][0, 2] == pytest.approx(180.3, abs=0.02)
     assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
 
 

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from slam.calibration import RigPosterior
+from slam.calibration.evidence import Accumulator, Evidence
+from slam.calibration.posterior import solve
+from slam.errors import CalibrationError
+
+
+def evidence(value, sigma, cross=0.0):
+    return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.array([[cross]]))
+
+
+def test_json_and_back():
+    posterior = RigPosterior(("yaw", "roll"), ("rad", "rad"), np.array([1e-3, 2e-3]), np.diag([1e-6, 4e-6]))
+    again = RigPosterior.from_json(json.loads(json.dumps(posterior.to_json())))
+    assert (again.names, again.units) == (posterior.names, posterior.units)
+    np.testing.assert_array_equal(again.mean, posterior.mean)
+    np.testing.assert_array_equal(again.covariance, posterior.covariance)
+    assert posterior.marginal([1]).names == ("roll",) and posterior.marginal([1]).sigma[0] == pytest.approx(2e-3)
+
+
+@pytest.mark.parametrize(
+    "tree", [{}, {"parameters": 3}, {"parameters": [{"name": "yaw", "unit": "rad", "mean": "x"}], "covariance": []}]
+)
+def test_what_is_no_posterior_is_refused(tree):
+    with pytest.raises(CalibrationError, match="calibration"):
+        RigPosterior.from_json(tree)
+
+
+def test_shapes_and_values_are_checked():
+    with pytest.raises(CalibrationError, match="length"):
+        RigPosterior(("yaw",), ("rad",), np.zeros(2), np.eye(2))
+    with pytest.raises(CalibrationError, match="finite"):
+        RigPosterior(("yaw",), ("rad",), np.zeros(1), np.array([[np.nan]]))
+
+
+def test_a_calibration_that_nothing_speaks_against_is_left_alone():
+    prior = np.eye(1)
+    near = solve(prior, 0.0, [evidence(0.1, 0.1)])
+    assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
+    clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
+    assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
+    plain, wide = (solve(np.eye(1), 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0))
+    assert plain.mean == wide.mean and plain.inner == wide.inner
+    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + 0.25**2, rel=0.1)  # 0.5 · 50 / 100
+
+
+@pytest.mark.parametrize("length", [1, 4, 10])
+def test_errors_that_last_are_counted_as_such(length):
+    """Each error is shared by so many neighbours: the variance of the mean is so many times as large."""
+    rng = np.random.default_rng(0)
+    z = []
+    for _ in range(60):
+        errors = np.repeat(rng.standard_normal(400 // length), length)
+        sums = Accumulator(1.0, 4)
+        for x in errors:
+            sums.add(evidence(x, 1.0))
+        for _ in range(5):
+            solution = solve(np.array([[1e-6]]), 0.0, sums.total())
+            sums.judge(solution.mean, solution.inner)
+        z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
+    # Half a block and less is counted in full; the prior on the inflation holds a part back.
+    assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9
