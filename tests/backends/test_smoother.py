@@ -247,7 +247,7 @@ def test_right_pixels_are_mended_afterwards(options):
     known: list[set[int]] = [set(), set(), set()]
     for k, (stamp, _, seen) in enumerate(data):
         if k == 14:
-            mended.revise(lambda z: z + [0.0, 0.0, 0.8])
+            mended.revise(lambda z: z + np.array([0.0, 0.0, 0.8]))
         early = off_by(seen, -0.8) if k < 14 else seen
         for backend, ids, given in zip((right, mended, spoilt), known, (seen, early, early)):
             step(backend, stamp, given, ids)

@@ -166,7 +166,7 @@ def reordered(ids):
 
 FAULTS = {
     "another format": (lambda a: {**a, "format": "something"}, "is no recording"),
-    "a later version": (lambda a: {**a, "version": 2}, "version 2"),
+    "a later version": (lambda a: {**a, "version": 3}, "version 3"),
     "a missing array": (lambda a: {k: v for k, v in a.items() if k != "stamps"}, "lacks 'stamps'"),
     "time runs back": (lambda a: {**a, "stamps": a["stamps"][::-1]}, "stamps must be finite and increase"),
     "pixels of another length": (lambda a: {**a, "observed_uv_left": a["observed_uv_left"][1:]}, "differ in length"),
