@@ -12,7 +12,7 @@ from slam.calibration.evidence import Accumulator, Evidence
 from slam.calibration.model import RigModel
 from slam.calibration.motion import pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, solve
-from slam.calibration.prior import prior_information, residual_variance, systematic_variance
+from slam.calibration.prior import offset_sigma, prior_information, residual_variance, systematic_variance
 from slam.calibration.rows import row_evidence
 from slam.calibration.views import View, match, pair_of
 from slam.data import StereoFeatures
@@ -151,4 +151,4 @@ class SelfCalibration:
         evidence = self._rows.total() + self._motion.total()
         if self._open is not None:
             evidence.append(self._open.scaled(1 / self._motion.inflation))
-        self._solution = solve(self._prior, residual_variance(), evidence)
+        self._solution = solve(self._prior, offset_sigma(self.model), residual_variance(), evidence)

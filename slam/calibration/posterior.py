@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
 #: Scales of the prior that are weighed against each other, from a calibration without errors to one as bad as the
-#: prior allows; equally probable beforehand.
+#: prior allows, and the same for an offset of the disparity alone; all equally probable beforehand.
 _SCALES = (0.02, 0.1, 0.3, 1.0)
+_OFFSETS = (0.03, 0.3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -92,24 +94,27 @@ class Solution:
     covariance: Array
 
 
-def solve(prior: Array, residual: float, evidence: Sequence[Evidence]) -> Solution:
+def solve(prior: Array, offset: Array, residual: float, evidence: Sequence[Evidence]) -> Solution:
     """Posterior, averaged over how large a calibration's errors are.
 
-    The prior `N(0, s² prior⁻¹)` has a scale s that is not known. The scales' probabilities follow from the evidence
-    (the marginal likelihood), so a calibration that nothing speaks against is left as it is, instead of following the
-    noise.
+    The prior `N(0, s² prior⁻¹ + t² offset offsetᵀ)` has scales s and t that are not known: how good the calibration
+    was, and by how much the cameras have turned since. The scales' probabilities follow from the evidence (the
+    marginal likelihood), so a calibration that nothing speaks against is left as it is, instead of following the noise.
 
     Args:
         prior: its information (n, n) at the scale 1.
+        offset: standard deviation of the parameters by an offset of the disparity (n,).
         residual: variance of the residual fields' coefficients.
         evidence: of the data.
     """
     whole = evidence[0]
     for more in evidence[1:]:
         whole += more
-    logs, means, covariances = [], [], []
-    for scale in _SCALES:
-        information = prior / scale**2
+    logs, means, covariances, scales = [], [], [], []
+    spread, drift = np.linalg.inv(prior), np.outer(offset, offset)
+    for scale, turned in product(_SCALES, _OFFSETS):
+        information = np.linalg.inv(scale**2 * spread + turned**2 * drift)
+        scales.append(scale)
         total = information + whole.S
         covariance = np.linalg.inv(total)
         mean = covariance @ whole.e
@@ -120,5 +125,5 @@ def solve(prior: Array, residual: float, evidence: Sequence[Evidence]) -> Soluti
     weights /= weights.sum()
     mean = np.asarray(sum(w * m for w, m in zip(weights, means)))
     inner = np.asarray(sum(w * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covariances)))
-    moved = sum(w * scale * C for w, scale, C in zip(weights, _SCALES, covariances)) @ whole.cross
+    moved = sum(w * scale * C for w, scale, C in zip(weights, scales, covariances)) @ whole.cross
     return Solution(mean, inner, inner + residual * moved @ moved.T)

@@ -22,9 +22,13 @@ SIGMAS = {
 _RESIDUAL = 2e-4
 
 #: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
-#: [focal lengths]. Cameras that are knocked or warmed up turn by less than a milliradian.
+#: [focal lengths].
 MEAN_DISPARITY = 7e-4
 MEAN_VERTICAL = 1.4e-3
+
+#: Cameras that are knocked or warmed up turn by less than a milliradian, with the best calibration: an offset of all
+#: disparities [focal lengths].
+OFFSET = 7e-4
 
 #: And it does not leave more than about a pixel of a camera with a focal length of 700 px anywhere: its reprojection
 #: errors would show it. Root mean square over the image of what disparities and rows of far points are off by [focal
@@ -46,6 +50,11 @@ def prior_information(model: RigModel) -> Array:
         information += np.outer(mean, mean) / sigma**2
         information += change.T @ change * (_FREEDOM / (len(far) * FIELD**2))
     return np.asarray(information)
+
+
+def offset_sigma(model: RigModel) -> Array:
+    """Standard deviation of the parameters (n,) by an offset of all disparities."""
+    return np.array([OFFSET if name == "right_cx" else 0.0 for name in model.names])
 
 
 def residual_variance() -> float:

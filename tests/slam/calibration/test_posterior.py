@@ -10,6 +10,8 @@ from slam.calibration.evidence import Accumulator, Evidence
 from slam.calibration.posterior import solve
 from slam.errors import CalibrationError
 
+NONE = np.zeros(1)
+
 
 def evidence(value, sigma, cross=0.0):
     return Evidence(np.array([[sigma**-2]]), np.array([value / sigma**2]), np.array([[cross]]))
@@ -41,14 +43,14 @@ def test_shapes_and_values_are_checked():
 
 def test_a_calibration_that_nothing_speaks_against_is_left_alone():
     prior = np.eye(1)
-    near = solve(prior, 0.0, [evidence(0.1, 0.1)])
+    near = solve(prior, NONE, 0.0, [evidence(0.1, 0.1)])
     assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
-    clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
+    clear = solve(prior, NONE, 0.0, [evidence(0.1, 0.01)])
     assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
 
 
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
-    plain, wide = (solve(np.eye(1), 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0))
+    plain, wide = (solve(np.eye(1), NONE, 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0))
     assert plain.mean == wide.mean and plain.inner == wide.inner
     assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + 0.25**2, rel=0.1)  # 0.5 · 50 / 100
 
@@ -64,7 +66,7 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(np.array([[1e-6]]), 0.0, sums.total())
+            solution = solve(np.array([[1e-6]]), NONE, 0.0, sums.total())
             sums.judge(solution.mean, solution.inner)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
