@@ -16,6 +16,7 @@ from slam.geometry.se3 import Array, inverse
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
+_LOOSE = np.array([1.0, 1.0, 2.0])  # of uR, predicted from the first view's disparity, more is allowed
 _HYPOTHESES = 100
 
 
@@ -90,17 +91,17 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed:
     a, b = match(first, second)
     one, two = first.points[a], second.points[b]
     ideal = [p + model.field(p) @ parameters for p in (one, two)]
-    T = inverse(second.T_world_left) @ first.T_world_left
+    T: Array = inverse(second.T_world_left) @ first.T_world_left
     near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
     rig = model.rig.rectified.rig
     if near.sum() >= 3:
         before, after = (model.rows(p[near]) for p in ideal)
         local = rig.triangulate(before[:, :2], before[:, [2, 1]])
         found = find_consensus(rig, local, after, inverse(T), _AGREES, _HYPOTHESES, seed)
-        T = inverse(found.T_world_left)
+        T = np.asarray(inverse(found.T_world_left))
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.abs(move(ideal[0], R, t, model.focal)[0] - ideal[1])
-    error[:, 2] += 0 * error[:, 0]
-    agree = (error[:, :2] <= _AGREES).all(axis=1) & (np.abs(error[:, 0] - error[:, 2]) <= 2 * _AGREES)
+        error = move(ideal[0], R, t, model.focal)[0] - ideal[1]
+    every = np.column_stack([error[:, :2], error[:, 0] - error[:, 2]])  # of uL, vL and uR
+    agree = (np.abs(every) <= _AGREES * _LOOSE).all(axis=1)
     return Pair(one[agree], two[agree], R, t)
