@@ -16,7 +16,7 @@ from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
 from tests.slam.scene import RIG, Cloud, path
 
-#: A turn of the right camera as the issue of a knock; the offsets of paths that come out too long or too short.
+#: A turn of the right camera after a knock [rad].
 TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
 
 
