@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from slam.checks import LATEST_STAMP
 from slam.data import (
     FrameResult,
     FrameStatus,
@@ -35,7 +36,6 @@ from slam.tracking.association import AssociationConfig
 
 _FARTHEST = 1e7  # pixel
 _MOST_ID = 2**53
-_LATEST = 1e12  # stamp [s], either side of zero
 _TRACKED = 3  # stereo points that fix a pose
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
@@ -151,8 +151,8 @@ class Recording:
         count = len(self.stamps)
         if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
-        if count and np.abs(self.stamps).max() > _LATEST:
-            raise MeasurementError(f"recording: a stamp is beyond {_LATEST:g} s")
+        if count and np.abs(self.stamps).max() > LATEST_STAMP:
+            raise MeasurementError(f"recording: a stamp is beyond {LATEST_STAMP:g} s")
         if self.shift is not None and (self.shift.shape != (count,) or not np.isfinite(self.shift).all()):
             raise MeasurementError("recording: shift must be finite, with a value for each stamp")
         if self.removed.shape != self.removed_frame.shape:

@@ -66,7 +66,9 @@ def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkey
     save_recording(record(results, desk.rig, system.config.models), tmp_path / "run.npz")
     recorded = load_recording(tmp_path / "run.npz")
     backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
-    monkeypatch.setattr(backend, "shift_right", lambda shift: given.append((len(backend.records.path.stamps), shift)))
+    monkeypatch.setattr(
+        backend, "shift_right", lambda shift: given.append((len(backend.measurement_log.path.stamps), shift))
+    )
     assert [r.shift for r in replay(recorded, backend)] == shifts
     assert given == [(8, shifts[8]), (11, shifts[11])]
     assert len(list(replay(recorded, StereoSlam(desk.rig, None, "ekf").backend))) == FRAMES
