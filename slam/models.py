@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
+from slam.naming import unknown
 from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
@@ -133,4 +134,4 @@ def models_for(kind: str) -> EstimatorModels:
     try:
         return KINDS[kind]
     except KeyError:
-        raise ConfigurationError(f"unknown kind of motion {kind!r}; known: {', '.join(KINDS)}") from None
+        raise ConfigurationError(unknown("kind of motion", kind, KINDS)) from None

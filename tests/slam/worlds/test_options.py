@@ -20,7 +20,9 @@ def test_an_unknown_world_is_answered_with_the_known_ones():
 
 
 def test_an_unknown_key_is_answered_with_the_known_ones():
-    with pytest.raises(ConfigurationError, match=r"world 'aisle' has no option 'sead'; known: bare, .*seed"):
+    with pytest.raises(
+        ConfigurationError, match=r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: bare, .*seed"
+    ):
         worlds.open_world("aisle?sead=3")
 
 
