@@ -64,9 +64,11 @@ class EstimatorModels:
         motion: the motion model.
         pixel_sigma: standard deviation of uL, vL and uR [px].
         gate_probability: an observation is rejected where its innovation lies outside this quantile of χ².
-        initial_position_sigma, initial_rotation_sigma: of the first pose [m], [rad]; tiny where it defines the world.
-        initial_velocity_sigma, initial_angular_velocity_sigma: of the first velocities [m/s], [rad/s].
-        T_world_left: first pose (4, 4); None for the identity.
+        initial_position_sigma, initial_rotation_sigma: standard deviations of the first pose [m], [rad]; tiny where it
+            defines the world.
+        initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of the first velocities [m/s],
+            [rad/s].
+        T_world_left: first pose (4, 4) of the left camera; null (in Python None) for the identity.
         objects: how moving bodies move.
     """
 

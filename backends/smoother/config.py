@@ -21,7 +21,7 @@ class SmootherConfig:
         relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately: in
             every tenth frame; ten times as much in the others, next to nothing when the whole path or map is asked for.
         window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
-        lag: poses that stay variables; None for all.
+        lag: poses that stay variables; null (in Python None) for all.
 
     Raises:
         ConfigurationError: a value is out of its range.

@@ -59,7 +59,7 @@ class Progress:
         self._bar.start()
         task = self._bar.tasks[0]
         rate = f"{task.speed:.1f} Hz" if task.speed else ""
-        status = f"{result.status.value}, {len(result.report.used)} of {result.map_size} landmarks"
+        status = f"{result.status.value} {len(result.report.used)} of {result.map_size}"  # landmarks; 80 columns
         self._bar.update(self._task, advance=1, rate=rate, status=status)
 
 

@@ -19,24 +19,9 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.landmarks import LandmarkRows
 from slam.object_data import MovingObject
+from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
 
-#: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
-STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage")
-
-FRAME_COLUMNS = (
-    "frame", "stamp", "status", "reason", "features", "stereo", "predicted", "matched", "used", "rejected",
-    "added", "erased", "map_size", "D_threshold", "nis", "nis_dof",
-    "sd_x", "sd_y", "sd_z", "sd_rotation", *(f"ms_{stage}" for stage in STAGES),
-)  # fmt: skip
-
-LANDMARK_COLUMNS = ("id", "x", "y", "z", "cxx", "cxy", "cxz", "cyy", "cyz", "czz", "seen", "last_seen")
-
-#: One row per frame and moving object.
-OBJECT_COLUMNS = (
-    "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
-    "motion_x", "motion_y", "motion_z", "motion_roll", "motion_pitch", "motion_yaw",
-    *(f"c{i}{j}" for i in range(6) for j in range(i, 6)),
-)  # fmt: skip
+FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 
 
 class RunFiles:
@@ -53,7 +38,7 @@ class RunFiles:
         self.folder = folder
         with self._writing():
             folder.mkdir(parents=True, exist_ok=True)
-            for stale in ("trajectory_final.txt", "landmarks.csv", "summary.json"):
+            for stale in ("trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png"):
                 (folder / stale).unlink(missing_ok=True)
             self._trajectory = self._open("trajectory.txt")
             self._frames = self._open("frames.csv")
@@ -103,7 +88,7 @@ class RunFiles:
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         self._frame_rows.writerow(row)
-        self._object_rows.writerows(_object_row(thing) for thing in result.objects)
+        self._object_rows.writerows(_object_row(number, thing) for thing in result.objects)
         for file in (self._trajectory, self._frames, self._objects):
             file.flush()
 
@@ -126,6 +111,11 @@ class RunFiles:
                 last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
                 rows.writerow([int(i), *values, int(landmarks.seen[at]), last])
 
+    def write_truth(self, trajectory: Trajectory) -> None:
+        """Write truth.txt, the true path at the frames' stamps."""
+        with self._writing():
+            trajectory.write_tum(self.folder / "truth.txt")
+
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all."""
         with self._writing():
@@ -139,11 +129,13 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
     temporary.replace(path)
 
 
-def _object_row(thing: MovingObject) -> list[Any]:
-    """Pose, motion since the previous frame in world coordinates, and the pose covariance's upper triangle."""
+def _object_row(number: int, thing: MovingObject) -> list[Any]:
+    """A row of `slam.run.schema.OBJECT_TABLE` for a body in frame `number`."""
     e = thing.estimate
-    numbers = [*_pose_numbers(e.T_world_object), *_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
-    return [f"{e.stamp:.9f}", thing.id, *(f"{x:.9g}" for x in numbers)]
+    numbers = [*_pose_numbers(e.T_world_object), *e.velocity[3:], *e.velocity[:3]]
+    numbers += [*_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
+    flags = [int(thing.moving), int(e.measured)]
+    return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
 
 
 def _pose_numbers(T: Array) -> list[float]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,19 @@ from slam import registry
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFrame
 from slam.errors import SlamError
-from slam.evaluation.summary import consistency, evaluate
+from slam.evaluation.summary import consistency, evaluate, true_path
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
-from slam.run.outputs import STAGES, RunFiles
+from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
+from slam.run.repeat import portable
 from slam.run.replay import RecordedFrame, Recording, replay
+from slam.run.schema import STAGES, schema
+from slam.run.settings_reference import in_force
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -52,6 +55,7 @@ class RunOptions:
         known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
         mono: use the left images alone.
+        origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
     """
 
     backend: str
@@ -64,6 +68,7 @@ class RunOptions:
     known_map: Path | None = None
     save_map: Path | None = None
     mono: bool = False
+    origin: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -183,6 +188,7 @@ def _drive(
     first, summary = _FirstError(), dict[str, Any]()
     with first.kept(), RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
+        files.write_json("schema.json", schema(options.config, getattr(system, "frontend", None), system.backend))
         with first.kept(BaseException):
             for number, result in results:
                 record.add(number, result)
@@ -201,6 +207,10 @@ def _drive(
         with first.kept():
             if record.stamps:
                 files.write_final(system.trajectory(), system.estimate(), system.landmarks, record.numbers)
+        with first.kept():
+            truth = true_path(record.trajectory, sequence)
+            if truth is not None:
+                files.write_truth(truth)
         with first.kept():
             if options.record is not None:
                 save_recording(_recording(sequence, options, system, tape), options.record)
@@ -356,16 +366,17 @@ def _timings(record: RunRecord) -> dict[str, Any]:
 
 def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed) -> dict[str, Any]:
     """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-    parts = {"frontend": getattr(system, "frontend", None), "backend": system.backend}
-    in_force = {name: getattr(part, "config", None) for name, part in parts.items()}
+    parts = {"frontend": in_force(getattr(system, "frontend", None)), "backend": in_force(system.backend)}
     return {
+        **options.origin,
         "sequence": sequence.name,
         "format": sequence.format,
         "frontend": options.frontend,
         "backend": options.backend,
         "frames": [options.start, options.stop],
-        "settings": options.config.to_json(),
-        "in_force": {name: asdict(c) for name, c in in_force.items() if is_dataclass(c) and not isinstance(c, type)},
+        "settings": portable(options.config.to_json()),
+        "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
+        "versions": versions(),
     }
 
 

@@ -145,7 +145,7 @@ def view_run(folder: Path, target: str) -> None:
         run = RunData.read(folder, folder.name)
         with (folder / "objects.csv").open(encoding="utf-8", newline="") as file:
             objects = list(csv.DictReader(file))
-    except (OSError, KeyError, IndexError) as error:
+    except OSError as error:
         raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):

@@ -28,7 +28,7 @@ from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
 TABLES = {"landmarks.csv", "objects.csv", "frames.csv"}
-FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json"} | TABLES
+FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json", "schema.json"} | TABLES
 
 
 def options(out, backend="ekf", **more):
