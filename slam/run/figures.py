@@ -40,6 +40,7 @@ class RunData:
         truth: true path, in its own world; None where it is not known.
         sequence, backend: names.
         folder: where it was read from.
+        truth_is_exact: whether the truth has no errors of its own: that of a world.
     """
 
     name: str
@@ -55,6 +56,7 @@ class RunData:
     sequence: str = ""
     backend: str = ""
     folder: Path = Path()
+    truth_is_exact: bool = True
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
@@ -89,6 +91,7 @@ class RunData:
             str(config["sequence"]),
             str(config["backend"]),
             folder,
+            config["format"] == "synthetic",
         )
 
 
@@ -180,11 +183,13 @@ def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
 def position_errors(run: RunData, truth: Trajectory) -> tuple[Array, Array, Array]:
     """Time since the start (N,) [s], error of the online position and its claimed standard deviation, (N, 3) [m] each.
 
-    Both are along the axes of the run's world, in which the truth begins with the estimated pose.
+    Both are along the axes of the run's world, in which the truth begins at the estimated position. It is turned by the
+    first pose where the truth is exact. A recorded one is turned so that the whole paths fit: an error of its first
+    orientation by some tenths of a degree would look like an error of the path that grows with the distance.
     """
     own, true = associate(run.online, truth, 0.02, interpolated=True)
-    start = own.poses[0] @ np.linalg.inv(true.poses[0])
-    expected = true.positions @ start[:3, :3].T + start[:3, 3]
+    R = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
+    expected = (true.positions - true.positions[0]) @ R.T + own.positions[0]
     rows = np.searchsorted(run.online.stamps, own.stamps)
     return own.stamps - own.stamps[0], own.positions - expected, run.deviations[rows]
 

@@ -15,6 +15,7 @@ import numpy as np
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
+from slam.naming import unknown
 from slam.run.figures import RunData, draw_map, position_errors
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
     if path.suffix.lower() not in _METADATA:
         raise SlamError(f"{path}: a picture is a file .png, .pdf or .svg")
     if kind not in KINDS:
-        raise SlamError(f"unknown figure {kind!r}; known: {', '.join(KINDS)}")
+        raise SlamError(unknown("figure", kind, KINDS))
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -152,8 +153,17 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
 def _map_panel(axis: Axes, run: RunData) -> None:
     """The map from above with ellipses."""
     draw_map(axis, run, run.truth)
+    _widen(axis)
     axis.set_title(f"Map of {run.name}: {len(run.positions)} landmarks, 2σ ellipses")
     axis.legend(fontsize=7, frameon=True, framealpha=0.8, edgecolor="none")
+
+
+def _widen(axis: Axes, ratio: float = 1.15) -> None:
+    """Widen the limits of one direction until width over height are about those of the panel."""
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    width, height = right - left, top - bottom
+    wider, higher = max(0.0, ratio * height - width) / 2, max(0.0, width / ratio - height) / 2
+    axis.set(xlim=(left - wider, right + wider), ylim=(bottom - higher, top + higher))
 
 
 def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
@@ -171,8 +181,9 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
         axis.set_ylabel(f"{name} [{unit}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
-    title = "Error of the online position and ±3σ as claimed" if known else "±3σ of the online position as claimed"
-    axes[0].set_title(title if known else f"{title} (no truth is known)")
+    title = "Error of the online position" if known else "Online position, no truth is known"
+    turned = ", truth turned to fit" if any(run.truth is not None and not run.truth_is_exact for run in runs) else ""
+    axes[0].set_title(f"{title}{turned}; band: ±3σ as claimed")
     axes[-1].set_xlabel("time [s]")
     if known:
         axes[0].legend(loc="upper left", fontsize=8, frameon=False, ncols=4)
