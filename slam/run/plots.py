@@ -186,7 +186,7 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     axes[0].set_title(f"{title}{turned}; band: ±3σ as claimed")
     axes[-1].set_xlabel("time [s]")
     if known:
-        axes[0].legend(loc="upper left", fontsize=8, frameon=False, ncols=4)
+        axes[0].legend(fontsize=8, frameon=False, ncols=4)
 
 
 def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
