@@ -37,9 +37,11 @@ class BatchConfig(SmootherConfig):
 
     Attributes:
         online: whether the pose alone is the solved one as well, and not the smoother's.
+        lag: no option here: all poses stay variables.
     """
 
     online: bool = False
+    lag: None = None
 
 
 class BatchBackend:
@@ -54,7 +56,7 @@ class BatchBackend:
         rig: the cameras.
         models: noise, priors, motion and gate.
         online: whether the pose alone is the solved one as well, and not the smoother's.
-        options: of the smoother, see `backends.smoother.config.SmootherConfig`.
+        options: of the smoother but for its lag, see `backends.smoother.config.SmootherConfig`.
 
     Raises:
         ConfigurationError: an option is unknown or out of range.
@@ -72,7 +74,9 @@ class BatchBackend:
         self.rig = rig
         self.models = models
         self.online = online
-        self._smoother = SmootherBackend(rig, models, **options)
+        if "lag" in options:
+            raise ConfigurationError("batch: lag is an option of the smoother; nothing is left out here")
+        self._smoother = SmootherBackend(rig, models, lag=None, **options)
         self.config = BatchConfig(**asdict(self._smoother.config), online=online)
         self._solution: _Solution | None = None
 

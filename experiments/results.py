@@ -28,7 +28,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from slam.compare.revision import made_with
-from slam.run.runner import versions
+from slam.run.repeat import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -91,6 +91,10 @@ EXPERIMENTS = (
     ),
     Experiment("faults", "Blackout, dropped frames, a camera that is carried off"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
+    Experiment(
+        "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
+        arguments=("--wrong", "0", "0.05", "0.1", "0.2"),
+    ),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip
 

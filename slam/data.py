@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,7 @@ class Observations:
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, or a left pixel is not finite.
+        MeasurementError: shapes differ, an id stands twice, a left pixel is not finite, or a right one is infinite.
     """
 
     ids: IdArray
@@ -115,6 +115,8 @@ class Observations:
             raise MeasurementError("observations: a landmark id stands twice")
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError("observations: a left pixel is not finite")
+        if np.isinf(self.uv_right).any():
+            raise MeasurementError("observations: a right pixel is infinite; NaN says that there is none")
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -157,7 +159,7 @@ class Prediction:
     innovation: Array
 
 
-class UpdateStatus(str, Enum):
+class UpdateStatus(StrEnum):
     """How an update ended."""
 
     OK = "ok"  #: measurements were used
@@ -213,7 +215,7 @@ class Estimate:
     covariances: Array
 
 
-class FrameStatus(str, Enum):
+class FrameStatus(StrEnum):
     """How a frame ended."""
 
     STARTED = "started"  #: first frame, or the first one with anything to see: the map begins

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
+from slam.runtime.ahead import ahead
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
 from slam.tracking.localizer import LandmarkMatches, Localizer
@@ -117,13 +119,34 @@ class StereoSlam:
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
+        _, features, milliseconds = self._extract(frame)
+        result = self.process_features(features)
+        return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+
+    def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
+        """Every frame with the result of its step.
+
+        Args:
+            frames: a sequence, or frames in order of time.
+            overlap: read the next frame and extract its features in a second thread meanwhile. The results are the same
+                to the byte; only the times differ.
+
+        Raises:
+            As `process`, where the frame comes whose step fails.
+        """
+        extracted = map(self._extract, frames)
+        for frame, features, milliseconds in ahead(extracted) if overlap else extracted:
+            result = self.process_features(features)
+            yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
+
+    def _extract(self, frame: StereoFrame) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
+        """A frame, its features, and how long these took [ms]."""
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
         stages = Stages()
         with stages.stage("extract"):
             features = self.frontend.extract(frame)
-        result = self.process_features(features)
-        return replace(result, milliseconds={**stages.milliseconds, **result.milliseconds})
+        return frame, features, stages.milliseconds
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).

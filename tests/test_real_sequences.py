@@ -8,6 +8,8 @@ from slam.config import SystemConfig
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
+pytestmark = pytest.mark.slow
+
 KITTI_06 = "kitti_odometry/sequences/06"
 RAW_0013 = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 EUROC = "euroc/V1_01_keyframes_a"

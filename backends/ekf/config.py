@@ -22,7 +22,7 @@ class EkfConfig:
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
         consistent: keep what nothing measures, where the world's origin is and which way it faces, from seeming to be
             measured, by referring the covariance to the corrected state after each update. With stereo measurements
-            only, and until the first moving body is observed.
+            only.
 
     The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``, printed as it is there.
 

@@ -18,6 +18,8 @@ the rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
@@ -52,6 +54,21 @@ class Covariance:
         self._X: Array = np.zeros((CAMERA, 0))
         self._Phi: Array = np.zeros((CAMERA, 0))
         self._Psi: Array = np.zeros((0, 0))
+        self._undo: list[tuple[Array, slice, Array]] = []  # parts of arrays as they were before they were changed
+        self._mine = False  # whether P_LL and Φ may be changed in place
+
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        undo = self._undo = []
+        self._mine = False
+        before = vars(self).copy()
+
+        def restore() -> None:
+            for array, part, values in reversed(undo):
+                array[part] = values
+            vars(self).update(before)
+
+        return restore
 
     @property
     def size(self) -> int:
@@ -138,33 +155,35 @@ class Covariance:
         """``P ← P − W Wᵀ`` with ``W = P[:, g] B``, g as above; B (6 + 3M, K)."""
         g = self._rows(slots)
         W, V = B.T @ self._local[g], B.T @ self._Phi[g]  # transposed
-        self._local -= W.T @ W
+        P, Phi = self._own()
+        P -= W.T @ W
         if V.size:
-            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=self._Phi.T, trans_b=1, overwrite_c=1).T
-            self._Psi += V.T @ V
+            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=Phi.T, trans_b=1, overwrite_c=1).T
+            self._Psi = self._Psi + V.T @ V
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
-        P = self._local
+        P, Phi = self._own()
         P[:POSE] += dt * P[POSE:CAMERA]
         P[:, :POSE] += dt * P[:, POSE:CAMERA]
         P[:CAMERA, :CAMERA] = _symmetric(P[:CAMERA, :CAMERA] + noise)
-        self._Phi[:POSE] += dt * self._Phi[POSE:CAMERA]
+        Phi[:POSE] += dt * Phi[POSE:CAMERA]
 
     def transform_camera(self, J: Array) -> None:
         """``P ← J P Jᵀ`` for a change of the camera's state (12, 12)."""
-        rows = J @ self._local[:CAMERA]
+        P, Phi = self._own()
+        rows = J @ P[:CAMERA]
         rows[:, :CAMERA] = _symmetric(rows[:, :CAMERA] @ J.T)
-        self._local[:CAMERA], self._local[:, :CAMERA] = rows, rows.T
-        self._Phi[:CAMERA] = J @ self._Phi[:CAMERA]
+        P[:CAMERA], P[:, :CAMERA] = rows, rows.T
+        Phi[:CAMERA] = J @ Phi[:CAMERA]
 
     def transform_landmarks(self, K: Array) -> None:
         """``Y ← Y + K [r, φ]`` for a change of coordinates of those landmarks that became local last; K (M, 3, 6)."""
-        by_pose, P = K.reshape(-1, POSE), self._local
+        by_pose, (P, Phi) = K.reshape(-1, POSE), self._own()
         rows = slice(len(P) - len(by_pose), len(P))
         P[rows] += by_pose @ P[:POSE]
         P[:, rows] += P[:, :POSE] @ by_pose.T
-        self._Phi[rows] += by_pose @ self._Phi[:POSE]
+        Phi[rows] += by_pose @ Phi[:POSE]
 
     def append(self, J: Array, noise: Array) -> None:
         """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
@@ -204,11 +223,16 @@ class Covariance:
             self._slots = self._slots[stay]
         for hole, mover in zip(holes.tolist(), movers.tolist()):
             self._move(CAMERA + 3 * hole, CAMERA + 3 * mover)
-        self._slots[self._slots >= left] = holes[np.searchsorted(movers, self._slots[self._slots >= left])]
-        self._P[CAMERA + 3 * left : self.size] = self._X[CAMERA + 3 * left : self.size] = 0.0
+        mine, tail = self._slots.copy(), slice(CAMERA + 3 * left, self.size)
+        mine[mine >= left] = holes[np.searchsorted(movers, mine[mine >= left])]
+        self._slots = mine
+        self._note(self._P, tail)
+        self._note(self._X, tail)
+        self._P[tail] = self._X[tail] = 0.0
         self.count = left
-        self._place = np.full(left, -1)
-        self._place[self._slots] = np.arange(len(self._slots))
+        place = np.full(left, -1)
+        place[mine] = np.arange(len(mine))
+        self._place = place
         if len(self._P) > self.size + 4 * _spare(self.size):
             self._resize()
         return holes, movers
@@ -243,6 +267,7 @@ class Covariance:
         """Enlarge the local part by landmarks with covariances `cross` with it and `own`."""
         self._local = np.block([[self._local, cross.T], [cross, _symmetric(own)]])
         self._Phi = np.concatenate([self._Phi, Phi])
+        self._place = self._place.copy()
         self._place[slots] = len(self._slots) + np.arange(len(slots))
         self._slots = np.concatenate([self._slots, slots])
 
@@ -252,8 +277,7 @@ class Covariance:
         C = _square_root(self._Psi)
         X = self._X.copy()
         X[mine] = 0.0
-        if C.shape[1]:
-            P = self._P = dsyrk(-1.0, dgemm(1.0, X.T, C, trans_a=1), beta=1.0, c=P, lower=1, overwrite_c=1)
+        P = dsyrk(-1.0, dgemm(1.0, X.T, C, trans_a=1), beta=1.0, c=P, lower=1) if C.shape[1] else P.copy(order="F")
         columns = np.zeros((len(self._local), len(P)))  # transposed: each row is read in one go
         columns[:, : self.size] = self._Phi @ X[: self.size].T
         columns[:, mine] = self._local
@@ -261,7 +285,7 @@ class Covariance:
             P[start : start + 3, :start] = columns[row : row + 3, :start]
             P[start:, start : start + 3] = columns[row : row + 3, start:].T
             P[start, start + 1] = P[start, start + 2] = P[start + 1, start + 2] = 0.0
-        self._local = self.camera
+        self._P, self._local = P, self.camera
         self._slots, self._place = np.zeros(0, np.intp), np.full(self.count, -1)
         self._X, self._Phi, self._Psi = columns[:CAMERA].T.copy(), np.eye(CAMERA), np.zeros((CAMERA, CAMERA))
 
@@ -282,11 +306,24 @@ class Covariance:
     def _move(self, to: int, row: int) -> None:
         """Copy a landmark's rows and columns, which start at `row`, to `to` < `row`."""
         P = self._P
+        self._note(P, slice(to, to + 3))
+        self._note(P.T, slice(to, to + 3))
+        self._note(self._X, slice(to, to + 3))
         P[to : to + 3, :to] = P[row : row + 3, :to]
         P[to + 3 : row, to : to + 3] = P[row : row + 3, to + 3 : row].T
         P[row + 3 : self.size, to : to + 3] = P[row + 3 : self.size, row : row + 3]
         P[to : to + 3, to : to + 3] = P[row : row + 3, row : row + 3]
         self._X[to : to + 3] = self._X[row : row + 3]
+
+    def _own(self) -> tuple[Array, Array]:
+        """P_LL and Φ, to be changed in place: copies, once after each `saved`."""
+        if not self._mine:
+            self._local, self._Phi, self._mine = self._local.copy(), self._Phi.copy(), True
+        return self._local, self._Phi
+
+    def _note(self, array: Array, part: slice) -> None:
+        """Note rows of an array that is about to be changed in place."""
+        self._undo.append((array, part, array[part].copy()))
 
     def _resize(self) -> None:
         """Make the buffers hold the state, with a little room to grow."""

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from backends.ekf.angles import LIMIT, anchor, attitude, pose_jacobian, reanchor
+from backends.ekf.atomic import all_or_nothing
 from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import CAMERA, POSE, Covariance, SlotArray
 from backends.ekf.landmarks import COORDINATES, Landmarks, far_charts
 from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
 from backends.ekf.objects import ObjectFilter
 from backends.ekf.objects_body import CameraBelief
-from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
+from backends.ekf.recovery import Agreement, agreement, landmarks_pose
+from backends.ekf.solve import Problem, Solution, UnsolvableError
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -32,9 +33,12 @@ from slam.runtime.blas import one_blas_thread
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
+_ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
+_ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
+_PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
+_DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
-_ENOUGH = 6  # observations that can be judged to agree with each other
 
 
 class EkfBackend:
@@ -65,11 +69,26 @@ class EkfBackend:
         self._camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self._covariance = Covariance(self._initial_covariance())
         self._objects = ObjectFilter(rig, models, self.config.iterations)
-        self._has_objects = False
+        self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
+
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        parts = (self._covariance.saved(), self._landmarks.saved(), self._objects.saved())
+        before, count, last = (self._camera, self._R_world_angles), len(self._stamps), self._poses[-1:]
+
+        def restore() -> None:
+            for part in parts:
+                part()
+            self._camera, self._R_world_angles = before
+            del self._stamps[count:], self._poses[count:]
+            self._poses[count - len(last) :] = last
+
+        return restore
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
         if not np.isfinite(stamp) or (self._stamps and stamp <= self._stamps[-1]):
@@ -82,6 +101,7 @@ class EkfBackend:
         return self._prediction()
 
     @one_blas_thread
+    @all_or_nothing
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
@@ -91,21 +111,22 @@ class EkfBackend:
         joined = self._covariance.make_local(slots)
         if self._consistent:
             self._refer_landmarks(joined)
+        problem = self._problem(observations, slots, guess)
         try:
-            problem = self._problem(observations, slots, guess)
-            problem, gated, surprise = self._gated(problem)
-            solution = solve(problem, gated)
-            if solution is not None:
-                self._correct(slots, solution, surprise)
+            found = agreement(problem, self._surprises(), lambda: self._landmarks_pose(problem, slots), self.models)
+            if found is None:
+                reason = "no observation, or only a minority, agrees with the prediction"
+                return UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids)
+            self._correct(slots, found)
         except UnsolvableError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
-        if solution is None:
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
+        solution = found.solution
         used = solution.used
         dof = int(np.isfinite(problem.z[used]).sum())
         return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], solution.nis, dof)
 
     @one_blas_thread
+    @all_or_nothing
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
         self._require_started("add")
@@ -113,11 +134,16 @@ class EkfBackend:
         if not len(observations):
             return
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
-        bad = ~np.isfinite(h).all(axis=1)
+        bad = ~(np.isfinite(h).all(axis=1) & (np.abs(observations.uv_left) < _PIXELS).all(axis=1))
         if bad.any():
-            raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
+            raise MeasurementError(
+                f"ekf: landmark {observations.ids[bad][0]} has no right pixel, no positive depth or no pixel that a "
+                "camera has"
+            )
+        h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         self._place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
 
+    @all_or_nothing
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
         ids = np.unique(np.asarray(ids, np.int64))
@@ -132,9 +158,10 @@ class EkfBackend:
         marks = self._landmarks
         slots = np.argsort(marks.ids) if landmarks else np.zeros(0, np.intp)
         D = marks.jacobian(slots)
+        blocks = D @ self._covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1)
         return Estimate(
             self._stamps[-1], self._poses[-1].copy(), self._pose_covariance(),
-            marks.ids[slots], marks.points[slots], D @ self._covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1),
+            marks.ids[slots], marks.points[slots], 0.5 * (blocks + blocks.transpose(0, 2, 1)),
         )  # fmt: skip
 
     def positions(self, ids: IdArray) -> Array:
@@ -148,6 +175,7 @@ class EkfBackend:
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("ekf", ids, positions, covariances)
@@ -157,6 +185,7 @@ class EkfBackend:
             self._append(np.zeros((len(ids), 3, POSE)), D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
+    @all_or_nothing
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
         self._require_started("place")
@@ -168,18 +197,18 @@ class EkfBackend:
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
     @one_blas_thread
+    @all_or_nothing
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
-        self._has_objects = self._has_objects or bool(observations)
         T, columns = self._poses[-1], self._covariance.columns(np.zeros(0, np.intp))
         camera = CameraBelief(T, pose_jacobian(T[:3, :3], self._camera[3:6]), columns)
         return self._objects.update(observations, self._stamps[-1], camera)
 
+    @all_or_nothing
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
         self._objects.remove(ids)
-        self._has_objects = bool(self._objects.count)
 
     # --- the filter's parts ---
 
@@ -210,6 +239,9 @@ class EkfBackend:
 
     def _advance(self, dt: float) -> None:
         """The printed transition (paper B, section 2), in pieces where it would run into the angles' singularity."""
+        if self._attitude_deviation(dt) > _ANY_ATTITUDE:
+            self._forget_motion(dt)
+            return
         turn = float(self._camera[10]) * dt
         if abs(float(self._camera[4]) + turn) > LIMIT:
             self._reanchor()
@@ -221,12 +253,35 @@ class EkfBackend:
 
     def _transition(self, dt: float) -> None:
         """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W."""
-        before = self._camera.copy()
-        self._camera[:POSE] += dt * self._camera[POSE:]
+        before = self._camera
+        self._camera = before.copy()
+        self._camera[:POSE] += dt * before[POSE:]
         if self._consistent and np.abs(self._camera[3:6] - before[3:6]).max() < _SMALL_TURN:
             self._turn_with(before)
         self._covariance.move_camera(dt, self._motion_noise(dt))
         self._objects.camera_moved(dt)
+
+    def _attitude_deviation(self, dt: float) -> float:
+        """Largest standard deviation [rad] of the angles after a step."""
+        phi, omega = np.arange(3, 6), np.arange(9, 12)
+        P = self._covariance.camera
+        variance = P[phi, phi] + 2 * dt * P[phi, omega] + dt * dt * P[omega, omega]
+        return math.sqrt(max(variance.max() + dt * dt * self.models.motion.velocity_variance(dt)[1], 0.0))
+
+    def _forget_motion(self, dt: float) -> None:
+        """A step after which the camera may be turned anyhow: it stays where it was, and starts anew.
+
+        As uncertain as its speed at the start would make it meanwhile, and independent of the map. Larger numbers mean
+        nothing, and next to what is known of the map they would not leave a double enough digits for that.
+        """
+        P, E = self._initial_covariance(), np.linalg.inv(body_rate_matrix(self._camera[3:6]))
+        P[:3, :3] = self._covariance.pose[:3, :3] + (self.models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
+        P[:3, :3] *= min(1.0, _ANYWHERE**2 / P[:3, :3].diagonal().max())
+        P[3:6, 3:6] = np.pi**2 / 3 * E @ E.T
+        self._camera = np.concatenate([self._camera[:POSE], np.zeros(POSE)])
+        self._covariance.transform_camera(np.zeros((CAMERA, CAMERA)))
+        self._covariance.move_camera(0.0, P)
+        self._objects.camera_transformed(np.zeros((CAMERA, CAMERA)))
 
     def _motion_noise(self, dt: float) -> Array:
         """``W Q Wᵀ`` (12, 12)."""
@@ -253,7 +308,8 @@ class EkfBackend:
 
     def _pose_covariance(self) -> Array:
         J = pose_jacobian(self._poses[-1][:3, :3], self._camera[3:6])
-        return J @ self._covariance.pose @ J.T
+        P = J @ self._covariance.pose @ J.T
+        return np.asarray(0.5 * (P + P.T))
 
     def _prediction(self) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
@@ -272,6 +328,8 @@ class EkfBackend:
     def _problem(self, observations: Observations, slots: SlotArray, guess: Array | None) -> Problem:
         """The update in the coordinates [r, φ, measured landmarks]."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
+        if not (np.abs(z) < _PIXELS).all():
+            z = np.clip(np.where(np.isfinite(z), z, np.nan), -_PIXELS, _PIXELS)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
         marks = self._landmarks
@@ -280,8 +338,15 @@ class EkfBackend:
         return Problem(
             prior, self._covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
-            None if guess is None else self._change_to(guess),
+            None if guess is None else self._change_to(guess), self._by_world(slots) if self._consistent else None,
         )  # fmt: skip
+
+    def _by_world(self, slots: SlotArray) -> Array:
+        """Derivatives (6 + 3M, 6) of [r, φ, landmarks] by a displacement of the world."""
+        own = np.eye(6)
+        own[:3, 3:] = -se3.hat(self._camera[:3])
+        own[3:, 3:] = np.linalg.inv(self._turning(self._camera))
+        return np.concatenate([own, self._landmarks.gauge_jacobian[slots].reshape(-1, 6)])
 
     def _change_to(self, T_world_left: Array) -> Array:
         """The change of [r, φ] (6,) that moves the pose to `T_world_left`."""
@@ -292,67 +357,63 @@ class EkfBackend:
         nearest = changes[np.argmin(np.linalg.norm(changes, axis=1))]
         return np.concatenate([T_world_left[:3, 3] - self._camera[:3], nearest])
 
-    def _gated(self, problem: Problem) -> tuple[Problem, Gated, Array | None]:
-        """Gate the observations; where most fail together, the prediction is at fault and not they.
+    def _surprises(self) -> list[Array]:
+        """Motion noises (12, 12) beyond what the model expects of the last step."""
+        if len(self._stamps) < 2:
+            return []
+        noise = self._motion_noise(self._stamps[-1] - self._stamps[-2])
+        return [factor**2 * noise for factor in _SURPRISES]
 
-        It may be so far off that its linearisation does not hold: then the guess may serve. Or an impulse (or a turn
-        that the Euler model does not follow) was larger than the motion model expects: then all predictions are off
-        together, while the observations agree with each other. If a wider motion noise lets most of them pass, that
-        noise was there: it joins the prediction's covariance. What still disagrees is taken out later by `solve`.
+    def _landmarks_pose(self, problem: Problem, slots: SlotArray) -> Array | None:
+        """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""
+        T = self._pose() if problem.guess is None else self._changed(problem.guess)
+        T_world_left = landmarks_pose(self.rig, self._landmarks.points[slots], problem, T, len(self._stamps))
+        return None if T_world_left is None else self._change_to(T_world_left)
 
-        Returns:
-            the problem, its gate, and the noise (12, 12) to add to the camera's covariance, or None.
-        """
-        first = gate(problem)
-        most = max(_ENOUGH, (len(problem.z) + 1) // 2)
-        if len(problem.z) < most or first.used.sum() >= most:
-            return problem, first, None
-        started = len(self._stamps) > 1
-        dt = self._stamps[-1] - self._stamps[-2] if started else 0.0
-        for factor in (0.0, *_SURPRISES) if started else (0.0,):
-            noise = factor**2 * self._motion_noise(dt)
-            covariance = problem.covariance.copy()
-            covariance[:POSE, :POSE] += noise[:POSE, :POSE]
-            wider = replace(problem, covariance=covariance)
-            for at_guess in (False,) if problem.guess is None else (False, True):
-                gated = gate(wider, at_guess)
-                if gated.used.sum() >= most:
-                    return wider, gated, noise
-        return problem, first, None
+    def _changed(self, change: Array) -> Array:
+        """The pose (4, 4) after a change of [r, φ] (6,)."""
+        return se3.pose(attitude(self._R_world_angles, self._camera[3:6] + change[3:]), self._camera[:3] + change[:3])
 
-    def _correct(self, slots: SlotArray, solution: Solution, surprise: Array | None) -> None:
-        """Change the whole state and covariance, or nothing; `surprise` (12, 12) adds to the camera's covariance.
+    def _correct(self, slots: SlotArray, found: Agreement) -> None:
+        """Change the whole state and covariance, or nothing.
 
         Raises:
             UnsolvableError: the new state is not finite.
         """
-        covariance = self._covariance
-        if surprise is not None:
-            covariance.move_camera(0.0, surprise)
+        covariance, solution = self._covariance, found.solution
         change = covariance.times(slots, solution.s)
+        if found.noise is not None:
+            change[:CAMERA] += found.noise[:, :POSE] @ solution.s[:POSE]
         if not np.isfinite(change).all():
-            if surprise is not None:
-                covariance.move_camera(0.0, -surprise)
             raise UnsolvableError("the corrected state is not finite")
-        if self._has_objects:
-            self._objects.camera_corrected(slots, solution, covariance.columns(slots) @ solution.B)
+        if found.noise is not None:
+            covariance.move_camera(0.0, found.noise)
+        if self._objects.count:
+            self._correct_objects(slots, solution)
         covariance.subtract(slots, solution.B)
         before = self._camera
         self._camera = self._camera + change[:CAMERA]
         self._landmarks.move(change[CAMERA:].reshape(-1, 3))
-        if self._consistent and solution.at_prior:
+        if self._consistent:
             self._transport(before)
-        elif self._consistent:  # it refers to about the corrected state already
-            self._landmarks.transport(covariance.local)
         self._reanchor_if_needed()
         self._poses[-1] = self._pose()
+
+    def _correct_objects(self, slots: SlotArray, solution: Solution) -> None:
+        """The bodies' part of a correction, before that of the filter's own state."""
+        columns = self._covariance.columns(slots)
+        W = columns @ solution.B
+        T = self._poses[-1]
+        by_state = pose_jacobian(T[:3, :3], self._camera[3:6])
+        camera = CameraBelief(T, by_state, columns[:, :POSE] - W @ W[:POSE].T)
+        self._objects.camera_corrected(slots, solution, W, camera)
 
     # --- what nothing measures ---
 
     @property
     def _consistent(self) -> bool:
-        """Whether the covariance is referred to the corrected state. The bodies' correlation with it cannot follow."""
-        return self.config.consistent and self.config.measurement == "stereo" and not self._has_objects
+        """Whether the covariance is referred to the corrected state."""
+        return self.config.consistent and self.config.measurement == "stereo"
 
     def _transport(self, before: Array) -> None:
         """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
@@ -392,6 +453,7 @@ class EkfBackend:
         K = self._landmarks.transport(slots) @ world
         if K.any():
             self._covariance.transform_landmarks(K)
+            self._objects.landmarks_transformed(slots, K)
 
     def _turning(self, camera: Array) -> Array:
         """Derivative (3, 3) of the attitude, turned about the world's axes, by the angles φ."""

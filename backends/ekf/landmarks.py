@@ -10,8 +10,8 @@ state has three numbers a landmark as before and everything else stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from slam.geometry.se3 import Array, hat
 
 SlotArray = NDArray[np.intp]
 
+_FARTHEST = 1e-6  # least inverse depth [1/m]
+_NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
@@ -40,6 +42,14 @@ class Coordinates(Protocol):
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
         ...
 
+    def proper(self, c: Array) -> Array:
+        """The nearest coordinates to c (M, 3) that are those of points."""
+        ...
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """Coordinates c (M, 3) of points after a change: those of points again."""
+        ...
+
 
 class Euclidean:
     """The papers': the position in the world. Charts do not matter."""
@@ -56,15 +66,23 @@ class Euclidean:
         """See `Coordinates.jacobian`."""
         return np.tile(np.eye(3), (len(c), 1, 1))
 
+    def proper(self, c: Array) -> Array:
+        """See `Coordinates.proper`."""
+        return c
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """See `Coordinates.moved`."""
+        return c + change
+
 
 class InverseDepth:
-    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes."""
+    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes; z is positive."""
 
     def points(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.points`."""
+        """See `Coordinates.points`; NaN where the inverse depth is not positive."""
         homogeneous = np.ones((len(c), 4))  # [x/z, y/z, 1, 1/z]
         homogeneous[:, :2], homogeneous[:, 3] = c[:, :2], c[:, 2]
-        return np.asarray(np.einsum("nij,nj->ni", anchors, homogeneous) / c[:, 2:])
+        return np.asarray(np.einsum("nij,nj->ni", anchors, homogeneous) * _depth(c)[:, None])
 
     def of(self, anchors: Array, points: Array) -> Array:
         """See `Coordinates.of`."""
@@ -73,12 +91,35 @@ class InverseDepth:
 
     def jacobian(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.jacobian`."""
-        depth = 1 / c[:, 2]
+        depth = _depth(c)
         D = np.zeros((len(c), 3, 3))
         D[:, 0, 0] = D[:, 1, 1] = depth
         D[:, :2, 2] = -c[:, :2] * (depth * depth)[:, None]
         D[:, 2, 2] = -depth * depth
         return np.asarray(anchors[:, :, :3] @ D)
+
+    def proper(self, c: Array) -> Array:
+        """See `Coordinates.proper`."""
+        if (c[:, 2] >= _FARTHEST).all():
+            return c
+        out = c.copy()
+        out[:, 2] = np.maximum(out[:, 2], _FARTHEST)
+        return out
+
+    def moved(self, c: Array, change: Array) -> Array:
+        """See `Coordinates.moved`.
+
+        The measurements of a far point may want its inverse depth negative: then it goes away, step by step.
+        """
+        out = c + change
+        out[:, 2] = np.maximum(out[:, 2], np.maximum(_NEARER * c[:, 2], _FARTHEST))
+        return np.asarray(out)
+
+
+def _depth(c: Array) -> Array:
+    """Depths (M,) of inverse-depth coordinates (M, 3); NaN where they are not positive."""
+    rho = c[:, 2]
+    return np.asarray(1 / np.where(rho > 0, rho, np.nan))
 
 
 #: By the name of the option.
@@ -107,6 +148,11 @@ class Landmarks:
         self.gauge_jacobian: Array = np.zeros((0, 3, 6))
         self._slots: dict[int, int] = {}
 
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        before = vars(self).copy()
+        return lambda: vars(self).update(before)
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -127,7 +173,7 @@ class Landmarks:
         """Add landmarks at positions (M, 3); returns the derivatives (M, 3, 3) of their coordinates by these."""
         first, state = len(self), self.coordinates.of(anchors, points)
         inverse, gauge_jacobian = self._derivatives(anchors, state, points)
-        self._slots.update(zip(ids.tolist(), range(first, first + len(ids))))
+        self._slots = {**self._slots, **dict(zip(ids.tolist(), range(first, first + len(ids))))}
         self.ids = np.concatenate([self.ids, ids])
         self.anchors = np.concatenate([self.anchors, anchors])
         self.state = np.concatenate([self.state, state])
@@ -137,25 +183,28 @@ class Landmarks:
 
     def remove(self, ids: IdArray, holes: SlotArray, movers: SlotArray) -> None:
         """Forget landmarks; `holes` are filled from `movers`, as the covariance has done (`Covariance.drop`)."""
-        for i in ids.tolist():
-            del self._slots[i]
-        left = len(self) - len(ids)
-        for array in (self.ids, self.anchors, self.state, self.points, self.gauge_jacobian):
-            array[holes] = array[movers]
-        self._slots.update(zip(self.ids[holes].tolist(), holes.tolist()))
-        self.ids, self.anchors = self.ids[:left], self.anchors[:left]
-        self.state, self.points = self.state[:left], self.points[:left]
-        self.gauge_jacobian = self.gauge_jacobian[:left]
+        left, gone = len(self) - len(ids), set(ids.tolist())
+        moved = dict(zip(self.ids[movers].tolist(), holes.tolist()))
+        self._slots = {i: moved.get(i, slot) for i, slot in self._slots.items() if i not in gone}
+
+        def rest(array: NDArray[Any]) -> NDArray[Any]:
+            out = array[:left].copy()
+            out[holes] = array[movers]
+            return out
+
+        self.ids, self.anchors, self.state = rest(self.ids), rest(self.anchors), rest(self.state)
+        self.points, self.gauge_jacobian = rest(self.points), rest(self.gauge_jacobian)
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""
-        self.state = self.state + change
+        self.state = self.coordinates.moved(self.state, change)
         self.points = self.coordinates.points(self.anchors, self.state)
 
     def transport(self, slots: SlotArray) -> Array:
         """Let `gauge_jacobian` be that of the present coordinates; returns the change (M, 3, 6)."""
         now = self._derivatives(self.anchors[slots], self.state[slots], self.points[slots])[1]
         change = now - self.gauge_jacobian[slots]
+        self.gauge_jacobian = self.gauge_jacobian.copy()
         self.gauge_jacobian[slots] = now
         return np.asarray(change)
 

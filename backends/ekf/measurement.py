@@ -9,7 +9,6 @@ import numpy as np
 
 from backends.ekf.angles import attitude
 from backends.ekf.landmarks import Coordinates
-from slam.data import BoolArray
 from slam.geometry.euler import body_rate_matrix
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat
@@ -85,13 +84,17 @@ class StereoMeasurement:
     def linearise(self, x: Array) -> Linearisation:
         """The same with derivatives."""
         h, R = self._local(x)
-        D = self.coordinates.jacobian(self.anchors, x[6:].reshape(-1, 3))
+        D = self.coordinates.jacobian(self.anchors, self._landmarks(x))
         return chained(*self.rig.project_stereo(h), h, R, x[3:6], D)
 
     def _local(self, x: Array) -> tuple[Array, Array]:
         """Landmarks ``h = Rᵀ (Y − r)`` (M, 3) in camera coordinates (paper B, Eqs. 3-5), and R (3, 3)."""
         R = attitude(self.R_world_angles, x[3:6])
-        return (self.coordinates.points(self.anchors, x[6:].reshape(-1, 3)) - x[:3]) @ R, R
+        return (self.coordinates.points(self.anchors, self._landmarks(x)) - x[:3]) @ R, R
+
+    def _landmarks(self, x: Array) -> Array:
+        """The landmarks' coordinates (M, 3); a linear step may ask for a point beyond infinity: it is at infinity."""
+        return self.coordinates.proper(x[6:].reshape(-1, 3))
 
 
 def chained(z: Array, J: Array, h: Array, R: Array, phi: Array, D: Array) -> Linearisation:
@@ -122,16 +125,3 @@ def innovation_covariances(line: Linearisation, pose: Array, cross: Array, block
     S = (A @ pose + 2 * (B @ cross)) @ At
     S = 0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1)
     return np.asarray(S + sigma**2 * np.eye(S.shape[1]))
-
-
-def stacked(line: Linearisation, rows: BoolArray) -> Array:
-    """The dense Jacobian (3M, 6 + 3M) by [r, φ, landmarks]; zero where a row is not measured (mask (M, 3))."""
-    m = len(line.z)
-    J, own = line.by_pose, line.own
-    if not rows.all():
-        J, own = np.where(rows[:, :, None], J, 0.0), np.where(rows[:, :, None], own, 0.0)
-    H = np.zeros((m, 3, 2 + m, 3))
-    H[:, :, :2] = J.reshape(m, 3, 2, 3)
-    landmark = np.arange(m)
-    H[landmark, :, 2 + landmark] = own
-    return H.reshape(3 * m, 6 + 3 * m)

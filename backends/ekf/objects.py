@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +60,11 @@ class ObjectFilter:
         self._stamp = 0.0
         self._now = 0
 
+    def saved(self) -> Callable[[], None]:
+        """A function that puts everything back as it is now."""
+        before = {**vars(self), "_bodies": self._bodies.copy()}
+        return lambda: vars(self).update(before)
+
     # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
 
     def update(
@@ -99,13 +104,16 @@ class ObjectFilter:
 
     def camera_moved(self, dt: float) -> None:
         """The camera's [r, φ] went on by dt times [v, ω]."""
-        for body in self._bodies.values():
-            body.cross[:, :POSE] += dt * body.cross[:, POSE:CAMERA]
+        F = np.eye(CAMERA)
+        F[:POSE, POSE:] = dt * np.eye(POSE)
+        self.camera_transformed(F)
 
     def camera_transformed(self, J: Array) -> None:
         """The camera's state changed its coordinates by the Jacobian J (12, 12)."""
-        for body in self._bodies.values():
-            body.cross[:, :CAMERA] = body.cross[:, :CAMERA] @ J.T
+        for number, body in self._bodies.items():
+            cross = body.cross.copy(order="K")
+            cross[:, :CAMERA] = cross[:, :CAMERA] @ J.T
+            self._bodies[number] = replace(body, cross=cross)
 
     def landmarks_appended(self, J: Array) -> None:
         """Landmarks joined whose derivatives by [r, φ] are J (M, 3, 6)."""
@@ -113,23 +121,32 @@ class ObjectFilter:
             new = body.cross[:, :POSE] @ J.reshape(-1, POSE).T
             self._bodies[number] = replace(body, cross=np.concatenate([body.cross, new], axis=1))
 
+    def landmarks_transformed(self, slots: NDArray[np.intp], K: Array) -> None:
+        """The coordinates Y of landmarks `slots` became ``Y + K [r, φ]``; K (M, 3, 6)."""
+        columns = (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)
+        for number, body in self._bodies.items():
+            cross = body.cross.copy(order="K")
+            cross[:, columns] += cross[:, :POSE] @ K.reshape(-1, POSE).T
+            self._bodies[number] = replace(body, cross=cross)
+
     def landmarks_dropped(self, holes: NDArray[np.intp], movers: NDArray[np.intp], left: int) -> None:
         """Landmarks went: those of the slots `movers` have moved into `holes`, and the first `left` slots remain."""
         for number, body in self._bodies.items():
-            marks = body.cross[:, CAMERA:].reshape(len(body.cross), -1, 3)
+            marks = body.cross[:, CAMERA:].reshape(len(body.cross), -1, 3).copy()
             marks[:, holes] = marks[:, movers]
             cross = np.concatenate([body.cross[:, :CAMERA], marks[:, :left].reshape(len(marks), -1)], axis=1)
             self._bodies[number] = replace(body, cross=cross)
 
-    def camera_corrected(self, slots: NDArray[np.intp], solution: Solution, W: Array) -> None:
+    def camera_corrected(self, slots: NDArray[np.intp], solution: Solution, W: Array, camera: CameraBelief) -> None:
         """The filter's state changed by ``P[:, g] s``, its covariance became ``P − W Wᵀ`` with ``W = P[:, g] B``.
 
-        g = [r, φ, landmarks `slots`]; s and B are the solution's. What has been learnt of the camera and the map is
+        g = [r, φ, landmarks `slots`]; s and B are the solution's; the camera has its covariance after the update, at
+        the pose before it. What has been learnt of the camera and the map is
         learnt of the bodies too, as far as they hang on it.
         """
         columns = np.concatenate([np.arange(POSE), (CAMERA + 3 * slots[:, None] + np.arange(3)).reshape(-1)])
         for number, body in self._bodies.items():
-            self._bodies[number] = corrected_by_map(body, columns, solution.s, solution.B, W)
+            self._bodies[number] = corrected_by_map(body, columns, solution.s, solution.B, W, camera)
 
     # --- parts ---
 

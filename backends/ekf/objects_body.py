@@ -237,40 +237,54 @@ def corrected(body: Body, camera: CameraBelief, covariances: Gathered, s: Array,
     of_body, of_camera = covariances.backward(B)
     # The filter's state has the covariance `crossᵀ of_body + camera.crossᵀ of_camera` with B.
     gain = W @ np.concatenate([of_body, of_camera]).T
-    return _learnt(body, change, W, gain, np.concatenate([body.cross[covariances.rows], camera.cross]))
+    after = _learnt(body, change, W, gain, np.concatenate([body.cross[covariances.rows], camera.cross]))
+    return referred(after, body.points, camera)
 
 
-def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, W: Array) -> Body:
+def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, W: Array, camera: CameraBelief) -> Body:
     """After an update of the filter itself, which changed its state by ``P[:, columns] s`` and its covariance P by
-    ``− W Wᵀ``, ``W = P[:, columns] B``.
+    ``− W Wᵀ``, ``W = P[:, columns] B``; the camera has its covariance after the update, at the pose before it.
     """
     mine = body.cross[:, columns]
     V = mine @ B
-    return _learnt(body, mine @ s, V, V, W[: body.cross.shape[1]].T)
+    after = _learnt(body, mine @ s, V, V, W[: body.cross.shape[1]].T)
+    return referred(after, body.points, camera)
 
 
 def _learnt(body: Body, change: Array, W: Array, gain: Array, rows: Array) -> Body:
-    """With the mean changed by (12 + 3p,), covariance less ``W Wᵀ``, cross-covariance less ``gain @ rows``.
-
-    No measurement says where in the body its frame lies: a change [θ, τ] of it changes the points by ``N [θ, τ]`` and
-    no prediction. N depends on the points; were the covariance kept in the coordinates of their old places, each
-    update would seem to say something of it. So both covariances are carried over to the new N.
-    """
-    points = body.points.plus(change[RIGID:].reshape(-1, 3))
-    P = body.covariance - W @ W.T
+    """With the mean changed by (12 + 3p,), covariance less ``W Wᵀ``, cross-covariance less ``gain @ rows``."""
     turned = rows.flags.f_contiguous  # BLAS reads both orders; scipy would copy one
     rows, cross = rows if turned else rows.T, body.cross.T.copy(order="F")
     cross = dgemm(-1.0, rows, gain.T, beta=1.0, c=cross, trans_a=turned, overwrite_c=1).T
-    if len(points):
-        moved_on = points.by_frame() - body.points.by_frame()
-        P[RIGID:] += moved_on @ P[:6]
-        P[:, RIGID:] += P[:, :6] @ moved_on.T
-        cross[RIGID:] += moved_on @ cross[:6]
     return replace(
         body,
         T=moved(body.T, change[:6]),
         velocity=body.velocity + change[6:RIGID],
-        points=points,
-        covariance=P,
+        points=body.points.plus(change[RIGID:].reshape(-1, 3)),
+        covariance=body.covariance - W @ W.T,
         cross=cross,
     )
+
+
+def referred(body: Body, before: BodyPoints, camera: CameraBelief) -> Body:
+    """Refer the covariance to the points as they are now; `before` (p) are those that it still refers to.
+
+    No measurement says where in the body its frame lies, nor where in the world camera and body are together. If the
+    pose is off by ``[θ, τ]`` and the camera by c, such a displacement changes the points by ``N η``, where ``η =
+    [θ, τ] − Ad c`` (see `gathered`), and no prediction. N depends on the points; were the covariance kept in the
+    coordinates of their old places, each update would seem to say something of η. So it is carried over to the new N.
+    """
+    if not len(before):
+        return body
+    K = body.points.by_frame() - before.by_frame()
+    A = adjoint(inverse(body.T) @ camera.T_world_left)
+    by_state = A @ camera.by_state
+    with_body = body.covariance[:6] - by_state @ body.cross[:, :6].T  # covariance (6, n) of η with the body
+    with_filter = body.cross[:6] - A @ camera.cross  # and with the filter's state (6, N)
+    own = with_body[:, :6] - with_filter[:, :6] @ by_state.T
+    P, cross = body.covariance.copy(), body.cross.copy(order="K")
+    P[RIGID:] += K @ with_body
+    P[:, RIGID:] += with_body.T @ K.T
+    P[RIGID:, RIGID:] += K @ own @ K.T
+    cross[RIGID:] += K @ with_filter
+    return replace(body, covariance=P, cross=cross)

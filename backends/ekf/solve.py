@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
-from backends.ekf.measurement import Linearisation, Measurement, stacked
+from backends.ekf.jacobian import Displacement, Jacobian
+from backends.ekf.measurement import Linearisation, Measurement
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
 from slam.tracking.gating import chi_square_limits
@@ -61,6 +62,34 @@ class Problem:
     iterations: int
     gate_probability: float
     guess: Array | None = None
+    gauge_jacobian: Array | None = None
+
+    @cached_property
+    def displacement(self) -> Displacement | None:
+        """What nothing measures, or None where the landmarks are known exactly.
+
+        It is that of all landmarks which explains their change best, given how well they are known to each other.
+        """
+        if self.gauge_jacobian is None:
+            return None
+        U = self.gauge_jacobian
+        lower, info = dpotrf(self.covariance[6:, 6:].T, lower=1, clean=0)
+        if info != 0:
+            return None
+        weighted = np.asarray(dpotrs(lower, U[6:], lower=1)[0])
+        L = np.zeros(U.T.shape)
+        L[:, 6:] = np.linalg.pinv(U[6:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
+        return Displacement(U, L)
+
+    def mean(self, change: Array) -> Array:
+        """The mean (6 + 3M,) at which the model is asked after a change: without the world's displacement in it."""
+        if not change.any() or self.displacement is None:
+            return self.prior + change
+        return self.prior + (change - self.displacement.change @ (self.displacement.share @ change))
+
+    def jacobian(self, line: Linearisation, rows: BoolArray, change: Array) -> Jacobian:
+        """Derivatives by the change, from those by the mean; zero where a row is not measured (mask (M, 3))."""
+        return Jacobian.of(line, rows, self.displacement if change.any() else None)
 
 
 @dataclass(frozen=True)
@@ -70,18 +99,26 @@ class Solution:
     Attributes:
         used: which landmarks (M,) it is made of.
         s: the correction is ``P[:, g] s``.
-        B: ``Hᵀ L⁻ᵀ`` (6 + 3M, K) in Fortran order: the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``.
+        H: the Jacobian of the last linearisation.
+        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
+        measured: which rows (3M,) are measured.
         nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
-        at_prior: whether it is linearised at the prior.
     """
 
     used: BoolArray
     s: Array
-    B: Array
+    H: Jacobian
+    inverse: Array
+    measured: BoolArray
     nis: float
     distances: Array
-    at_prior: bool
+
+    @cached_property
+    def B(self) -> Array:
+        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``."""
+        B = self.H.transposed_times(self.inverse.T)
+        return B if self.measured.all() else B[:, self.measured]
 
 
 @dataclass(frozen=True)
@@ -102,21 +139,31 @@ class _System:
     """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S, S = L Lᵀ."""
 
     rows: BoolArray
-    H: Array
+    H: Jacobian
     nu: Array
     S: Array
     L: Array
+
+    def only(self, rows: BoolArray, sigma: float) -> _System:
+        """With fewer rows (mask (M, 3))."""
+        if (rows == self.rows).all():
+            return self
+        kept = rows.reshape(-1)
+        S = np.where(kept[:, None] & kept, self.S, 0.0)
+        S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
+        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S, _factor(S))
 
 
 @dataclass(frozen=True)
 class Gated:
     """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`.
 
-    The limits (M,) are the gate's, of a squared distance.
+    The limits (M,) are the gate's, of the squared distances (M,) of the innovations; NaN where none is predicted.
     """
 
     used: BoolArray
     limits: Array
+    distances: Array
     start: _Iterate
     system: _System
 
@@ -134,14 +181,14 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     if at_guess:
         s = _towards_guess(problem)
         change = problem.covariance @ s
-    line = problem.model.linearise(problem.prior + change)
+    line = problem.model.linearise(problem.mean(change))
     start = _Iterate(s, change, line.z, np.inf)
     measured = np.isfinite(problem.z)
     visible = np.asarray(np.isfinite(line.z).all(axis=1))
     system = _system(problem, measured & visible[:, None], start, line)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
-    used = visible & (_squared_distances(system.nu, _diagonal_blocks(system.S)) <= limits)
-    return Gated(used, limits, start, system)
+    distances = np.where(visible, _squared_distances(system.nu, _diagonal_blocks(system.S)), np.nan)
+    return Gated(distances <= limits, limits, distances, start, system)
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
@@ -158,31 +205,35 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     """
     used = gated.used
     while used.any():
-        solution = _iterate(problem, used, gated.start, gated.system if used.all() else None)
+        solution = _iterate(problem, used, gated.start, gated.system)
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
+            _require_positive(problem, solution)
             return solution
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
 
 
-def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System | None) -> Solution:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system at the start, if known.
+def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System) -> Solution:
+    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
     """
-    rows = first.rows if first else np.isfinite(problem.z) & used[:, None]
+    rows = first.rows & used[:, None]
     now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
-    system = first or _system(problem, rows, now)
+    system = first.only(rows, problem.sigma)
     for iteration in range(1, problem.iterations + 1):
         y = _solved(system)
-        s: Array = system.H.T @ y
+        s: Array = system.H.transposed_times(y[:, None])[:, 0]
         if not np.isfinite(s).all():
             raise UnsolvableError("the corrected state is not finite")
         if problem.iterations == 1:
+            break
+        following = _visit(problem, rows, s, plain=True)
+        if following.cost <= now.cost and _linear(problem, system, now, following):
             break
         following, whole = _descend(problem, rows, now, s)
         if whole and _linear(problem, system, now, following):
@@ -190,18 +241,22 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System 
         if iteration == 1 and problem.guess is not None:
             at_guess = _visit(problem, rows, _towards_guess(problem))
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
+        if following is now and iteration == 1:
+            raise UnsolvableError("no step towards the solution lowers the cost")
         s = following.s
         if iteration == problem.iterations or following is now:
             break
         now, system = following, _system(problem, rows, following)
-    B = dtrsm(1.0, system.L, system.H.T, side=1, lower=1, trans_a=1)
-    reduction = problem.covariance[:6] @ B
+    inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
+    distances = _conditional_distances(inverse, y)
+    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances)
+
+
+def _require_positive(problem: Problem, solution: Solution) -> None:
+    """Raise where rounding leaves a variance of the pose that is not positive."""
+    reduction = problem.covariance[:6] @ solution.B
     if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
-    measured = rows.reshape(-1)
-    B = B if measured.all() else np.asfortranarray(B[:, measured])
-    at_prior = iteration == 1 and not start.s.any()
-    return Solution(used, s, B, float(system.nu @ y), _conditional_distances(system, y), at_prior)
 
 
 def _solved(system: _System) -> Array:
@@ -211,7 +266,7 @@ def _solved(system: _System) -> Array:
 
 def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterate) -> bool:
     """Whether the measurements changed between two iterates as the Jacobian said."""
-    expected = (system.H @ (following.change - now.change)).reshape(-1, 3)
+    expected = system.H.times((following.change - now.change)[:, None]).reshape(-1, 3)
     return bool(np.abs(following.z - now.z - expected)[system.rows].max() < _LINEAR * problem.sigma)
 
 
@@ -230,9 +285,10 @@ def _towards_guess(problem: Problem) -> Array:
     return s
 
 
-def _visit(problem: Problem, rows: BoolArray, s: Array) -> _Iterate:
+def _visit(problem: Problem, rows: BoolArray, s: Array, plain: bool = False) -> _Iterate:
+    """The iterate with a correction; `plain`: with the world's displacement in it, which is less work."""
     change = problem.covariance @ s
-    z = problem.model.predict(problem.prior + change)
+    z = problem.model.predict(problem.prior + change if plain else problem.mean(change))
     return _Iterate(s, change, z, _cost(problem, rows, z, float(s @ change)))
 
 
@@ -249,27 +305,36 @@ def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) ->
 
 
 def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
-    line = line or problem.model.linearise(problem.prior + now.change)
-    H = stacked(line, rows)
+    line = line or problem.model.linearise(problem.mean(now.change))
+    H = problem.jacobian(line, rows, now.change)
     nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
     if now.change.any():
-        nu += H @ now.change
-    S = H @ problem.covariance @ H.T
+        nu += H.times(now.change[:, None])[:, 0]
+    S = H.sandwich(problem.covariance)
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    L, info = dpotrf(S.T, lower=1, clean=0)  # S is symmetric: its transpose is in the order that LAPACK wants
+    return _System(rows, H, nu, S, _factor(S))
+
+
+def _factor(S: Array) -> Array:
+    """The lower triangular L with ``L Lᵀ = S``."""
+    L, info = dpotrf(S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
     if info != 0:
         raise UnsolvableError("the innovation covariance is not positive definite")
-    return _System(rows, H, nu, S, L)
+    return np.asarray(L)
 
 
-def _conditional_distances(system: _System, y: Array) -> Array:
+def _conditional_distances(inverse: Array, y: Array) -> Array:
     """Squared distance (M,) of each landmark's innovation from what all other measurements predict for it.
 
     For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off by
-    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0.
+    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0. `inverse`
+    is the lower triangular ``L⁻¹``.
     """
-    inverse, _ = dpotri(system.L, lower=1)
-    return _squared_distances(y, _diagonal_blocks(inverse))
+    Q = np.empty((len(y) // 3, 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            Q[:, i, j] = Q[:, j, i] = np.einsum("nm,nm->m", inverse[:, i::3], inverse[:, j::3])
+    return _squared_distances(y, Q)
 
 
 def _squared_distances(nu: Array, covariances: Array) -> Array:

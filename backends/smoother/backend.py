@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +23,9 @@ from backends.smoother.prediction import (
     normalised_innovation,
     predict_points,
     predict_pose,
+    residual_noise,
 )
+from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
@@ -78,11 +81,17 @@ class SmootherBackend:
         """CPU time spent in gtsam's solvers so far [s]: the least this back end could cost; the rest is overhead."""
         return self._graph.solver_seconds
 
+    @property
+    def rebuilds(self) -> int:
+        """How often the problem was put into a new solver so far, after a failure or a divergence."""
+        return self._graph.rebuilds
+
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
+        self._graph.mend()
         self._commit()
         stamps = self.measurement_log.path.stamps
         if not np.isfinite(stamp) or (len(stamps) and stamp <= stamps[-1]):
@@ -92,7 +101,8 @@ class SmootherBackend:
             self._predicted = first_pose(self.models, float(stamp))
             return self._in_view(self._predicted)
         if not len(stamps):
-            self._graph.append_pose(stamp, self.models.initial_pose)
+            with self._whole():
+                self._graph.append_pose(stamp, self.models.initial_pose)
             P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
             T = self.models.initial_pose
             return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
@@ -115,8 +125,9 @@ class SmootherBackend:
         solved = self._points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
-        self._predicted = None
-        failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
+        with self._whole():
+            failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
+            self._predicted = None
         if failure:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
         return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
@@ -136,16 +147,20 @@ class SmootherBackend:
                 f"smoother: landmark {observations.ids[bad][0]} has no right pixel or no positive depth"
             )
         self._commit()
-        self._graph.add_landmarks(observations.ids, z, local)
+        with self._whole():
+            self._graph.add_landmarks(observations.ids, z, local)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
-        self._graph.remove_landmarks(self.measurement_log.landmarks.slots(np.unique(np.asarray(ids, np.int64))))
+        slots = self.measurement_log.landmarks.slots(np.unique(np.asarray(ids, np.int64)))
+        with self._whole():
+            self._graph.remove_landmarks(slots)
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
+        self._graph.mend()
         if landmarks and self._predicted is None:
             self._graph.converge()
         window, marks = self._graph.window(), self.measurement_log.landmarks
@@ -166,6 +181,7 @@ class SmootherBackend:
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
+        self._graph.mend()
         self._commit()
         self._graph.converge()
         return Trajectory(self.measurement_log.path.stamps.copy(), self.measurement_log.path.poses.copy())
@@ -177,7 +193,8 @@ class SmootherBackend:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("smoother", ids, positions, covariances)
         self._require_new(ids)
-        self._graph.add_known(ids, positions, covariances)
+        with self._whole():
+            self._graph.add_known(ids, positions, covariances)
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
@@ -186,7 +203,8 @@ class SmootherBackend:
         require_known("smoother", ids, local, covariances)
         self._require_new(ids)
         self._commit()
-        self._graph.add_known(ids, local, covariances, self.measurement_log.path.count - 1)
+        with self._whole():
+            self._graph.add_known(ids, local, covariances, self.measurement_log.path.count - 1)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -197,7 +215,8 @@ class SmootherBackend:
             raise MeasurementError(f"smoother: shift must be finite, got {shift}")
         self._commit()
         if self.measurement_log.measurements.count:
-            self._graph.shift_right(float(shift))
+            with self._whole():
+                self._graph.shift_right(float(shift))
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
@@ -206,7 +225,7 @@ class SmootherBackend:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
         self._commit()
-        return self._objects.update(observations, self.measurement_log.path, self._graph.window)
+        return self._objects.update(observations, self.measurement_log.path, self._graph.last_poses)
 
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
@@ -214,12 +233,26 @@ class SmootherBackend:
 
     # --- parts ---
 
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """What is done within either happens or, where it is interrupted, does not: the measurement log is restored."""
+        self._graph.mend()
+        restore, predicted = snapshot(self.measurement_log), self._predicted
+        try:
+            yield
+        except BaseException:
+            self._graph.interrupted()
+            restore()
+            self._predicted = predicted
+            raise
+
     def _commit(self) -> None:
         """Put a predicted pose without measurements into the graph."""
         if self._predicted is not None:
             stamp, T = self._predicted.stamp, self._predicted.T
-            self._predicted = None
-            self._graph.append_pose(stamp, T)
+            with self._whole():
+                self._graph.append_pose(stamp, T)
+                self._predicted = None
 
     def _in_view(self, predicted: PredictedPose) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
@@ -240,8 +273,7 @@ class SmootherBackend:
         self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, z: Array, guess: Array | None
     ) -> tuple[Array, BoolArray]:
         """First value of the newest pose, and which measurements agree with it."""
-        _, J = self._stereo.project(points.local)
-        noise = J @ points.own @ np.swapaxes(J, 1, 2) + self._make.sigma**2 * np.eye(3)
+        noise = residual_noise(self._stereo, self._make.sigma, points, z)
         known = self.measurement_log.landmarks.prior[
             slots
         ].any()  # what is known in the world does not move with the poses

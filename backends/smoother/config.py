@@ -21,7 +21,8 @@ class SmootherConfig:
         relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately: in
             every tenth frame; ten times as much in the others, next to nothing when the whole path or map is asked for.
         window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
-        lag: poses that stay variables; null (in Python None) for all.
+        lag: poses that stay variables, at least; what is older is marginalised, so that neither time nor memory grows
+            with the run. Null (in Python None) keeps all of them and revises the whole path.
 
     Raises:
         ConfigurationError: a value is out of its range.
@@ -31,7 +32,7 @@ class SmootherConfig:
     explicit: int = 300
     relinearise: float = 0.01
     window: int = 12
-    lag: int | None = None
+    lag: int | None = 50
 
     def __post_init__(self) -> None:
         _require_whole(self.track, "track", 2)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from backends.smoother.config import SmootherConfig
 from backends.smoother.graph import FactorMaker
-from backends.smoother.lag import FixedLag
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog, Track
 from backends.smoother.solver import Change
 from backends.smoother.variables import landmark_key, landmark_threshold, pose_key
@@ -30,29 +31,35 @@ class FactorBuilder:
         make: makes the factors.
         config: limits and thresholds.
         measurement_log: what is on record.
-        lag: which variables are still in the solver; None for all.
     """
 
-    def __init__(
-        self, make: FactorMaker, config: SmootherConfig, measurement_log: MeasurementLog, lag: FixedLag | None
-    ) -> None:
+    def __init__(self, make: FactorMaker, config: SmootherConfig, measurement_log: MeasurementLog) -> None:
         self.measurement_log = measurement_log
         self._make = make
         self._config = config
-        self._lag = lag
+
+    @property
+    def oldest(self) -> int:
+        """The first frame whose pose is in the solver."""
+        return self.measurement_log.history.first
 
     def newest(self) -> list[int]:
         """Frames of the window."""
-        first = 0 if self._lag is None else self._lag.first
-        return self.measurement_log.path.newest(self._config.window, first).tolist()
+        return self.measurement_log.path.newest(self._config.window, self.oldest).tolist()
 
-    def eliminate_late(self, change: Change) -> None:
-        """Have the landmarks of late eliminated late, and the newest poses last."""
+    def eliminate_late(self, change: Change, first: int = 0, gone: Collection[int] = ()) -> None:
+        """Have the landmarks of late eliminated late, and the newest poses last.
+
+        Without poses before frame `first` and without the landmark variables `gone`.
+        """
         marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count - 1
         landmarks, poses = change.late
-        poses.update(pose_key(i) for i in self.newest())
+        poses.update(pose_key(i) for i in self.newest() if i >= first)
+        oldest = max(first, self.oldest)
+        if oldest:  # that one is held, and its covariance is asked for
+            poses.add(pose_key(oldest))
         recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
-        landmarks.update(marks.variable[recent].tolist())
+        landmarks.update(set(marks.variable[recent].tolist()).difference(gone))
 
     def grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> list[tuple[Track, int]]:
         """Put measurements into factors; returns tracks with the places of their new smart factors in the change."""
@@ -103,8 +110,7 @@ class FactorBuilder:
     def _known(self, slot: int) -> Known | None:
         """What was known of a landmark beforehand, as long as what it hangs on is in the solver."""
         known = self.measurement_log.history.known.get(int(self.measurement_log.landmarks.serial[slot]))
-        gone = known is not None and known.frame is not None and self._lag is not None and known.frame < self._lag.first
-        return None if gone else known
+        return None if known is None or known.hangs_before(self.measurement_log.history.first) else known
 
     def _enter_known(self, change: Change, slots: IndexArray) -> None:
         """Give landmarks that were known beforehand variables of their own, where they have none yet."""
@@ -129,10 +135,8 @@ class FactorBuilder:
         threshold = landmark_threshold(self._make.stereo, distance, self._config.relinearise)
         key = landmark_key(history.variables, threshold)
         history.variables += 1
-        marks.variable[slot], history.places[key] = key, place
+        marks.variable[slot], history.places[key], history.owner[key] = key, place, int(marks.serial[slot])
         change.values.insert(key, place)
-        if self._lag is not None:
-            self._lag.enter(key)
         return key
 
     def finish_tracks(self, slots: IndexArray) -> None:

@@ -44,6 +44,10 @@ class FactorMaker:
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         self._parameters = gtsam.SmartProjectionParams()
+        # The other mode gives the same information, but throws where a landmark lies behind a camera.
+        self._parameters.setLinearizationMode(gtsam.LinearizationMode.JACOBIAN_SVD)
+        # A far point's linear triangulation alone can be so far off that a step goes astray by metres.
+        self._parameters.setEnableEPI(True)
         rectified = stereo.rectified_rig.original.is_rectified
         self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)
 

@@ -1,77 +1,132 @@
-"""A fixed lag: which variables leave the problem, so that a frame's cost does not grow with what the run has seen.
+"""A fixed lag: which variables leave the problem, so that neither a frame's cost nor memory grows with the run.
 
-What leaves is marginalised: its factors become a linear one on what they touch. So no factor of theirs may change
-afterwards, and the smart factors that hold a leaving pose are finished first.
+What leaves is marginalised (see `backends.smoother.marginal`), all at the values of that moment, and the solver is made
+anew of what is left. So it is done for many poses together: a share of the lag.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
-from backends.smoother.measurement_log import MeasurementLog
-from backends.smoother.solver import Change
-from backends.smoother.variables import pose_key
+import gtsam
 
-#: For poses to leave, all that stays is eliminated anew. So many leave together: the lag over this.
+from backends.smoother.marginal import Held, MarginalPrior, marginal_prior
+from backends.smoother.measurement_log import MeasurementLog, Track
+from backends.smoother.solver import FAILURES, Change, Solver, SolverError
+from backends.smoother.variables import pose_key, put, size_of
+
+#: Poses leave once so many are there as the lag and one part in so many of it.
 _SHARE = 4
 
 
-class FixedLag:
-    """Keeps track of the variables that are in the solver.
-
-    Args:
-        measurement_log: what is on record.
-        lag: so many of the newest poses stay.
-        landmarks: so many landmark variables stay, as long as they are in the map; those last measured go last.
+@dataclass(frozen=True)
+class Rest:
+    """The problem without what has left.
 
     Attributes:
-        first: frame of the oldest pose that is a variable.
+        first: frame of the oldest pose.
+        gone: landmark variables that have left.
+        finished: tracks whose factor has become part of the prior.
+        prior: what has left, on what stays.
+        held: the oldest pose, where it is held.
+        change: all factors and values for a new solver.
+        slots: places of the old solver's factors in the change.
     """
 
-    def __init__(self, measurement_log: MeasurementLog, lag: int, landmarks: int) -> None:
-        self.first = 0
-        self._measurement_log = measurement_log
-        self._lag = lag
-        self._most = landmarks
-        self._landmarks: set[int] = set()
+    first: int
+    gone: list[int]
+    finished: list[Track]
+    prior: MarginalPrior
+    held: Held | None
+    change: Change
+    slots: dict[int, int]
 
-    def restart(self) -> None:
-        """Note that everything on record is in the solver again."""
-        self.first = 0
-        self._landmarks = set(self._measurement_log.history.explicit)
 
-    def enter(self, landmark: int) -> None:
-        """Note that a landmark has become a variable."""
-        self._landmarks.add(landmark)
+def overdue(measurement_log: MeasurementLog, lag: int) -> int | None:
+    """Frame of the oldest pose that shall stay, where it is time that others leave."""
+    first = measurement_log.path.count - lag
+    return first if first >= measurement_log.history.first + max(1, lag // _SHARE) else None
 
-    def advance(self, change: Change) -> None:
-        """Put what leaves with the newest pose, and what stays, into the change; that pose is on record already."""
-        first = self._measurement_log.path.count - self._lag
-        if first < self.first + max(1, self._lag // _SHARE):
-            return
-        self._finish_tracks(first)
-        gone = self._landmarks_before(first)
-        change.leaving = [*map(pose_key, range(self.first, first)), *gone]
-        self._landmarks.difference_update(gone)
-        newest = self._measurement_log.path.count - 1
-        change.staying = [*map(pose_key, range(first, newest)), *sorted(self._landmarks)]
-        self.first = first
 
-    def _finish_tracks(self, first: int) -> None:
-        """Finish the smart factors that hold poses before frame `first`."""
-        oldest = pose_key(first)
-        for track in self._measurement_log.landmarks.tracks.values():
-            if track.keys and track.keys[0] < oldest:
-                self._measurement_log.finish(track)
+def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, most: int) -> Rest:
+    """Marginalise the poses before frame `first`, and landmark variables last measured before it.
 
-    def _landmarks_before(self, first: int) -> list[int]:
-        """Variables to leave, last measured before frame `first`: of landmarks not in the map any more, and surplus."""
-        frame, marks = self._measurement_log.measurements.frame, self._measurement_log.landmarks
-        explicit = self._measurement_log.history.explicit
-        last = {key: int(frame[explicit[key][-1]]) for key in self._landmarks.intersection(explicit)}
-        mapped = set(marks.variable[marks.variable >= 0].tolist())
-        old = sorted((key for key, k in last.items() if k < first), key=lambda key: (key in mapped, last[key], key))
-        erased = sum(key not in mapped for key in old)
-        gone = old[: max(erased, len(self._landmarks) - self._most)]
-        marks.variable[np.isin(marks.variable, gone)] = -1
-        return gone
+    Those of landmarks that are not in the map any more leave, and those of others where there are more than `most`.
+    Nothing is changed on record or in the solver; the prior that follows is put on record by the caller.
+
+    Raises:
+        SolverError: what leaves cannot be marginalised.
+    """
+    history, kept = measurement_log.history, Change()
+    gone = _old_landmarks(measurement_log, first, most)
+    leaving = {*map(pose_key, range(history.first, first)), *gone}
+    touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
+    for slot, factor in solver.factors():
+        keys = factor.keys()
+        if history.held is not None and keys == [history.held.key]:
+            continue
+        if leaving.isdisjoint(keys):
+            slots[slot] = kept.factors.size()
+            kept.factors.add(factor)
+        else:
+            touched.add(factor)
+            staying.update(keys)
+    values = solver.values()
+    if history.held is not None and history.held.pulled(values.atPose3(history.held.key).matrix()):
+        values = _solved_together(kept.factors, touched, values)
+    ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
+    prior = marginal_prior(touched, values, sorted(leaving), ordered)
+    held = held_pose(measurement_log, prior, values)
+    kept.factors.add(prior.factor())
+    if held is not None:
+        kept.factors.add(held.factor())
+    for key in [*map(pose_key, range(first, measurement_log.path.count)), *history.explicit]:
+        if key not in leaving:
+            put(kept.values, key, values)
+    oldest = pose_key(first)
+    finished = [track for track in measurement_log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
+    return Rest(first, gone, finished, prior, held, kept, slots)
+
+
+def held_pose(measurement_log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
+    """The oldest pose, held where it stands; None where landmarks that are known in the world tell where that is."""
+    if any(known.frame is None for known in measurement_log.history.known.values()):
+        return None
+    return prior.held(values.atPose3(prior.poses[0]).matrix())
+
+
+def _solved_together(
+    some: gtsam.NonlinearFactorGraph, others: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> gtsam.Values:
+    """One step of Gauss-Newton with all variables linearised where they stand; none where it gains nothing.
+
+    Raises:
+        SolverError: gtsam failed.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    graph.push_back(some)
+    graph.push_back(others)
+    mine = gtsam.Values()
+    for key in graph.keyVector():
+        put(mine, key, values)
+    try:
+        better = mine.retract(graph.linearize(mine).optimize())
+        return better if graph.error(better) < graph.error(mine) else mine
+    except FAILURES as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
+
+
+def _old_landmarks(measurement_log: MeasurementLog, first: int, most: int) -> list[int]:
+    """Landmark variables to leave: last measured before frame `first`, those of erased landmarks and the surplus."""
+    marks, history, frame = measurement_log.landmarks, measurement_log.history, measurement_log.measurements.frame
+    used = marks.used()
+    mapped = dict(zip(marks.serial[used].tolist(), marks.last[used].tolist()))
+    old = []
+    for key, rows in history.explicit.items():
+        serial = history.owner[key]
+        last = mapped.get(serial, int(frame[rows[-1]]) if rows else -1)
+        if last < first:
+            old.append((serial in mapped, last, key))
+    erased = sum(not in_map for in_map, _, _ in old)
+    surplus = len(history.explicit) - most
+    return [key for _, _, key in sorted(old)[: max(erased, surplus)]]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
+
+if TYPE_CHECKING:
+    from backends.smoother.marginal import Held, MarginalPrior
 
 IndexArray = NDArray[np.intp]
 
@@ -114,6 +117,17 @@ class Measurements:
         self._z[rows], self._frame[rows], self._landmark[rows] = z, frame, landmarks
         return rows
 
+    def shift_right(self, shift: float) -> None:
+        """Move all right pixels by `shift`."""
+        self._z = self._z + np.array([0.0, 0.0, shift])
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Forget all but some of the rows (n,); the others move up."""
+        count = int(rows.sum())
+        for name in ("_z", "_frame", "_landmark"):
+            setattr(self, name, grown(getattr(self, name)[: self.count][rows], max(1024, count)))
+        self.count = count
+
 
 @dataclass
 class Track:
@@ -174,6 +188,10 @@ class Known:
     covariance: Array
     frame: int | None = None
 
+    def hangs_before(self, first: int) -> bool:
+        """Whether it hangs on a camera before frame `first`."""
+        return self.frame is not None and self.frame < first
+
 
 class History:
     """What the solver was told besides what the tracks hold; with them, all that it takes to tell another one.
@@ -181,6 +199,10 @@ class History:
     Attributes:
         finished: rows of `Measurements` of each finished smart factor.
         explicit: rows of each landmark that is a variable, by the variable.
+        owner: serial number of the landmark of each variable.
+        first: frame of the oldest pose that is a variable.
+        prior: what those before it have left behind; None while there are none.
+        held: the oldest pose, where there is a prior.
         places: where each of those was believed to be at first.
         variables: number of landmark variables that were ever made, for their names.
         known: what was known of landmarks beforehand, by serial number.
@@ -191,6 +213,10 @@ class History:
     def __init__(self) -> None:
         self.finished: list[NDArray[np.int64]] = []
         self.explicit: dict[int, list[int]] = {}
+        self.owner: dict[int, int] = {}
+        self.first = 0
+        self.prior: MarginalPrior | None = None
+        self.held: Held | None = None
         self.places: dict[int, Array] = {}
         self.known: dict[int, Known] = {}
         self.impulses: list[float] = []
@@ -339,22 +365,63 @@ class MeasurementLog:
         rows.remove(row)
         known = rows and int(self.landmarks.serial[slot]) in self.history.known
         if not known and not np.isfinite(self.measurements.z[rows, 2]).any():
-            del self.history.explicit[variable], self.history.places[variable]
+            del self.history.explicit[variable], self.history.places[variable], self.history.owner[variable]
             self.landmarks.variable[slot] = -1
 
     def shift_right(self, shift: float, point: Callable[[list[float]], Any]) -> None:
         """Move all right pixels by `shift`; `point` makes the solver's measurements of rows (uL, vL, uR)."""
-        self.measurements.z[:, 2] += shift
+        self.measurements.shift_right(shift)
         for track in self.landmarks.tracks.values():
             track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
+    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held | None) -> None:
+        """Let go of the poses before frame `first` and of the landmark variables `gone`: `prior` holds what they said.
+
+        Measurements that no factor and no landmark refers to any more are forgotten.
+        """
+        history, frame = self.history, self.measurements.frame
+        history.first, history.prior, history.held = first, prior, held
+        history.finished = [rows for rows in history.finished if frame[rows].min() >= first]
+        for name in ("explicit", "places", "owner"):
+            kept = {key: value for key, value in getattr(history, name).items() if key not in gone}
+            setattr(history, name, kept)
+        history.explicit = {key: [row for row in rows if frame[row] >= first] for key, rows in history.explicit.items()}
+        self._forget_unused_known()
+        self._forget_unused_measurements()
+
+    def _forget_unused_known(self) -> None:
+        """Forget what was known beforehand of landmarks that are neither in the map nor variables."""
+        marks, history = self.landmarks, self.history
+        kept = {*marks.serial[marks.used()].tolist(), *history.owner.values()}
+        history.known = {serial: known for serial, known in history.known.items() if serial in kept}
+
+    def _forget_unused_measurements(self) -> None:
+        """Number the measurements anew that a factor, a track or a landmark still refers to."""
+        marks, history = self.landmarks, self.history
+        used = np.zeros(self.measurements.count + 1, bool)
+        recent = marks.recent[marks.used()]
+        used[recent[recent >= 0]] = True
+        lists = [*history.explicit.values(), *(track.rows for track in marks.tracks.values())]
+        for referred in (*history.finished, *lists):
+            used[np.asarray(referred, np.intp)] = True
+        used[-1] = False
+        number = np.where(used, np.cumsum(used) - 1, -1)  # −1 stays −1
+        marks.recent[:] = number[np.where(marks.ids[:, None] >= 0, marks.recent, -1)]
+        history.finished = [number[rows] for rows in history.finished]
+        history.explicit = {key: number[rows].tolist() if rows else [] for key, rows in history.explicit.items()}
+        for track in marks.tracks.values():
+            track.rows = number[track.rows].tolist() if track.rows else []
+        self.measurements.keep(used[:-1])
+
     def forget_measurements(self) -> None:
         """Let all poses hang on each other as they are; landmarks stay where they are and are measured anew."""
         history = self.history
-        history.finished, history.explicit, history.places = [], {}, {}
+        history.finished, history.explicit, history.places, history.owner = [], {}, {}, {}
         history.restarted = self.path.count
+        if history.prior is not None:
+            history.prior = history.prior.of_reference()
         for track in self.landmarks.tracks.values():
             track.restart()
         self.landmarks.variable[:] = -1

@@ -34,7 +34,8 @@ _BATCH = 2  # so many frames leave it together: that costs hardly more than for 
 _ITERATIONS = 2
 _ENOUGH = 4  # points that show a shape
 _FAILURES = 3  # so many rejections running, and a point starts anew
-_JITTER = 1e-14  # [rad², m²] that keeps poses of the camera apart which are taken to move together
+# Keeps poses of the camera apart that are taken to move together: of each variance, and at least [rad², m²].
+_JITTER, _LEAST = 1e-8, 1e-14
 
 
 class ObjectSmoother:
@@ -60,17 +61,18 @@ class ObjectSmoother:
     # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
 
     def update(
-        self, observations: Sequence[ObjectObservations], path: Path, window: Callable[[], PoseSet]
+        self, observations: Sequence[ObjectObservations], path: Path, last_poses: Callable[[int], PoseSet]
     ) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`.
 
-        The path's last frame is the current one; `window` gives the newest camera poses, and is called if need be.
+        The path's last frame is the current one; `last_poses` gives the camera's poses in so many frames, and is called
+        if need be.
         """
         seen = {o.id: _Measured.of(o, self._stereo) for o in observations}
         self._require_usable(observations, seen)
         if not (self._windows or seen):
             return []
-        camera, out = window(), []
+        camera, out = last_poses(_LAG + _BATCH), []
         for number in sorted({*self._windows, *seen}):
             body = self._windows.get(number)
             if body is None:
@@ -267,4 +269,5 @@ def _cameras(frames: IndexArray, path: Path, known: PoseSet) -> CameraWindow:
         at = max(0, int(np.searchsorted(known.frames, frame, side="right")) - 1)
         J[i, :, at] = np.eye(6) if frame == known.frames[at] else adjoint(inverse(X) @ known.poses[at])
     flat = J.reshape(6 * len(frames), -1)
-    return CameraWindow(poses, flat @ known.covariance @ flat.T + _JITTER * np.eye(len(flat)))
+    P = flat @ known.covariance @ flat.T
+    return CameraWindow(poses, P + np.diag(_JITTER * P.diagonal() + _LEAST))

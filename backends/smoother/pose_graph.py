@@ -11,7 +11,8 @@ from backends.smoother import uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
-from backends.smoother.lag import FixedLag
+from backends.smoother.lag import held_pose, overdue, without_old
+from backends.smoother.marginal import Held
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -19,7 +20,7 @@ from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.uncertainty import PoseSet, WindowJacobians
 from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.tracking.gating import chi_square_gate
 
 #: What lies before the window is read back when the window's oldest pose has been revised by so much [m, or sine].
@@ -32,6 +33,9 @@ _SELDOM, _AT_ONCE = 0.01, 20
 #: Each time a variable is linearised anew, all that was seen since it was first seen is eliminated again, so it is done
 #: for many together: every so many frames. What is off by so many times as much is not left to wait.
 _EVERY, _OFF = 10, 10.0
+
+#: A landmark is solved anew where a single step would change its sum of squares by so much.
+_FAR = 1.0
 
 #: Steps that take landmarks to where their mended measurements put them.
 _REFINED = 3
@@ -50,20 +54,22 @@ class PoseGraph:
 
     Attributes:
         measurement_log: poses, measurements and landmarks as they are believed now.
+        rebuilds: how often all was put into a new solver.
     """
 
     def __init__(self, make: FactorMaker, config: SmootherConfig) -> None:
         self.measurement_log = MeasurementLog()
         self._make = make
         self._config = config
-        self._lag = None if config.lag is None else FixedLag(self.measurement_log, config.lag, config.explicit)
-        self._factor_builder = FactorBuilder(make, config, self.measurement_log, self._lag)
+        self._factor_builder = FactorBuilder(make, config, self.measurement_log)
         self._often, self._seldom, self._last = (
             thresholds(make.stereo, config.relinearise, share) for share in (_OFF, 1.0, _LAST / config.relinearise)
         )
-        self._solver = Solver(self._seldom)
+        self._solver = self._new_solver()
         self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
+        self.rebuilds = 0
         self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
+        self._broken = False  # whether a call was interrupted since
         self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
         self._converged = 0  # number of frames then
@@ -76,13 +82,24 @@ class PoseGraph:
         """CPU time spent in gtsam's solvers [s]."""
         return self._seconds + self._solver.seconds
 
+    def interrupted(self) -> None:
+        """Note that the solver may hold what is not on record: it is made anew before anything else is done."""
+        self._broken, self._window, self._carried = True, None, None
+
+    def mend(self) -> None:
+        """Make the solver anew after an interruption."""
+        if self._broken:
+            self._recover()
+            self._broken = False
+
     def append_pose(self, stamp: float, T_world_left: Array) -> None:
         """Add a frame without measurements."""
         self.measurement_log.path.append(stamp, T_world_left)
         try:
-            self._enter_pose(self._change(), 1.0)
+            self._enter_pose(Change(), 1.0)
         except SolverError:
             self._recover()
+        self._advance()
 
     def append_measured_pose(
         self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array, impulse: float
@@ -102,7 +119,7 @@ class PoseGraph:
         marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count
         self.measurement_log.path.append(stamp, T_world_left)
         rows = self.measurement_log.measurements.append(z, frame, marks.serial[slots])
-        change = self._change()
+        change = Change()
         grown = self._factor_builder.grow(change, slots, rows, z)
         try:
             try:
@@ -114,6 +131,7 @@ class PoseGraph:
         except SolverError as error:
             self.measurement_log.take_back(slots, rows)
             self._recover()
+            self._advance()
             return str(error)
         marks.measured(slots, rows, frame)
         self.measurement_log.path.note_measured()
@@ -124,6 +142,7 @@ class PoseGraph:
         except SolverError:
             self._recover()
         self._factor_builder.finish_tracks(slots)
+        self._advance()
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
@@ -192,17 +211,38 @@ class PoseGraph:
             self._last_window = self._window if count else None
         return self._window
 
+    def last_poses(self, count: int) -> PoseSet:
+        """The window, or the last `count` poses where it leaves some of them out: those without measurements."""
+        window, path = self.window(), self.measurement_log.path
+        frames = np.arange(max(self._factor_builder.oldest, path.count - count), path.count)
+        if np.isin(frames, window.frames).all():
+            return window
+        try:
+            return PoseSet(frames, path.poses[frames], self._covariance_of([pose_key(i) for i in frames.tolist()]))
+        except SolverError:
+            return window
+
     def _joint_covariance(self, frames: IndexArray) -> Array:
         """Joint covariance of poses; where the solver cannot give it, the last one carried on by the motion model."""
         keys = [pose_key(i) for i in frames.tolist()]
         try:
-            return self._solver.joint_covariance(keys)
+            return self._covariance_of(keys)
         except SolverError:
             self._recover()
         try:
-            return self._solver.joint_covariance(keys)
+            return self._covariance_of(keys)
         except SolverError:
             return carried_covariance(self._make.models, self.measurement_log.path, self._last_window, frames)
+
+    def _covariance_of(self, keys: list[int]) -> Array:
+        """Joint covariance of poses as it is while none is held."""
+        held = self.measurement_log.history.held
+        if held is None:
+            return self._solver.joint_covariance(keys)
+        others = [key for key in keys if key != held.key]
+        P = self._solver.joint_covariance([held.key, *others])
+        P = held.let_go(P, P[:, :6], P[:6, :6])
+        return P if len(others) < len(keys) else P[6:, 6:]
 
     def landmarks_by_window(self, slots: IndexArray) -> Array:
         """Jacobians (M, 3, 6 W) of landmark positions by the poses of the window."""
@@ -218,10 +258,14 @@ class PoseGraph:
         older than the window to move with its oldest pose, which makes them a little too large.
         """
         marks = self.measurement_log.landmarks
+        if not self.measurement_log.path.count:  # a map that is known, and no pose in it yet
+            return marks.covariance[slots]
         P = uncertainty.quadratic(self.landmarks_by_window(slots), self.window().covariance) + marks.covariance[slots]
         variables = marks.variable[slots].tolist()
         try:
-            exact = self._solver.point_covariances(variables, pose_key(self.measurement_log.path.count - 1))
+            exact = self._solver.point_covariances(
+                variables, pose_key(self.measurement_log.path.count - 1), self.measurement_log.history.held
+            )
         except SolverError:
             self._recover()
             return P
@@ -243,32 +287,31 @@ class PoseGraph:
             self._recover()
         self._solved, self._window = True, None
 
-    def _read_all(self) -> None:
-        """Bring all poses and landmarks on record up to what the solver has."""
+    def _read_all(self, before: Array | None = None) -> None:
+        """Bring all poses and landmarks on record up to what the solver has; `before` are the poses as they were."""
         path = self.measurement_log.path
         if path.count:
+            before = path.poses.copy() if before is None else before
             path.poses[:] = self._solved_poses()
             if self.measurement_log.measurements.count:
-                self._place(self.measurement_log.landmarks.used())
+                self._place(self.measurement_log.landmarks.used(), before)
             self._moved, self._converged = 0.0, path.count
 
     def _solved_poses(self) -> Array:
         """All poses, those that are variables as the solver has them."""
         poses = self.measurement_log.path.poses.copy()
-        first = 0 if self._lag is None else self._lag.first
+        first = self.measurement_log.history.first
         if len(poses):
             values = self._solver.values()
             poses[first:] = [values.atPose3(pose_key(i)).matrix() for i in range(first, len(poses))]
         return poses
 
-    # --- factors ---
+    def _new_solver(self) -> Solver:
+        """An empty solver for as many variables as there will be."""
+        c = self._config
+        return Solver(self._seldom, None if c.lag is None else 2 * (c.lag + c.explicit))
 
-    def _change(self) -> Change:
-        """The change that comes with the newest pose, empty but for what leaves."""
-        change = Change()
-        if self._lag is not None:
-            self._lag.advance(change)
-        return change
+    # --- factors ---
 
     def _enter_pose(self, change: Change, impulse: float) -> list[int]:
         """Add the newest pose with its prior or motion to the change, and solve; returns the new factors' slots."""
@@ -282,6 +325,33 @@ class PoseGraph:
         self._window, self._solved = None, False
         return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
 
+    # --- the lag ---
+
+    def _advance(self) -> None:
+        """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
+        first = None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+        if first is None:
+            return
+        try:
+            rest = without_old(self.measurement_log, self._solver, first, self._config.explicit)
+            self._factor_builder.eliminate_late(rest.change, first, rest.gone)
+            solver = self._new_solver()
+            new = solver.update(rest.change)
+            held = _informed(rest.held, solver)
+            left = self._solver.poses(pose_key(i) for i in range(self.measurement_log.history.first, first))
+        except SolverError:
+            return
+        marks = self.measurement_log.landmarks
+        self.measurement_log.path.poses[first - len(left) : first] = left
+        marks.variable[np.isin(marks.variable, rest.gone)] = -1
+        for track in rest.finished:
+            track.restart()
+        for track in marks.tracks.values():
+            track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
+        self.measurement_log.advance(first, rest.gone, rest.prior, held)
+        self._seconds += self._solver.seconds
+        self._solver, self._window, self._carried = solver, None, None
+
     # --- the way back from the solver ---
 
     def _read_back(self, slots: IndexArray) -> None:
@@ -292,41 +362,53 @@ class PoseGraph:
         """
         path = self.measurement_log.path
         first = max(0, path.count - self._config.window)
-        before = path.poses[first].copy()
+        before = path.poses.copy()
         path.poses[first:] = self._solver.poses(pose_key(i) for i in range(first, path.count))
-        self._moved += float(np.abs(path.poses[first] - before).max())
+        self._moved += float(np.abs(path.poses[first] - before[first]).max())
         waited = path.count - self._converged >= _SELDOM * path.count
         if self._moved > (_STALE if waited else _AT_ONCE * _STALE):
-            self._read_all()
+            self._read_all(before)
         else:
-            self._place(slots)
+            self._place(slots, before)
 
-    def _place(self, slots: IndexArray) -> None:
-        """Positions of landmarks that fit the poses on record."""
-        marks = self.measurement_log.landmarks
+    def _place(self, slots: IndexArray, before: Array | None = None) -> None:
+        """Positions of landmarks that fit the poses on record.
+
+        `before` (F, 4, 4) are the poses as they were; a landmark first goes with the last one that measured it.
+        """
+        r, marks = self.measurement_log, self.measurement_log.landmarks
         variables = marks.variable[slots]
         explicit = variables >= 0
+        others = slots[~explicit]
+        if before is not None:
+            last = marks.last[others]
+            moved = r.path.poses[last] @ inverse(before[last])
+            turned = moved[:, :3, :3] @ marks.position[others][:, :, None]
+            marks.position[others] = turned[:, :, 0] + moved[:, :3, 3]
         marks.position[slots[explicit]] = self._solver.points(variables[explicit].tolist())
-        marks.position[slots[~explicit]] += self._linearise(slots)[~explicit]
+        step, gain = self._linearise(slots)
+        far = ~explicit & (gain > _FAR)
+        if far.any():
+            marks.position[slots[far]] = uncertainty.refined(
+                self._make.stereo, self._make.sigma, r.path.poses, r.measurements, marks, slots[far]
+            )
+            step[far] = self._linearise(slots[far])[0]
+        near = ~explicit & (gain <= _FAR)
+        marks.position[slots[near]] += step[near]
 
-    def _linearise(self, slots: IndexArray) -> Array:
-        """Covariances of landmarks by their recent measurements; returns steps (M, 3) to better positions."""
+    def _linearise(self, slots: IndexArray) -> tuple[Array, Array]:
+        """Covariances of landmarks by their recent measurements; returns steps (M, 3) to better positions and gains."""
         r, marks = self.measurement_log, self.measurement_log.landmarks
+        position = marks.position[slots]
         E, residuals = uncertainty.linearise(
-            self._make.stereo,
-            self._make.sigma,
-            r.path.poses,
-            r.measurements,
-            marks.position[slots],
-            marks.recent[slots],
+            self._make.stereo, self._make.sigma, r.path.poses, r.measurements, position, marks.recent[slots]
         )
-        offset = marks.mean[slots] - marks.position[slots]
-        step, marks.covariance[slots] = uncertainty.position_step(
-            E, residuals, marks.older[slots], marks.prior[slots], offset
+        step, marks.covariance[slots], gain = uncertainty.position_step(
+            E, residuals, marks.older[slots], np.zeros_like(position), marks.prior[slots], marks.mean[slots] - position
         )
         marks.information[slots] = np.swapaxes(E, 2, 3) @ E
         self._carried = None
-        return step
+        return step, gain
 
     # --- failures ---
 
@@ -363,21 +445,33 @@ class PoseGraph:
         Raises:
             SolverError: that cannot be solved either.
         """
+        self.rebuilds += 1
         change, places = whole_problem(self._make, self.measurement_log)
         start = time.process_time()
         try:
             if solved:
                 change.values = optimise(change)
+            prior = self.measurement_log.history.prior
+            held = None if prior is None else held_pose(self.measurement_log, prior, change.values)
         finally:
             self._seconds += time.process_time() - start
-        solver = Solver(self._seldom)
+        if held is not None:
+            change.factors.add(held.factor())
+        solver = self._new_solver()
         new = solver.update(change)
+        held = _informed(held, solver)
+        self._broken = True  # until all of the following has been done
+        self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():
             track.factor = -1
         for track, place in places:
             track.factor = new[place]
         self._seconds += self._solver.seconds
         self._solver, self._window, self._rebuilt = solver, None, self.measurement_log.path.count
-        if self._lag is not None:
-            self._lag.restart()
         self._read_all()
+        self._broken = False
+
+
+def _informed(held: Held | None, solver: Solver) -> Held | None:
+    """What is known of the pose that is held, by a solver that is new."""
+    return None if held is None else held.informed(solver.joint_covariance([held.key]))

@@ -131,6 +131,21 @@ def predict_points(predicted: PredictedPose, points: Array, own: Array, by_windo
     return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, R.T @ own @ R)
 
 
+def residual_noise(stereo: RectifiedStereo, sigma: float, points: PredictedPoints, z: Array) -> Array:
+    """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
+
+    Pixel noise and the landmark's own uncertainty, linearised where the landmark is believed to be or where it was
+    measured, whichever leaves less: close to the camera a small error of depth would explain any pixel.
+    """
+    _, J = stereo.project(points.local)
+    own = J @ points.own @ np.swapaxes(J, 1, 2)
+    _, J = stereo.project(stereo.triangulate(z))
+    measured = J @ points.own @ np.swapaxes(J, 1, 2)
+    size, other = (np.trace(C, axis1=1, axis2=2) for C in (own, measured))
+    smaller = (other > 0) & (other < size)
+    return np.where(smaller[:, None, None], measured, own) + sigma**2 * np.eye(3)
+
+
 def normalised_innovation(
     stereo: RectifiedStereo, sigma: float, predicted: PredictedPose, points: PredictedPoints, z: Array, step: Array
 ) -> tuple[float, int]:

@@ -22,9 +22,11 @@ def whole_problem(make: FactorMaker, measurement_log: MeasurementLog) -> tuple[C
         points = [make.point(z) for z in measurement_log.measurements.z[rows].tolist()]
         change.factors.add(make.smart(points, pose_keys(measurement_log, rows)))
     for key, all_rows in measurement_log.history.explicit.items():
-        add_landmark(change, make, measurement_log, key, np.array(all_rows), measurement_log.history.places[key])
-        known = measurement_log.history.known.get(int(measurement_log.measurements.landmark[all_rows[0]]))
-        if known is not None:
+        add_landmark(
+            change, make, measurement_log, key, np.array(all_rows, np.intp), measurement_log.history.places[key]
+        )
+        known = measurement_log.history.known.get(measurement_log.history.owner[key])
+        if known is not None and not known.hangs_before(measurement_log.history.first):
             change.factors.add(make.known(key, known))
     places = []
     for track in measurement_log.landmarks.tracks.values():
@@ -35,13 +37,20 @@ def whole_problem(make: FactorMaker, measurement_log: MeasurementLog) -> tuple[C
 
 
 def add_poses(change: Change, make: FactorMaker, measurement_log: MeasurementLog, restarted: int = 0) -> None:
-    """All poses, with what ties them to each other and to the world; the first `restarted` as they stand."""
-    path = measurement_log.path
-    for i in range(path.count):
+    """All poses that are variables, with what ties them to each other and to the world.
+
+    Those of the first `restarted` frames stand to each other as they are on record.
+    """
+    path, first, prior = measurement_log.path, measurement_log.history.first, measurement_log.history.prior
+    if prior is not None:
+        change.factors.add(prior.factor())
+    for i in range(first, path.count):
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
-        if 0 < i < restarted:
+        if first < i < restarted:
             relative = inverse(path.poses[i - 1]) @ path.poses[i]
             factor = make.step((pose_key(i - 1), pose_key(i)), relative, path.stamps[i] - path.stamps[i - 1])
+        elif prior is not None and i < first + 2:
+            continue  # the prior holds what ties it to those that left
         else:
             factor = pose_factor(make, path, i, measurement_log.history.impulses[i])
         change.factors.add(factor)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -15,6 +15,9 @@ from scipy.linalg import solve_triangular
 from backends.smoother.variables import ballast_key, size_of
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
+
+if TYPE_CHECKING:
+    from backends.smoother.marginal import Held
 
 _T = TypeVar("_T")
 
@@ -45,16 +48,12 @@ class Change:
         late: variables to eliminate late, those of the first set before those of the second: what will be touched
             again soon. Without it a landmark that was seen from many poses may be eliminated before them, and with it
             in between everything is touched by everything.
-        leaving: variables to marginalise after the update; all their factors stay as they are from then on.
-        staying: all other variables that were there before; only needed where some leave.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     removed: list[int] = field(default_factory=list)
     late: tuple[set[int], set[int]] = field(default_factory=lambda: (set(), set()))
-    leaving: list[int] = field(default_factory=list)
-    staying: list[int] = field(default_factory=list)
 
 
 class Solver:
@@ -62,12 +61,13 @@ class Solver:
 
     Args:
         thresholds: how far each kind of variable may move before it is linearised anew.
+        variables: about so many there will be at most; None for no end of them.
 
     Attributes:
         seconds: CPU time spent in gtsam so far.
     """
 
-    def __init__(self, thresholds: gtsam.ISAM2ThresholdMap) -> None:
+    def __init__(self, thresholds: gtsam.ISAM2ThresholdMap, variables: int | None = None) -> None:
         self.seconds = 0.0
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(thresholds)
@@ -75,7 +75,8 @@ class Solver:
         parameters.findUnusedFactorSlots = True
         parameters.cacheLinearizedFactors = True
         self._isam = gtsam.ISAM2(parameters)
-        self._guarded(lambda: self._isam.update(*_ballast()))
+        self._ballast = _BALLAST if variables is None else min(variables, _BALLAST)
+        self._guarded(lambda: self._isam.update(*_ballast(self._ballast)))
 
     def update(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap | None = None) -> list[int]:
         """One step; returns the slots of the new factors, in their order.
@@ -91,14 +92,9 @@ class Solver:
             self._isam.params().setRelinearizeThreshold(thresholds)  # gtsam hands out its own, not a copy
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = change.removed
-        if change.leaving:
-            parameters.constrainedKeys = _groups(set(change.staying) - set().union(*change.late), *change.late)
-            parameters.extraReelimKeys = _key_list([*change.leaving, *change.staying])
-        elif any(change.late):
+        if any(change.late):
             parameters.constrainedKeys = _groups(*change.late)
         result = self._guarded(lambda: self._isam.update(change.factors, change.values, parameters))
-        if change.leaving:  # eliminated first of all, so they are leaves of the tree
-            self._guarded(lambda: self._isam.marginalizeLeaves(_key_list(change.leaving)))
         return result.getNewFactorsIndices()
 
     def converge(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
@@ -137,23 +133,29 @@ class Solver:
             raise SolverError("gtsam: a covariance is not finite and positive")
         return P
 
-    def point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+    def point_covariances(self, keys: list[int], newest: int, held: Held | None = None) -> dict[int, Array]:
         """Covariances (3, 3) of those point variables that were eliminated together with the newest pose, or after it.
+
+        As they are while the pose `held` is not.
 
         Raises:
             SolverError: gtsam failed.
         """
-        return self._guarded(lambda: self._point_covariances(keys, newest))
+        return self._guarded(lambda: self._point_covariances(keys, newest, held))
 
-    def _point_covariances(self, keys: list[int], newest: int) -> dict[int, Array]:
+    def _point_covariances(self, keys: list[int], newest: int, held: Held | None) -> dict[int, Array]:
         root = _root_of(self._isam, newest)
-        if root is None:
+        if root is None or (held is not None and held.key not in root[0]):
             return {}
         variables, R = root
         starts = dict(zip(variables, np.cumsum([0, *map(size_of, variables)]).tolist()))
         half = np.asarray(solve_triangular(R, np.eye(len(R))))
         rows = {key: half[starts[key] : starts[key] + 3] for key in keys if key in starts}
-        return {key: part @ part.T for key, part in rows.items()}
+        if held is None:
+            return {key: part @ part.T for key, part in rows.items()}
+        own = half[starts[held.key] : starts[held.key] + 6]
+        P = own @ own.T
+        return {key: held.let_go(part @ part.T, part @ own.T, P) for key, part in rows.items()}
 
     def _joint_covariance(self, keys: list[int]) -> Array:
         root = _root_of(self._isam, keys[-1])
@@ -166,6 +168,13 @@ class Solver:
     def values(self) -> gtsam.Values:
         """All variables, solved to the last."""
         return self._guarded(self._isam.calculateBestEstimate)
+
+    def factors(self) -> Iterator[tuple[int, gtsam.NonlinearFactor]]:
+        """All factors but those of the ballast, with their slots."""
+        graph = self._isam.getFactorsUnsafe()
+        for slot in range(self._ballast, graph.size()):
+            if graph.exists(slot):
+                yield slot, graph.at(slot)
 
     def _guarded(self, call: Callable[[], _T]) -> _T:
         start = time.process_time()
@@ -185,13 +194,6 @@ def _groups(*late: set[int]) -> gtsam.KeyGroupMap:
         for key in keys:
             groups.insert2(key, number)
     return groups
-
-
-def _key_list(keys: list[int]) -> gtsam.KeyList:
-    out = gtsam.KeyList()
-    for key in keys:
-        out.push_back(key)
-    return out
 
 
 def _root_of(isam: gtsam.ISAM2, key: int) -> tuple[list[int], Array] | None:
@@ -226,11 +228,11 @@ def _covariance_in(variables: list[int], R: Array, keys: list[int]) -> Array:
     return half.T @ half
 
 
-def _ballast() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _ballast(count: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Variables that nothing depends on, with their factors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
-    for i in range(_BALLAST):
+    for i in range(count):
         key = ballast_key(i)
         values.insert(key, np.zeros(1))
         graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))

@@ -18,6 +18,11 @@ from backends.smoother.measurement_log import IndexArray, Landmarks, Measurement
 from backends.smoother.stereo import RectifiedStereo
 from slam.geometry.se3 import Array
 
+#: Landmarks are refined until another step would lessen their sum of squares by less than this, in at most so many.
+_GAIN, _REFINEMENTS = 0.01, 10
+_DAMPING = 0.01  # the first that is tried where a plain step fails, as a share of the information
+_BEHIND = 1e4  # sum of squares of a measurement whose landmark lies behind the camera
+
 
 def linearise(
     stereo: RectifiedStereo, sigma: float, poses: Array, measurements: Measurements, points: Array, rows: IndexArray
@@ -41,11 +46,15 @@ def linearise(
     return E.reshape(*shape, 3, 3) / sigma, r.reshape(*shape, 3) / sigma
 
 
-def position_step(E: Array, r: Array, older: Array, prior: Array, offset: Array) -> tuple[Array, Array]:
-    """Gauss-Newton steps (M, 3) of the positions, and their covariances (M, 3, 3) where all poses are known.
+def position_step(
+    E: Array, r: Array, older: Array, moved: Array, prior: Array, offset: Array, damping: Array | float = 0.0
+) -> tuple[Array, Array, Array]:
+    """Gauss-Newton steps (M, 3) of the positions, their covariances (M, 3, 3) where all poses are known, and gains.
 
-    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones, `prior` (M, 3, 3) what
-    was known beforehand of positions that stand `offset` (M, 3) from where they are now.
+    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones, on positions that stand
+    `moved` (M, 3) from where they are now; `prior` (M, 3, 3) what was known beforehand of positions `offset` (M, 3)
+    from where they are now. `damping` (M,) multiplies the information's diagonal. The gain (M,) is by how much a step
+    lessens the sum of squares, were it linear.
     """
     count, width = r.shape[:2]
     E = E.reshape(count, 3 * width, 3)
@@ -53,9 +62,51 @@ def position_step(E: Array, r: Array, older: Array, prior: Array, offset: Array)
     information = Et @ E + older + prior
     # Far points leave their depth nearly free: the little that is added keeps the inverse finite.
     information += np.eye(3) * (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-12)
+    information += np.eye(3) * information * np.reshape(damping, (-1, 1, 1))
     covariance = np.linalg.inv(information)
-    step = covariance @ (Et @ r.reshape(count, 3 * width, 1) + prior @ offset[:, :, None])
-    return step[:, :, 0], covariance
+    gradient = Et @ r.reshape(count, 3 * width, 1) + older @ moved[:, :, None] + prior @ offset[:, :, None]
+    step = covariance @ gradient
+    return step[:, :, 0], covariance, (gradient * step).sum(axis=(1, 2))
+
+
+def refined(
+    stereo: RectifiedStereo, sigma: float, poses: Array, measurements: Measurements, marks: Landmarks, slots: IndexArray
+) -> Array:
+    """Positions (M, 3) of landmarks that fit their recent measurements, by Levenberg-Marquardt on each by itself.
+
+    A single step of Gauss-Newton from afar may end behind the camera.
+    """
+    start, rows, older = marks.position[slots], marks.recent[slots], marks.older[slots]
+    prior, mean = marks.prior[slots], marks.mean[slots]
+
+    def at(x: Array, m: IndexArray) -> tuple[Array, Array, Array]:
+        E, r = linearise(stereo, sigma, poses, measurements, x, rows[m])
+        behind = (rows[m] >= 0) & (E == 0).all(axis=(2, 3))
+        cost = (r**2).sum(axis=(1, 2)) + _form(older[m], start[m] - x) + _form(prior[m], mean[m] - x)
+        return E, r, cost + _BEHIND * behind.sum(axis=1)
+
+    x, damping, todo = start.copy(), np.zeros(len(slots)), np.arange(len(slots))
+    E, r, cost = at(x, todo)
+    for _ in range(_REFINEMENTS):
+        step, _, gain = position_step(
+            E[todo], r[todo], older[todo], start[todo] - x[todo], prior[todo], mean[todo] - x[todo], damping[todo]
+        )
+        todo, step = todo[gain > _GAIN], step[gain > _GAIN]
+        if not len(todo):
+            break
+        tried = x[todo] + step
+        E_new, r_new, cost_new = at(tried, todo)
+        better = cost_new < cost[todo]
+        rows_better = todo[better]
+        x[rows_better], E[rows_better], r[rows_better] = tried[better], E_new[better], r_new[better]
+        cost[rows_better] = cost_new[better]
+        damping[todo] = np.where(better, 0.1 * damping[todo], np.maximum(10 * damping[todo], _DAMPING))
+    return x
+
+
+def _form(A: Array, x: Array) -> Array:
+    """``xᵀ A x`` (M,) for A (M, 3, 3) and x (M, 3)."""
+    return np.einsum("mi,mij,mj->m", x, A, x)
 
 
 @dataclass(frozen=True)

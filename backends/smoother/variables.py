@@ -41,6 +41,11 @@ def size_of(key: int) -> int:
     return 6 if gtsam.symbolChr(key) == ord(_POSE) else 3
 
 
+def put(values: gtsam.Values, key: int, of: gtsam.Values) -> None:
+    """Insert a pose or landmark `of` other values."""
+    values.insert(key, of.atPose3(key) if size_of(key) == 6 else of.atPoint3(key))
+
+
 def landmark_threshold(stereo: RectifiedStereo, distance: float, error: float) -> float:
     """How far a landmark may move along its ray before linearised pixels are off by `error` [px].
 

@@ -72,7 +72,7 @@ def main() -> None:
 def _print_version(wanted: bool) -> None:
     """What ``--version`` prints."""
     if wanted:
-        from slam.run.runner import versions
+        from slam.run.repeat import versions
 
         print(f"surf-stereo-slam {versions()['surf-stereo-slam']}")
         raise typer.Exit
@@ -140,6 +140,9 @@ def run_command(
     draw: Annotated[
         Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
     ] = None,
+    overlap: Annotated[
+        bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
+    ] = True,
     picture: PictureOption = True,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -155,7 +158,8 @@ def run_command(
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
-        options = replace(options, out=folder, record=record, save_map=save_map, origin=origin.to_json(folder))
+        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap)
+        options = replace(options, origin=origin.to_json(folder))
         watches = []
         if viewer is not None:
             from slam.run.viewer import Viewer

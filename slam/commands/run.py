@@ -11,8 +11,8 @@ from pathlib import Path
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
-from slam.run.repeat import Origin, Repeat, changed_versions, load
-from slam.run.runner import RunOptions, parse_frames, versions
+from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
+from slam.run.runner import RunOptions, parse_frames
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 

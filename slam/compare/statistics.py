@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _LIKELY = 0.1  # p up to which a difference is called likely
 FEWEST = int(np.ceil(np.log2(2 / (1 - LEVEL))))
 
 
-class Verdict(str, Enum):
+class Verdict(StrEnum):
     """What may be concluded of a difference."""
 
     CERTAIN = "certain"  #: interval and test agree that there is one

@@ -108,9 +108,15 @@ def _mean_rows(group: Group) -> Iterable[tuple[object, ...]]:
         for backend in group.runs:
             values = group.values(backend, metric.key)
             values = values[np.isfinite(values)]
-            figures = (values.mean(), _sd(values), values.min(), values.max()) if len(values) else (np.nan,) * 4
             head = (group.sequence, group.variant.name, group.mode, backend, metric.key)
-            yield (*head, len(values), group.failures(backend), *map(_number, figures))
+            yield (*head, len(values), group.failures(backend), *map(_number, _figures(values)))
+
+
+def _figures(values: Array) -> tuple[float, ...]:
+    """Mean, standard deviation, least and greatest; NaN where there are no values."""
+    if not len(values):
+        return (np.nan,) * 4
+    return float(values.mean()), _sd(values), float(values.min()), float(values.max())
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:

@@ -68,7 +68,7 @@ def find_consensus(
     if first.inliers.sum() >= clear:
         return first
     nearer = _polish(rig, points, measured, _approach(rig, points, measured, inverse(guess)), threshold)
-    if nearer.inliers.sum() >= max(clear, first.inliers.sum()):
+    if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
     stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
     if len(stereo) < MINIMAL_POINTS:

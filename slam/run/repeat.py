@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from slam.errors import SlamError
 
 CONFIG = "config.json"
 _SYNTHETIC = "synthetic:"
+_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,17 @@ def load(path: Path, sequence: str | None = None, known_map: Path | None = None)
         raise SlamError(f"{file}: cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that shape a result."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
 
 
 def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> str:

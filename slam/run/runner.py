@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +24,12 @@ from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
-from slam.run.repeat import portable
+from slam.run.repeat import portable, versions
 from slam.run.replay import RecordedFrame, Recording, replay
 from slam.run.schema import STAGES, schema
 from slam.run.settings_reference import in_force
 from slam.sequences import Sequence
 from slam.system import StereoSlam
-
-_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 #: Frames whose pose was measured; accuracy is that of these alone.
 _MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
@@ -55,6 +51,7 @@ class RunOptions:
         known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
         mono: use the left images alone.
+        overlap: read and extract the next frame while the present one is estimated; the results are the same.
         origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
     """
 
@@ -68,6 +65,7 @@ class RunOptions:
     known_map: Path | None = None
     save_map: Path | None = None
     mono: bool = False
+    overlap: bool = True
     origin: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -82,6 +80,7 @@ class RunRecord:
     covariances: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # of the clock at the end of each frame [s]
     rejected: int = 0
     used: int = 0
     nis: float = 0.0
@@ -92,6 +91,7 @@ class RunRecord:
         self.numbers.append(number)
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
+        self.times.append(time.perf_counter())
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)
@@ -147,7 +147,9 @@ def run(
     system = StereoSlam(
         sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
     )
-    return _drive(sequence, options, system, _processed(system, frames, tuple(watches)), RunRecord(), on_frame)
+    return _drive(
+        sequence, options, system, _processed(system, frames, tuple(watches), options.overlap), RunRecord(), on_frame
+    )
 
 
 def run_recording(
@@ -260,12 +262,12 @@ def _recording(
 
 
 def _processed(
-    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...]
+    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...], overlap: bool
 ) -> Iterator[tuple[int, FrameResult]]:
     """Each frame's number and what the system did with it."""
-    for frame, elapsed in _timed(frames):
-        result = system.process(frame)
-        result.milliseconds["read"] = elapsed  # type: ignore[index]
+    reading = _Reading(frames)
+    for frame, result in system.run(reading, overlap):
+        result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
         yield frame.index, result
         for watch in watches:
             watch(frame, result, system)
@@ -293,14 +295,21 @@ class _Replayed:
         return self.recording.landmarks(len(self.record.stamps))
 
 
-def _timed(frames: Iterator[StereoFrame]) -> Iterator[tuple[StereoFrame, float]]:
-    """Frames with the wall time that reading each took [ms]."""
-    while True:
-        start = time.perf_counter()
-        frame = next(frames, None)
-        if frame is None:
-            return
-        yield frame, 1e3 * (time.perf_counter() - start)
+class _Reading:
+    """Frames, and the wall time that reading each took [ms] by its index."""
+
+    def __init__(self, frames: Iterator[StereoFrame]) -> None:
+        self._frames = frames
+        self.milliseconds: dict[int, float] = {}
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        while True:
+            start = time.perf_counter()
+            frame = next(self._frames, None)
+            if frame is None:
+                return
+            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start)
+            yield frame
 
 
 def _summary(sequence: Sequence | Recording, options: RunOptions, record: RunRecord, ended: str) -> dict[str, Any]:
@@ -352,8 +361,8 @@ def _figures(
 
 def _rate(record: RunRecord) -> float | None:
     """Frames per second over all frames but the first, which may wait for compilers; None for a single frame."""
-    seconds = sum(sum(m.values()) for m in record.milliseconds[1:]) / 1e3
-    return (len(record.milliseconds) - 1) / seconds if seconds > 0 else None
+    seconds = record.times[-1] - record.times[0]
+    return (len(record.times) - 1) / seconds if seconds > 0 else None
 
 
 def _timings(record: RunRecord) -> dict[str, Any]:
@@ -378,17 +387,6 @@ def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: St
         "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
         "versions": versions(),
     }
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that shape a result."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:

@@ -118,6 +118,8 @@ def _range(config: Any, name: str, annotation: Any, text: str) -> str:
     if isinstance(default, tuple):
         return f"{len(default)} {'whole ' if int in kinds else ''}numbers"
     also = " or null" if type(None) in kinds else ""
+    if kinds == (type(None),):
+        return "null"
     if bool in kinds:
         return "true or false"
     if str in kinds:

@@ -4,34 +4,82 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, wraps
+from threading import Lock
 from typing import Any, TypeVar
 
 from threadpoolctl import LibController, ThreadpoolController
 
 _F = TypeVar("_F", bound=Callable[..., Any])
+_Changed = list[tuple[LibController, int]]
 
 
 @lru_cache(maxsize=1)
-def _libraries() -> list[LibController]:
-    """The BLAS libraries that are loaded, looked up once."""
-    return [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
+def _libraries() -> tuple[list[LibController], list[LibController]]:
+    """The BLAS libraries that are loaded, looked up once: with one number for the process, and with one per thread."""
+    found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
+    own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
+    return [library for library in found if library not in own], own
+
+
+class _Limit:
+    """The number of BLAS threads of the process is 1 as long as any thread is inside."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._inside = 0
+        self._changed: _Changed = []
+
+    def enter(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._changed = _with_more(_libraries()[0])
+                _set([(library, 1) for library, _ in self._changed])
+            self._inside += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                _set(self._changed)
+                self._changed = []
+
+
+_limit = _Limit()
 
 
 def one_blas_thread(function: _F) -> _F:
-    """Run with one BLAS thread.
+    """Run with one BLAS thread, in whatever thread of Python's.
 
-    As ``ThreadpoolController.limit``, but where there is one thread already it costs a microsecond and not twenty.
+    As ``ThreadpoolController.limit``, but that only works in the thread that used it first, and costs twenty
+    microseconds where there is one thread already. Where the number is one for the whole process, it is set back when
+    no thread needs it any more.
     """
 
     @wraps(function)
     def limited(*args: Any, **kwargs: Any) -> Any:
-        changed = [(library, threads) for library in _libraries() if (threads := library.get_num_threads()) != 1]
+        changed = _with_more(_libraries()[1])
+        _limit.enter()
         try:
-            for library, _ in changed:
-                library.set_num_threads(1)
+            _set([(library, 1) for library, _ in changed])
             return function(*args, **kwargs)
         finally:
-            for library, threads in changed:
-                library.set_num_threads(threads)
+            _set(changed)
+            _limit.leave()
 
     return limited  # type: ignore[return-value]
+
+
+def _with_more(libraries: list[LibController]) -> _Changed:
+    """Those that have more threads than one, and how many."""
+    return [(library, threads) for library in libraries if (threads := library.get_num_threads()) != 1]
+
+
+def _set(numbers: _Changed) -> None:
+    """Set numbers of threads. Since 3.8, threadpoolctl heeds only one thread of Python's unless that is cleared."""
+    for library, threads in numbers:
+        clear = getattr(library, "clear_controlling_thread", None)
+        if clear is not None:
+            clear(force=True)
+        library.set_num_threads(threads)
+        if clear is not None:
+            clear(force=True)

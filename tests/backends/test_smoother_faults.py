@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import count
 
 import gtsam
@@ -252,3 +253,59 @@ def test_impossible_measurements_do_not_end_a_run():
         assert np.isfinite(backend.estimate().T_world_left).all()
     off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate().T_world_left)
     assert np.abs(off[3:]).max() < 0.2 and np.abs(off[:3]).max() < 0.05
+
+
+@pytest.mark.parametrize("lag", [None, 12])
+def test_a_call_that_is_interrupted_did_not_happen(lag):
+    """A KeyboardInterrupt at any function call within the smoother: the same step again, and the run goes on."""
+    data, known = drive(26), set()
+    backend = SmootherBackend(RIG, MODELS, lag=lag)
+    rng = np.random.default_rng(0)
+    interrupted = 0
+    for k, (stamp, _, seen) in enumerate(data):
+        backend.predict(stamp)
+        old = seen.select(np.isin(seen.ids, list(known)))
+        new = seen.select(~np.isin(seen.ids, list(known)))
+        for call in (lambda old=old: backend.update(old), lambda new=new: backend.add(new)):
+            before = (
+                backend.measurement_log.path.count,
+                backend.measurement_log.measurements.count,
+                len(backend.measurement_log.landmarks),
+            )
+            if k > 2 and interrupt(call, int(rng.integers(1, 150))):
+                interrupted += 1
+                measurement_log = backend.measurement_log
+                assert (
+                    measurement_log.path.count,
+                    measurement_log.measurements.count,
+                    len(measurement_log.landmarks),
+                ) == before
+                call()
+            elif k <= 2:
+                call()
+        known.update(new.ids.tolist())
+        assert backend.measurement_log.path.count == k + 1 or backend.measurement_log.path.count == k
+    assert interrupted > 10
+    near_the_truth(backend, data)
+
+
+def interrupt(call, number: int) -> bool:
+    """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
+    left = number
+
+    def profile(frame, event, _):
+        nonlocal left
+        if event == "call" and "backends/smoother/" in frame.f_code.co_filename.replace("\\", "/"):
+            left -= 1
+            if not left:
+                raise KeyboardInterrupt
+
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(before)
+    return False

@@ -193,6 +193,7 @@ assert len(Surf(0, octaves=1).detect(image)) > 0
 """
 
 
+@pytest.mark.slow
 def test_first_use_says_why_it_takes_long_and_later_ones_do_not(tmp_path):
     run = [sys.executable, "-c", FIRST_USE]
     environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": ":".join(filter(None, sys.path))}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.config import SystemConfig
-from slam.data import FrameStatus, StereoFeatures
+from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, UnknownNameError
 from slam.geometry import se3
 from slam.mapping.config import MapConfig
@@ -165,3 +165,46 @@ def test_landmarks_held_in_suspicion_stay_and_are_not_counted():
     np.testing.assert_array_equal(after.ids, held)
     for name in ("seen", "in_view", "missed", "unseen", "last_seen"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
+
+
+class CloudFrontend:
+    """Features of a cloud of points, made from no image; broken from one frame on where asked for."""
+
+    def __init__(self, broken: int | None = None) -> None:
+        self.cloud, self.truth, self.broken = Cloud(150), path(12), broken
+
+    def extract(self, frame: StereoFrame) -> StereoFeatures:
+        if self.broken is not None and frame.index >= self.broken:
+            raise MeasurementError("broken image")
+        return self.cloud.features(self.truth[frame.index], frame.stamp, 0.3)[0]
+
+
+def frames_without_images(count: int = 12) -> list[StereoFrame]:
+    none = np.zeros((240, 320), np.uint8)
+    return [StereoFrame(k, k / 30, none, none) for k in range(count)]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_run_with_overlap_gives_the_same_bytes_as_one_step_after_the_other(backend):
+    frames = frames_without_images()
+    poses = []
+    for overlap in (True, False):
+        system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
+        results = list(system.run(frames, overlap))
+        assert [frame.index for frame, _ in results] == list(range(12))
+        assert "extract" in results[-1][1].milliseconds
+        poses.append(np.array([r.estimate.T_world_left for _, r in results]).tobytes())
+    system = StereoSlam(RIG, CloudFrontend(), backend, config=CONFIG)
+    poses.append(np.array([system.process(f).estimate.T_world_left for f in frames]).tobytes())
+    assert poses[0] == poses[1] == poses[2]
+
+
+def test_a_frame_that_cannot_be_extracted_ends_a_run_after_the_frames_before_it():
+    system = StereoSlam(RIG, CloudFrontend(broken=5), "ekf", config=CONFIG)
+    done = []
+    with pytest.raises(MeasurementError, match="broken image"):
+        for frame, _ in system.run(frames_without_images()):
+            done.append(frame.index)
+    assert done == [0, 1, 2, 3, 4]
+    later = replace(frames_without_images()[5], index=4)
+    assert system.process(later).status is FrameStatus.TRACKED

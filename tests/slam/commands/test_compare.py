@@ -1,19 +1,11 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 
-def slam(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "slam", *map(str, arguments)], capture_output=True, text=True, timeout=300
-    )
-
-
-def test_the_command_leaves_report_and_tables_and_says_what_follows(tmp_path):
-    done = slam(
+@pytest.mark.slow
+def test_the_command_leaves_report_and_tables_and_says_what_follows(slam_command, tmp_path):
+    done = slam_command(
         "compare", "synthetic:aisle?frames=6", "--backends", "ekf,smoother", "--frontends", "simulated", "--no-replay",
         "--workers", 1, "--quick", "--out", tmp_path / "out",
     )  # fmt: skip
@@ -34,8 +26,8 @@ def test_the_command_leaves_report_and_tables_and_says_what_follows(tmp_path):
         (["synthetic:aisle", "--variant", "a:surf:b"], "form"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path, arguments, word):
-    done = slam("compare", *arguments, "--out", tmp_path / "out")
+def test_bad_input_is_one_line(slam_command, tmp_path, arguments, word):
+    done = slam_command("compare", *arguments, "--out", tmp_path / "out")
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr

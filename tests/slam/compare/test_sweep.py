@@ -70,6 +70,7 @@ def test_a_replay_gives_all_back_ends_what_the_first_was_given(done):
                 assert run.metrics[key] == given.metrics[key]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_two_workers_one_killed_half_way_leave_the_same_tables(done, tmp_path):
     ended = []
@@ -85,6 +86,7 @@ def test_two_workers_one_killed_half_way_leave_the_same_tables(done, tmp_path):
     assert tables(tmp_path) == tables(done[0])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Dask's own
 def test_a_cluster_leaves_the_same_tables(done, tmp_path):
     distributed = pytest.importorskip("distributed")

@@ -34,7 +34,7 @@ def evo(command, *arguments, home):
     script = Path(sys.executable).with_name(command)
     environment = {**os.environ, "HOME": str(home), "USERPROFILE": str(home), "MPLBACKEND": "Agg"}
     words = [str(script), *map(str, arguments)]
-    answer = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=120)
+    answer = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=600)
     assert answer.returncode == 0, answer.stderr
     return answer.stdout
 

@@ -121,7 +121,7 @@ def assert_proper(R: np.ndarray) -> None:
     assert np.linalg.det(R) == pytest.approx(1, abs=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10_000), st.integers(3, 30), st.floats(0.01, 100))
 def test_alignment_undoes_a_similarity(seed: int, count: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def test_alignment_undoes_a_similarity(seed: int, count: int, scale: float) -> N
     assert_proper(rigid.R)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10_000), st.sampled_from([2, 3]), st.integers(1, 6))
 def test_no_other_rotation_is_better(seed: int, dimensions: int, count: int) -> None:
     """Random pairs, mirrored ones among them: a small turn or shift never helps."""

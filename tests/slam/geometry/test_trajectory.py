@@ -39,7 +39,7 @@ def assert_same(read: Trajectory, written: Trajectory, position: float = POSITIO
     assert np.allclose(np.linalg.det(read.poses[:, :3, :3]), 1, atol=1e-8)
 
 
-quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @quick

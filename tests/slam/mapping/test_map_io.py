@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
 import zipfile
 from dataclasses import replace
 from io import BytesIO
@@ -220,11 +218,7 @@ def test_there_is_no_map_before_the_first_frame():
         StereoSlam(RIG, None, "ekf").snapshot()
 
 
-def slam_command(*arguments):
-    return subprocess.run([sys.executable, "-m", "slam", *arguments], capture_output=True, text=True, check=False)
-
-
-def test_the_command_saves_and_starts_and_refuses(tmp_path):
+def test_the_command_saves_and_starts_and_refuses(slam_command, tmp_path):
     kept = str(tmp_path / "desk.map")
     run = ("run", "synthetic:desk?seed=1", "--quiet", "--out")
     done = slam_command(*run, str(tmp_path / "one"), "--frames", "0:5", "--save-map", kept)

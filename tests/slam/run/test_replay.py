@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -217,22 +215,18 @@ def test_recordings_are_checked_when_made(recording):
         replace(recording, removed=np.arange(3))
 
 
-def test_the_command_records_and_replays(tmp_path):
-    def run(*arguments):
-        command = [sys.executable, "-m", "slam", *map(str, arguments)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=300)
-
+def test_the_command_records_and_replays(slam_command, tmp_path):
     file = tmp_path / "run.npz"
-    done = run("run", "synthetic:aisle?frames=4", "--record", file, "--out", tmp_path / "first", "--quiet")
+    done = slam_command("run", "synthetic:aisle?frames=4", "--record", file, "--out", tmp_path / "first", "--quiet")
     assert done.returncode == 0, done.stderr
-    done = run("replay", file, "--backend", "smoother", "--out", tmp_path / "second")
+    done = slam_command("replay", file, "--backend", "smoother", "--out", tmp_path / "second")
     assert done.returncode == 0, done.stderr
     assert "smoother" in done.stdout
     names = [{p.name for p in (tmp_path / each).iterdir()} for each in ("first", "second")]
     assert names[0] == names[1]
     paths = [Trajectory.read_tum(tmp_path / each / "trajectory.txt") for each in ("first", "second")]
     np.testing.assert_allclose(paths[0].positions, paths[1].positions, atol=0.01)
-    done = run("run", "synthetic:aisle", "--record", tmp_path / "no" / "run.npz", "--out", tmp_path / "third")
+    done = slam_command("run", "synthetic:aisle", "--record", tmp_path / "no" / "run.npz", "--out", tmp_path / "third")
     assert done.returncode == 2 and "there is no folder" in done.stderr
-    done = run("replay", tmp_path / "nothing.npz", "--out", tmp_path / "third")
+    done = slam_command("replay", tmp_path / "nothing.npz", "--out", tmp_path / "third")
     assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1

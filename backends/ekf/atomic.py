@@ -1,0 +1,28 @@
+"""Calls that happen or do not: where one is broken off, for whatever reason, the filter is as it was before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def all_or_nothing(method: _F) -> _F:
+    """Put the object back as it was where the method does not come to its end, as by an interrupt from the keyboard.
+
+    The object offers ``saved()``, which returns a function that does so. The parts of a filter make that cheap: they
+    replace their arrays and never change one in place, or note what stood there.
+    """
+
+    @wraps(method)
+    def whole(self: Any, *args: Any, **kwargs: Any) -> Any:
+        restore = self.saved()
+        try:
+            return method(self, *args, **kwargs)
+        except BaseException:
+            restore()
+            raise
+
+    return whole  # type: ignore[return-value]

@@ -1,0 +1,178 @@
+"""What the filter tries where most observations contradict its prediction.
+
+The prediction is then at fault, and not they. It may be so far off that its linearisation does not hold: then the pose
+on which the matches agree, where the caller knows it, is a better place for that. Or an impulse (or a turn that the
+Euler model does not follow) was larger than the motion model expects: a wider motion noise lets the observations pass.
+Or the filter has lost its way (a stretch with next to nothing to see, a long gap): the landmarks agree on a pose that
+no impulse explains. Then the camera starts anew there, in the same map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import bdtrc, gammainc, gammaincinv
+
+from backends.ekf.covariance import POSE
+from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
+from slam.geometry.pnp import find_consensus
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.models import EstimatorModels
+from slam.tracking.gating import chi_square_limits
+
+ENOUGH = 6  #: observations that can be judged to agree with each other
+_HEEDED = 3  # one in so many observations is enough to agree with a prediction
+_CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
+_HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
+_AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
+
+#: The change of [r, φ] (6,) to a pose on which landmarks agree, if there is one.
+Search = Callable[[], "Array | None"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A solution, the problem that it solves, and the noise (12, 12) that joined the camera's covariance for it."""
+
+    problem: Problem
+    solution: Solution
+    noise: Array | None = None
+
+
+def agreement(problem: Problem, noises: Sequence[Array], search: Search, models: EstimatorModels) -> Agreement | None:
+    """Solve with the prior that most observations agree with.
+
+    Less than a third of the observations is not heeded where as many wrong ones might agree by chance: these move the
+    pose anywhere.
+
+    Args:
+        problem: the update.
+        noises: motion noises (12, 12) that may have been there in addition, smallest first.
+        search: finds the pose on which the landmarks agree; only called where nothing else helps.
+        models: how fast a camera may be that starts anew.
+
+    Returns:
+        the solution with its prior, or None where there is none.
+
+    Raises:
+        UnsolvableError: there is none, and the reason is numerical.
+    """
+    found, error = None, None
+    try:
+        found = _as_predicted(problem, noises)
+    except UnsolvableError as reason:
+        error = reason
+    if found is None or 2 * found.solution.used.sum() < len(problem.z):
+        found = _restarted(problem, search, models) or found
+    if found is None and error is not None:
+        raise error
+    return found
+
+
+def _as_predicted(problem: Problem, noises: Sequence[Array]) -> Agreement | None:
+    """With the prediction, or a wider one that most observations pass the gate of."""
+    wider, gated, noise = _gated(problem, noises)
+    found = _heeded(wider, gated, noise)
+    if noise is not None and (found is None or 2 * found.solution.used.sum() < len(problem.z)):
+        found = _heeded(problem, gate(problem), None) or found  # they passed, but do not agree with each other
+    return found
+
+
+def _heeded(problem: Problem, gated: Gated, noise: Array | None) -> Agreement | None:
+    """What agrees with a prediction, if it is more than might agree by chance."""
+    solution = solve(problem, gated)
+    if solution is None:
+        return None
+    used, few = int(solution.used.sum()), len(problem.z) < ENOUGH
+    if not few and _HEEDED * used < len(problem.z) and _by_chance(gated, used, problem):
+        return None
+    return Agreement(problem, solution, noise)
+
+
+def _by_chance(gated: Gated, used: int, problem: Problem) -> bool:
+    """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
+
+    Wrong observations are taken to be spread about their predictions as those that are rejected: that says what share
+    of them passes the gate.
+    """
+    rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
+    if not len(rejected):
+        return True
+    spread = float(np.median(rejected)) / (2 * gammaincinv(1.5, 0.5))  # in units of the innovation covariances
+    share = gammainc(1.5, float(gated.limits.max()) / spread / 2)
+    return bool(bdtrc(used - 1, len(problem.z), share) > 1 - problem.gate_probability)
+
+
+def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, Array | None]:
+    """The problem, its gate, and the noise to add to the camera's covariance, or None.
+
+    What still disagrees is taken out later by `solve`.
+    """
+    first = gate(problem)
+    most = max(ENOUGH, _half(problem))
+    if len(problem.z) < most or first.used.sum() >= most:
+        return problem, first, None
+    for noise in (None, *noises):
+        wider = problem if noise is None else _wider(problem, noise)
+        for at_guess in (False,) if problem.guess is None else (False, True):
+            gated = gate(wider, at_guess) if noise is not None or at_guess else first
+            if gated.used.sum() >= most:
+                return wider, gated, noise
+    return problem, first, None
+
+
+def _restarted(problem: Problem, search: Search, models: EstimatorModels) -> Agreement | None:
+    """With a camera that is where the landmarks say, wherever it was before; None where most do not agree with it."""
+    least = max(_CONFIRMED, _half(problem))
+    change = search() if len(problem.z) >= least else None
+    if change is None:
+        return None
+    noise = restart_noise(change, models)
+    there = replace(_wider(problem, noise), guess=change)
+    try:
+        solution = solve(there, gate(there, at_guess=True))
+    except UnsolvableError:
+        return None
+    if solution is None or solution.used.sum() < least:
+        return None
+    return Agreement(there, solution, noise)
+
+
+def _half(problem: Problem) -> int:
+    return (len(problem.z) + 1) // 2
+
+
+def _wider(problem: Problem, noise: Array) -> Problem:
+    covariance = problem.covariance.copy()
+    covariance[:POSE, :POSE] += noise[:POSE, :POSE]
+    return replace(problem, covariance=covariance)
+
+
+def restart_noise(change: Array, models: EstimatorModels) -> Array:
+    """The noise (12, 12) of a camera that is elsewhere, by a change of [r, φ] (6,), and whose speed is unknown."""
+    sigmas = np.repeat(
+        [
+            float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])),
+            models.initial_velocity_sigma, models.initial_angular_velocity_sigma,
+        ], 3,
+    )  # fmt: skip
+    return np.diag(sigmas**2)
+
+
+def landmarks_pose(rig: StereoRig, points: Array, problem: Problem, T_world_left: Array, seed: int) -> Array | None:
+    """The pose (4, 4) on which most landmarks agree, and at least five; None where there is none.
+
+    Args:
+        rig: the cameras.
+        points: the landmarks (M, 3) in the world [m].
+        problem: the update.
+        T_world_left: pose (4, 4) to begin with.
+        seed: of the random choice.
+    """
+    threshold = problem.sigma * np.sqrt(_AS_NEW * chi_square_limits(np.array([3]), problem.gate_probability)[0])
+    found = find_consensus(rig, points, problem.z, T_world_left, float(threshold), _HYPOTHESES, seed)
+    enough = found.inliers.sum() >= max(_CONFIRMED, _half(problem))
+    return found.T_world_left if enough and np.isfinite(found.T_world_left).all() else None

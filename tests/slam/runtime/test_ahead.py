@@ -1,0 +1,66 @@
+"""Items made ahead: the same ones in the same order, exceptions in their place, no thread left behind."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from slam.runtime.ahead import ahead
+
+
+def threads() -> int:
+    return sum(thread.name == "ahead" for thread in threading.enumerate())
+
+
+def test_the_same_items_in_the_same_order():
+    assert list(ahead(range(100))) == list(range(100))
+    assert list(ahead([])) == []
+    assert threads() == 0
+
+
+def test_an_item_is_made_while_the_one_before_is_used():
+    made = threading.Event()
+
+    def items():
+        yield 0
+        made.set()
+        yield 1
+
+    for item in ahead(items()):
+        if item == 0:
+            assert made.wait(10)
+
+
+def test_no_more_than_asked_for_is_made_beforehand():
+    made = []
+
+    def items():
+        for k in range(50):
+            made.append(k)
+            yield k
+
+    work = ahead(items(), depth=2)
+    assert next(work) == 0
+    assert len(made) <= 5
+    work.close()
+    assert threads() == 0
+
+
+def test_an_exception_comes_where_its_item_would():
+    def items():
+        yield 1
+        raise ValueError("broken")
+
+    work = ahead(items())
+    assert next(work) == 1
+    with pytest.raises(ValueError, match="broken"):
+        next(work)
+    assert threads() == 0
+
+
+def test_a_caller_that_stops_early_leaves_no_thread():
+    for item in ahead(range(1000)):
+        if item == 3:
+            break
+    assert threads() == 0
