@@ -29,6 +29,7 @@ from slam.sequences import open_sequence
 WORLD = "synthetic:aisle?frames=12"
 TABLES = {"landmarks.csv", "objects.csv", "frames.csv"}
 FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json", "schema.json"} | TABLES
+WITH_TRUTH = FILES | {"truth.txt"}
 
 
 def options(out, backend="ekf", **more):
@@ -59,7 +60,7 @@ class Broken:
 def test_a_run_leaves_its_files(tmp_path, backend):
     seen = []
     summary = run(open_sequence(WORLD), options(tmp_path, backend), seen.append)
-    assert {p.name for p in tmp_path.iterdir()} == FILES
+    assert {p.name for p in tmp_path.iterdir()} == WITH_TRUTH
     assert len(seen) == 12
     online = Trajectory.read_tum(tmp_path / "trajectory.txt")
     assert len(online) == len(Trajectory.read_tum(tmp_path / "trajectory_final.txt")) == 12
@@ -118,10 +119,10 @@ def test_what_can_still_be_written_is_written_and_the_first_error_is_raised(tmp_
     """A folder stands where the recording is to go: it cannot be written, map and files can."""
     (tmp_path / "taken").mkdir()
     wanted = {"record": tmp_path / "taken", "save_map": tmp_path / "map"}
-    for sequence, words in ((open_sequence(WORLD), "taken"), (Broken(5), "disk gone")):
+    for sequence, words, files in ((Broken(5), "disk gone", FILES), (open_sequence(WORLD), "taken", WITH_TRUTH)):
         with pytest.raises(SlamError, match=words):
             run(sequence, options(tmp_path / "out", **wanted))
-        assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+        assert {p.name for p in (tmp_path / "out").iterdir()} == files
         assert len(load_map(tmp_path / "map")) > 10
         (tmp_path / "map").unlink()
     assert {p.name for p in tmp_path.iterdir()} == {"taken", "out"}
@@ -137,7 +138,7 @@ def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_pat
     monkeypatch.setattr("slam.run.runner.save_map", lambda *_: 1 / 0)
     with pytest.raises(MeasurementError, match="frame 4"):
         run(open_sequence(WORLD), options(tmp_path, record=tmp_path / "tape.npz", save_map=tmp_path / "map"))
-    assert {p.name for p in tmp_path.iterdir()} == FILES | {"tape.npz"}
+    assert {p.name for p in tmp_path.iterdir()} == WITH_TRUTH | {"tape.npz"}
     assert len(load_recording(tmp_path / "tape.npz")) == 4
     assert "frame 4" in json.loads((tmp_path / "summary.json").read_text())["ended"]
 
