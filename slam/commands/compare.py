@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from slam.compare.paper import write_paper
 from slam.compare.plan import Plan, Trial, Variant, parse_variant
 from slam.compare.report import conclusions, most_trials, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler, available_cores
 from slam.compare.sweep import Run, check, sweep
-from slam.compare.tables import groups, write_tables
+from slam.compare.tables import count_tests, groups, write_tables
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError
 
@@ -39,7 +40,7 @@ def quick(plan: Plan) -> Plan:
 def compare(
     plan: Plan, out: Path, workers: int | None = None, address: str | None = None, quiet: bool = False
 ) -> list[Run]:
-    """Run a comparison to its end and leave ``report.html`` and the tables in `out`.
+    """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
     Args:
         plan: what to run.
@@ -70,6 +71,7 @@ def compare(
 
         runs = sweep(plan, out, scheduler, on_done)
     write_tables(plan, runs, out)
+    write_paper(plan, runs, out)
     report = write_report(plan, runs, out, where)
     if not quiet:
         _print_conclusions(plan, runs, report)
@@ -84,7 +86,8 @@ def _print_conclusions(plan: Plan, runs: Sequence[Run], report: Path) -> None:
             print(f"  {line}")
         for line in found.full:
             print(f"    {line}")
-    if caution(most_trials(every)):
-        print(caution(most_trials(every)))
+    warning = caution(most_trials(every), count_tests(every))
+    if warning:
+        print(warning)
     failed = sum(not run.completed for run in runs)
     print(f"{len(runs)} runs, {failed} failed. Report: {report}")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -13,20 +12,33 @@ from slam.compare.measure import object_figures
 from slam.data import FrameResult, FrameStatus, IdArray
 from slam.errors import TrajectoryError
 from slam.evaluation.association_truth import SurfacePoints, TrueWorld
-from slam.evaluation.metrics import associate, nees, pose_residuals, relative_errors
+from slam.evaluation.consistency import STRETCHES, stretch_nees
+from slam.evaluation.metrics import associate, relative_errors
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.alignment import Alignment
 from slam.geometry.se3 import Array, inverse, nearest_rotation, rotation_angle
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.stamps import pair
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences import Sequence
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associated [px]
 _SECONDS = 1.0  # of RPE by time
+_SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
+
+#: Frames whose pose was measured, as in `slam.run.runner`; accuracy is that of these alone.
+_MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
+
+#: The others, by key of `slam.compare.measure.UNTRACKED`.
+_STATUSES = {
+    "frames_lost": FrameStatus.LOST,
+    "frames_predicted": FrameStatus.PREDICTED,
+    "frames_failed": FrameStatus.FAILED,
+}
 
 SERIES_COLUMNS = (
     "frame", "stamp", "error_x", "error_y", "error_z", "sd_x", "sd_y", "sd_z", "error_rotation",
-    "nees", "nis", "nis_dof", "map_size",
+    "nees", "nis", "nis_dof", "map_size", "tracked",
 )  # fmt: skip
 
 
@@ -38,7 +50,8 @@ class Measured:
         metrics: by key of `slam.compare.measure.METRICS`, and ``object …`` figures; what cannot be said of this
             sequence is left out.
         milliseconds: median per stage and ``total`` over all frames but the first.
-        series: a row per frame of `SERIES_COLUMNS`; NaN where there is no truth.
+        series: a row per frame that has a pose, of `SERIES_COLUMNS`; errors are NaN where there is no truth or the pose
+            was not measured (``tracked`` is 0).
     """
 
     metrics: dict[str, float]
@@ -49,6 +62,8 @@ class Measured:
 @dataclass
 class Collector:
     """Takes in the results of a run frame by frame.
+
+    Frames whose pose was not measured (lost, predicted, failed) are counted, and left out of accuracy and consistency.
 
     Args:
         sequence: what is run.
@@ -90,6 +105,7 @@ class Collector:
                 len(report.used),
                 result.map_size,
                 dict(result.milliseconds),
+                result.located,
             )
         )
 
@@ -102,20 +118,23 @@ class Collector:
             positions: where they are (N, 3) [m].
             summary: of the run, for what it says of objects; may be empty.
         """
-        frames = self._frames
+        frames = [f for f in self._frames if f.located]
         if not frames:
             return Measured({}, {}, np.zeros((0, len(SERIES_COLUMNS))))
         online = Trajectory(np.array([f.stamp for f in frames]), np.array([f.pose for f in frames]))
         covariances = np.array([f.covariance for f in frames])
+        rows = np.array([f.tracked for f in frames])
+        tracked, honest = online.select(rows), covariances[rows]
+        final = final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0)
         metrics = {
-            **_accuracy(online, final, self.sequence),
-            **_consistency(online, covariances, self.sequence, frames),
+            **_accuracy(tracked, final, self.sequence),
+            **_consistency(tracked, honest, self.sequence, frames),
             **self._landmark_errors(final, ids, positions),
             **self._map_figures(),
             **object_figures(summary),
         }
         metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
-        return Measured(metrics, _milliseconds(frames), _series(online, covariances, self.sequence, frames))
+        return Measured(metrics, _milliseconds(self._frames), _series(online, covariances, self.sequence, frames))
 
     def _landmark_errors(self, final: Trajectory, ids: IdArray, positions: Array) -> dict[str, float]:
         """Distances of the map's landmarks from the surface points they are, after the alignment of the poses."""
@@ -132,13 +151,13 @@ class Collector:
         }
 
     def _map_figures(self) -> dict[str, float]:
-        """Size of the map and lifetimes."""
+        """Share of the frames by status, size of the map, and lifetimes."""
         frames = self._frames
         scored = self._right + self._wrong
-        tracked = sum(f.status in (FrameStatus.TRACKED, FrameStatus.STARTED) for f in frames)
         return {
             "association_precision": self._right / scored if scored else float("nan"),
-            "tracked": tracked / len(frames),
+            "tracked": float(np.mean([f.tracked for f in frames])),
+            **{key: float(np.mean([f.status is status for f in frames])) for key, status in _STATUSES.items()},
             "map_size": float(np.mean([f.map_size for f in frames])),
             **self._lifetimes.figures(),
             "used_per_frame": float(np.mean([f.used for f in frames])),
@@ -182,7 +201,13 @@ class _Frame:
     dof: int
     used: int
     map_size: int
-    milliseconds: dict[str, float] = field(default_factory=dict)
+    milliseconds: dict[str, float]
+    located: bool
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the pose was measured."""
+        return self.located and self.status in _MEASURED
 
 
 def _common(path: Trajectory, sequence: Sequence) -> tuple[Trajectory, Trajectory] | None:
@@ -232,10 +257,14 @@ def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
 
 
 def _consistency(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> dict[str, float]:
-    figures = {}
-    honesty = consistency(online, covariances, sequence)
-    if "mean NEES" in honesty:
-        figures["nees_per_dof"] = honesty["mean NEES"] / 6
+    """NEES from the start and over stretches of the path, scale, and NIS."""
+    found = consistency(online, covariances, sequence) if len(online) else {}
+    names = {"nees_per_dof": "mean NEES"}
+    names.update({f"nees_{length:g}m_per_dof": f"NEES over {length:g} m" for length in STRETCHES})
+    figures = {key: found[name] / found["dof"] for key, name in names.items() if name in found}
+    if "scale error [%]" in found:
+        figures["scale_error_percent"] = abs(found["scale error [%]"])
+        figures["scale_sigma_percent"] = found["scale sigma [%]"]
     dof = sum(f.dof for f in frames)
     if dof:
         figures["nis_per_dof"] = sum(f.nis for f in frames if f.dof) / dof
@@ -257,8 +286,9 @@ def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: 
     rows[:, 1] = online.stamps
     R, P = online.poses[:, :3, :3], covariances[:, 3:, 3:]
     rows[:, 5:8] = np.sqrt(np.maximum(np.diagonal(R @ P @ np.swapaxes(R, 1, 2), axis1=1, axis2=2), 0))
-    rows[:, 10:13] = [(f.nis, f.dof, f.map_size) for f in frames]
-    pairs = _common(online, sequence)
+    rows[:, 10:14] = [(f.nis, f.dof, f.map_size, f.tracked) for f in frames]
+    tracked = np.flatnonzero([f.tracked for f in frames])
+    pairs = _common(online.select(tracked), sequence)
     if pairs is None:
         return rows
     own, true = pairs
@@ -266,7 +296,16 @@ def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: 
     expected = own.poses[0] @ inverse(true.poses[0]) @ true.poses
     rows[at, 2:5] = own.positions - expected[:, :3, 3]
     rows[at, 8] = rotation_angle(np.swapaxes(expected[:, :3, :3], 1, 2) @ own.poses[:, :3, :3])
-    if len(at) > 1 and at[0] == 0:
-        with suppress(TrajectoryError):  # a covariance that is none stays not a number
-            rows[at[1:], 9] = nees(pose_residuals(own.poses, expected)[1:], covariances[at[1:]])
+    if len(at) > 1 and at[0] == tracked[0]:
+        rows[at, 9] = _nees_from_start(own, true, covariances[at], getattr(sequence, "truth_noise", TruthNoise()))
     return rows
+
+
+def _nees_from_start(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> Array:
+    """NEES (N,) of each pose relative to the first; NaN for the first, and where a covariance is none."""
+    values = np.full(len(own), np.nan)
+    first = np.zeros(1, np.intp)
+    for k in range(1, len(own)):  # one by one: `stretch_nees` does not say which it leaves out
+        found = stretch_nees(own, true, covariances, noise, first, first + k)
+        values[k] = found[0] if len(found) else np.nan
+    return values

@@ -1,11 +1,13 @@
-"""The pictures of a comparison's report, as SVG texts."""
+"""The pictures of a comparison: for its report as SVG texts, for papers as PDF files."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +21,52 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import open_sequence
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#ad1457", "#558b2f")
 _WIDTH = 5.2  # [inch] about that of a phone: text stays readable where the picture fills the screen
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with what stands below it.
+
+    Attributes:
+        name: short, for a file.
+        title: a few words.
+        caption: a sentence or two, without the measurements, which all pictures of a group share.
+        draw: makes it.
+    """
+
+    name: str
+    title: str
+    caption: str
+    draw: Callable[[], Figure]
+
+
+def pictures(group: Group) -> list[Picture]:
+    """The pictures of a group, as far as there is truth; none where every run failed."""
+    shown = example(group)
+    if not shown:
+        return []
+    seed = next(iter(shown.values())).trial.seed
+    known = {metric.key: metric for metric in group.metrics}
+    main = known.get("ate_online_m") or known.get("gps_m")
+    found = [Picture("paths", "Paths from above", f"Paths from above, seed {seed}.", partial(draw_paths, group))]
+    if main is not None:
+        text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
+        found.insert(0, Picture("trials", main.label, text, partial(draw_pairs, group, main)))
+    if "nees_per_dof" in known:
+        text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims (shaded)."
+        found.append(Picture("errors", "Error over time", text, partial(draw_errors, group)))
+        text = (
+            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and an honest estimator is in "
+            "the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
+        )
+        found.append(Picture("nees", "NEES over time", text, partial(draw_nees, group)))
+    text = "Time per frame by stage, median of the trials, one thread; it depends on the machine."
+    return [*found, Picture("time", "Time per stage", text, partial(draw_timing, group))]
 
 
 def colours(group: Group) -> dict[str, str]:
@@ -55,7 +101,7 @@ def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:
     return own, align(true, estimated).apply_trajectory(true)
 
 
-def draw_pairs(group: Group, metric: Metric) -> str:
+def draw_pairs(group: Group, metric: Metric) -> Figure:
     """Each trial's value by back end, pairs joined by a line: whether the differences are of one sign."""
     figure, axis = _axes(2.6)
     names = list(group.runs)
@@ -67,10 +113,10 @@ def draw_pairs(group: Group, metric: Metric) -> str:
     axis.set_xlim(-0.5, len(names) - 0.5)
     axis.set_ylabel(metric.title)
     axis.set_ylim(0, 1.1 * float(np.nanmax(values, initial=1e-9)))
-    return _svg(figure)
+    return figure
 
 
-def draw_paths(group: Group) -> str:
+def draw_paths(group: Group) -> Figure:
     """Top view of the first trial's paths and the true one."""
     figure, axis = _axes(3.6)
     truth = None
@@ -84,10 +130,10 @@ def draw_paths(group: Group) -> str:
     axis.axis("equal")
     axis.locator_params(nbins=6)
     _legend_above(axis)
-    return _svg(figure)
+    return figure
 
 
-def draw_errors(group: Group) -> str:
+def draw_errors(group: Group) -> Figure:
     """Position error of the first trial over time, component by component, inside the ±3σ that each run claims."""
     figure, axes = _rows(3, 1.5)
     for name, run in example(group).items():
@@ -102,11 +148,11 @@ def draw_errors(group: Group) -> str:
         axis.set_ylabel(f"{label} [cm]")
     _legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
-    return _svg(figure)
+    return figure
 
 
-def draw_nees(group: Group) -> str:
-    """NEES / 6 over time, mean over the trials, with the 95 % band of as many independent ones."""
+def draw_nees(group: Group) -> Figure:
+    """NEES / 6 over time, mean over the trials whose pose was measured, with the 95 % band of as many trials."""
     from matplotlib.ticker import LogLocator
 
     figure, axis = _axes(2.8)
@@ -117,21 +163,23 @@ def draw_nees(group: Group) -> str:
             continue
         fewest = min(fewest, len(every))
         length = min(len(s["nees"]) for s in every)
-        nees = np.array([s["nees"][1:length] for s in every])
+        nees = np.ma.masked_invalid([s["nees"][1:length] for s in every])
         t = (every[0]["stamp"] - every[0]["stamp"][0])[1:length]
-        axis.plot(t, nees.mean(axis=0) / 6, color=colours(group)[name], lw=1.2, label=name)
+        axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colours(group)[name], lw=1.2, label=name)
+    axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
     axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {fewest}")
     axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    bottom, top = axis.get_ylim()
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
     axis.set(xlabel="time [s]", ylabel="NEES / 6")
     _legend_above(axis)
-    return _svg(figure)
+    return figure
 
 
-def draw_timing(group: Group) -> str:
+def draw_timing(group: Group) -> Figure:
     """Milliseconds per frame and stage, median of the trials' medians."""
     names = list(group.runs)
     figure, axis = _axes(0.8 + 0.45 * len(names))
@@ -148,7 +196,7 @@ def draw_timing(group: Group) -> str:
     axis.invert_yaxis()
     axis.set_xlabel("ms per frame, one thread")
     _legend_above(axis)
-    return _svg(figure)
+    return figure
 
 
 def map_data(group: Group, most: int = 700) -> dict[str, Any]:
@@ -201,6 +249,7 @@ def _round(rows: Array) -> list[list[float]]:
 _STYLE: Mapping[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "slam",
+    "pdf.fonttype": 42,
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.spines.top": False,
@@ -229,10 +278,21 @@ def _rows(count: int, height: float) -> tuple[Any, list[Any]]:
     return figure, list(axes)
 
 
-def _svg(figure: Any) -> str:
+def as_svg(figure: Figure) -> str:
+    """A picture as SVG, the same for the same data."""
     from matplotlib import rc_context
 
     text = io.StringIO()
     with rc_context(dict(_STYLE)):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
+
+
+def as_pdf(figure: Figure, title: str) -> bytes:
+    """A picture as PDF with embedded TrueType fonts: the same bytes for the same data, without a date."""
+    from matplotlib import rc_context
+
+    content = io.BytesIO()
+    with rc_context(dict(_STYLE)):
+        figure.savefig(content, format="pdf", metadata={"CreationDate": None, "Title": title})
+    return content.getvalue()

@@ -58,17 +58,28 @@ METRICS = (
     Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg"),
     Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%"),
     Metric("gps_m", "GPS distance RMSE", "lower", True, "mm", 1e3),
-    Metric("nees_per_dof", "NEES / 6 (1 is honest)", "one", True),
-    Metric("nis_per_dof", "NIS per degree of freedom (1 is honest)", "one"),
+    Metric("scale_error_percent", "scale error, absolute", "lower", False, "%"),
+    Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%"),
+    Metric("nees_per_dof", "NEES / 6 from the start (expected 1)", "one", True),
+    Metric("nees_1m_per_dof", "NEES / 6 over 1 m (expected 1)", "one"),
+    Metric("nees_10m_per_dof", "NEES / 6 over 10 m (expected 1)", "one", True),
+    Metric("nees_100m_per_dof", "NEES / 6 over 100 m (expected 1)", "one"),
+    Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one"),
     Metric("landmark_error_m", "landmark error, median", "lower", True, "mm", 1e3),
     Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, "mm", 1e3),
     Metric("association_precision", "association precision", "higher", False, "%", 100),
-    Metric("tracked", "frames tracked", "higher", False, "%", 100),
+    Metric("tracked", "frames tracked", "higher", True, "%", 100),
+    Metric("frames_lost", "frames lost", "", False, "%", 100),
+    Metric("frames_predicted", "frames predicted", "", False, "%", 100),
+    Metric("frames_failed", "frames failed", "", False, "%", 100),
     Metric("map_size", "landmarks in the map, mean"),
     Metric("lifetime_frames", "lifetime of a landmark, median", "", False, "frames"),
     Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, "frames"),
     Metric("used_per_frame", "observations used per frame"),
 )
+
+#: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
+UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 

@@ -14,10 +14,24 @@ import numpy as np
 from slam.compare import figures
 from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
-from slam.compare.statistics import Difference, Verdict
+from slam.compare.statistics import LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
-from slam.compare.tables import RUN_COLUMNS, Group, groups
-from slam.compare.wording import caution, failures, headline, sentence, shown_interval, shown_mean, worth_saying
+from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures
+from slam.compare.wording import (
+    STRENGTH,
+    Line,
+    caution,
+    failures,
+    headline,
+    honesty,
+    measurements,
+    sentence,
+    shown_interval,
+    shown_mean,
+    shown_p,
+    shown_spread,
+    worth_saying,
+)
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -29,7 +43,9 @@ _WORDS = {
     Verdict.EQUAL: "equal",
     Verdict.SINGLE: "one trial",
     Verdict.NONE: "none",
+    Verdict.UNTESTED: "",
 }
+_DIRECTED = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
 
 
 def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Path:
@@ -54,8 +70,11 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         runs=runs,
         failed=sum(not run.completed for run in runs),
         short=conclusions(every),
-        caution=caution(most_trials(every)),
-        comparisons=(len(plan.backends) - 1) * sum(bool(m.better) for g in every for m in g.metrics),
+        caution=caution(most_trials(every), count_tests(every)),
+        tests=count_tests(every),
+        strengths=[(verdict.value, _WORDS[verdict], STRENGTH[verdict]) for verdict in _DIRECTED],
+        words=_WORDS,
+        level=round(100 * LEVEL),
         sections=_sections(plan, every),
         workers=workers,
         **_times(every),
@@ -79,13 +98,20 @@ class Conclusions:
 
     Attributes:
         name: of the group.
-        short: which runs failed, and a line on every other back end against the first.
-        full: a sentence per figure.
+        failed: which runs failed; empty where none did.
+        headlines: what is certain, likely and a hint, in both directions, and which main figures are open.
+        full: a sentence per main figure, and one per back end on its covariances.
     """
 
     name: str
-    short: list[str]
+    failed: str
+    headlines: list[Line]
     full: list[str]
+
+    @property
+    def short(self) -> list[str]:
+        """The headlines as plain text, failures first."""
+        return [line for line in (self.failed, *(line.text for line in self.headlines)) if line]
 
 
 def conclusions(every: Sequence[Group]) -> list[Conclusions]:
@@ -101,12 +127,21 @@ def most_trials(every: Sequence[Group]) -> int:
 def _conclusions(group: Group) -> Conclusions:
     first, *others = group.runs
     compared = [group.differences(metric) for metric in group.metrics]
-    short, full = [failures({b: group.failures(b) for b in group.runs}, group.trials)], []
+    short: list[Line] = []
+    full: list[str] = []
     for other in others:
-        own = [differences[other] for differences in compared if worth_saying(differences[other])]
-        short.append(headline(own, first, other))
-        full += [sentence(d, first, other) for d in own]
-    return Conclusions(_name(group), [line for line in short if line], full)
+        own = [differences[other] for differences in compared]
+        short += headline(own, first, other)
+        full += [sentence(d, first, other) for d in own if worth_saying(d)]
+    failed = failures({b: group.failures(b) for b in group.runs}, group.trials)
+    return Conclusions(_name(group), failed, short, [*full, *_honesty(group)])
+
+
+def _honesty(group: Group) -> list[str]:
+    """Whether each back end's covariances hold."""
+    keys = [metric.key for metric in group.metrics if metric.key.startswith("nees")]
+    values = {key: {b: mean_figures(group.finite(b, key))[0] for b in group.runs} for key in keys}
+    return honesty(values, group.trials)
 
 
 def _name(group: Group) -> str:
@@ -126,6 +161,7 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
                 "title": f"{first.sequence}{variant}",
                 "tables": [_table(group) for group in own],
                 "pictures": _pictures(first),
+                "given": measurements(first.mode, plan.backends[0]),
                 "map": figures.map_data(first) if figures.example(first) else None,
             }
         )
@@ -133,16 +169,18 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
 
 
 def _table(group: Group) -> dict[str, Any]:
-    words = {"closed loop": "each back end steers its own data association", "replay": "identical measurements"}
     first = next(iter(group.runs))
-    compared = {metric: group.differences(metric) for metric in group.metrics}
-    reasons = {f"{b}, seed {r.trial.seed}: {r.outcome}" for b, rs in group.runs.items() for r in rs if not r.completed}
+    reasons = {
+        f"{b}, seed {r.trial.seed}: {r.outcome.removeprefix('failed: ')}"
+        for b, rs in group.runs.items()
+        for r in rs
+        if not r.completed
+    }
     return {
-        "title": f"{group.mode.capitalize()}: {words.get(group.mode, '')}",
-        "rows": [_row(group, metric, compared[metric]) for metric in group.metrics],
-        "sentences": [
-            sentence(d, first, b) for metric in group.metrics if metric.better for b, d in compared[metric].items()
-        ],
+        "title": f"{measurements(group.mode, first)}",
+        "rows": [_row(group, metric, group.differences(metric)) for metric in group.shown],
+        "honesty": _honesty(group),
+        "sentences": [sentence(d, first, b) for m in group.shown if m.better for b, d in group.differences(m).items()],
         "reasons": sorted(reasons),
     }
 
@@ -150,42 +188,39 @@ def _table(group: Group) -> dict[str, Any]:
 def _row(group: Group, metric: Metric, differences: dict[str, Difference]) -> dict[str, Any]:
     cells = [_cells(d) for d in differences.values()]
     if metric is COMPLETED:
-        means = [f"{group.trials - group.failures(b)} of {group.trials}" for b in group.runs]
+        means = [(f"{group.trials - group.failures(b)} of {group.trials}", "") for b in group.runs]
         return {"label": metric.label, "means": means, "failed": list(map(group.failures, group.runs)), "cells": cells}
-    values = [group.values(backend, metric.key) for backend in group.runs]
-    means = [metric.show(float(np.nanmean(v))) if np.isfinite(v).any() else "–" for v in values]
+    means = []
+    for backend in group.runs:
+        mean, sd, _, _ = mean_figures(group.finite(backend, metric.key))
+        means.append(shown_spread(metric, mean, sd))
     return {"label": metric.title, "means": means, "failed": [0] * len(means), "cells": cells}
 
 
 def _cells(d: Difference) -> dict[str, str]:
-    """A difference's three cells; the verdict names the better one where there is one."""
-    shown = {"mean": shown_mean(d), "interval": shown_interval(d)}
-    words = _WORDS[d.verdict]
-    if d.better is not None and d.verdict in (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT):
-        words = f"{'better' if d.better else 'worse'}: {words}"
-    if not d.metric.better and d.verdict is not Verdict.EQUAL:
-        return {**shown, "verdict": "none", "words": ""}
-    return {**shown, "verdict": d.verdict.value, "words": words}
+    """A difference's cells; the badge's colour is the direction, its strength the verdict."""
+    words, direction = _WORDS[d.verdict], ""
+    if d.better is not None and d.verdict in _DIRECTED:
+        direction = "better" if d.better else "worse"
+        words = f"{direction}: {words}"
+    return {
+        "verdict": d.verdict.value,
+        "direction": direction,
+        "words": words,
+        "mean": shown_mean(d),
+        "interval": shown_interval(d),
+        "p": shown_p(d.p) if d.varies else "–",
+        "p_holm": shown_p(d.p_holm) if d.varies else "–",
+    }
 
 
 def _pictures(group: Group) -> list[dict[str, str]]:
-    """Pictures of a group's closed loop, as far as there is truth."""
-    if not figures.example(group):
-        return []
-    seed = next(iter(figures.example(group).values())).trial.seed
-    known = {metric.key: metric for metric in group.metrics}
-    main = known.get("ate_online_m") or known.get("gps_m")
-    pictures = [(figures.draw_paths(group), "Paths from above", f"Paths from above, seed {seed}.")]
-    if main is not None:
-        text = f"{main.label} of every trial; lines join the back ends' runs on the same recording."
-        pictures.insert(0, (figures.draw_pairs(group, main), main.label, text))
-    if "nees_per_dof" in known:
-        text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims."
-        pictures.append((figures.draw_errors(group), "Error over time", text))
-        text = "NEES over time, mean of the trials, with the 95 % band in which an honest one lies."
-        pictures.append((figures.draw_nees(group), "NEES over time", text))
-    pictures.append((figures.draw_timing(group), "Time per stage", "Time per frame by stage, median."))
-    return [{"source": _embedded(svg), "alt": alt, "caption": caption} for svg, alt, caption in pictures]
+    """Pictures of a group, embedded; each caption says which measurements."""
+    given = measurements(group.mode, next(iter(group.runs)))
+    return [
+        {"source": _embedded(figures.as_svg(p.draw())), "alt": p.title, "caption": f"{p.caption} {given}."}
+        for p in figures.pictures(group)
+    ]
 
 
 def _times(every: Sequence[Group]) -> dict[str, Any]:

@@ -1,41 +1,50 @@
 """What follows from paired trials, and what does not.
 
 Two estimators run on the same recordings: the difference of each pair is free of how hard a recording was. Its mean
-over the trials has a bootstrap confidence interval (bias-corrected and accelerated, Efron 1987), and the sign-flip
-test says how often so large a mean would come about if neither were better. A difference counts as certain only where
-both agree: with few trials the bootstrap is too sure of itself, while the test cannot fall below 2 / 2ᴺ.
+over the trials is the effect. It has a 95 % bootstrap confidence interval (bias-corrected and accelerated, Efron 1987)
+and a p-value by the sign-flip permutation test (two-sided): how often so large a mean would come about if neither were
+better. Many figures are tested at once, so p is adjusted over all tests of a report (Holm 1979). With few trials the
+bootstrap is too sure of itself, while the test's p cannot fall below 2 / 2ᴺ; a difference needs both.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 
 from slam.compare.measure import Metric
 from slam.geometry.se3 import Array
 
+#: Of confidence intervals.
 LEVEL = 0.95
+
+#: p up to which a difference is significant: Holm-adjusted it is certain, before the adjustment likely.
+ALPHA = 0.05
+
+#: p, before the adjustment, up to which a difference is a hint.
+HINT_ALPHA = 0.1
+
 _RESAMPLES = 9999
 _SEED = 0
-_LIKELY = 0.1  # p up to which a difference is called likely
-
-#: Fewer pairs than this cannot reach the level: 2 / 2ᴺ is more than 1 − LEVEL.
-FEWEST = int(np.ceil(np.log2(2 / (1 - LEVEL))))
+_EXACT = 16  # pairs up to which all 2ᴺ patterns of signs are tried; for more as many are drawn
 
 
 class Verdict(StrEnum):
-    """What may be concluded of a difference."""
+    """What may be concluded of a difference, by `ALPHA`, `HINT_ALPHA` and `LEVEL`."""
 
-    CERTAIN = "certain"  #: interval and test agree that there is one
-    LIKELY = "likely"  #: the interval leaves out zero, but the test's p is above 5 %, if not above 10 %
-    HINT = "hint"  #: the interval leaves out zero, but the test's p is above 10 %, perhaps for want of trials
-    OPEN = "open"  #: the interval holds zero
+    CERTAIN = "certain"  #: the interval leaves out zero, and the Holm-adjusted p is at most `ALPHA`
+    LIKELY = "likely"  #: the interval leaves out zero, and p is at most `ALPHA`, the adjusted one is not
+    HINT = "hint"  #: the interval leaves out zero, and p is above `ALPHA` and at most `HINT_ALPHA`
+    OPEN = "open"  #: the interval holds zero, or p is above `HINT_ALPHA`
     EQUAL = "equal"  #: every pair is the same to the last digit
     SINGLE = "single"  #: one pair: a difference without any spread to judge it by
     NONE = "none"  #: no pair
+    UNTESTED = "untested"  #: a figure of which neither more nor less is better
 
 
 @dataclass(frozen=True)
@@ -51,9 +60,9 @@ class Difference:
         reference, other: mean over the pairs.
         mean: of the differences, other less reference.
         low, high: bounds of its confidence interval; NaN with fewer than two pairs.
-        p: of the sign-flip test, two-sided; NaN with fewer than two pairs.
+        p: of the sign-flip test, two-sided; NaN with fewer than two pairs, and where nothing is better or worse.
+        p_holm: p adjusted over the tests of a report, see `adjusted`; p itself where there is no other test.
         lower, higher: pairs in which the other is lower, and higher.
-        verdict: what may be concluded.
     """
 
     metric: Metric
@@ -65,9 +74,9 @@ class Difference:
     low: float
     high: float
     p: float
+    p_holm: float
     lower: int
     higher: int
-    verdict: Verdict
 
     @property
     def better(self) -> bool | None:
@@ -81,9 +90,31 @@ class Difference:
         """Pairs in which the one that is better on average is better."""
         return self.lower if self.mean < 0 else self.higher
 
+    @property
+    def varies(self) -> bool:
+        """Whether the test can come out either way: two pairs or more, not all equal. Only these are a test."""
+        return bool(np.isfinite(self.p)) and self.lower + self.higher > 0
+
+    @property
+    def verdict(self) -> Verdict:
+        """What may be concluded."""
+        if not self.pairs:
+            return Verdict.NONE
+        if not self.lower and not self.higher:
+            return Verdict.EQUAL
+        if not self.metric.better:
+            return Verdict.UNTESTED
+        if self.pairs == 1:
+            return Verdict.SINGLE
+        if self.low <= 0 <= self.high or self.p > HINT_ALPHA:
+            return Verdict.OPEN
+        if self.p > ALPHA:
+            return Verdict.HINT
+        return Verdict.CERTAIN if self.p_holm <= ALPHA else Verdict.LIKELY
+
 
 def difference(metric: Metric, reference: Array, other: Array) -> Difference:
-    """The paired difference of two back ends in one figure.
+    """The paired difference of two back ends in one figure, as the only test; see `adjusted` for several.
 
     Args:
         metric: the figure.
@@ -97,29 +128,65 @@ def difference(metric: Metric, reference: Array, other: Array) -> Difference:
         a, b = _dishonesty(a), _dishonesty(b)
     d = b - a
     low, high, p = interval_and_test(d)
+    p = p if metric.better else float("nan")
     mean = float(d.mean()) if len(d) else float("nan")
-    verdict = _verdict(d, low, high, p)
     signs = int((d < 0).sum()), int((d > 0).sum())
-    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, *signs, verdict)
+    return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, p, *signs)
+
+
+def adjusted(differences: Sequence[Difference]) -> list[Difference]:
+    """The differences of one report, in the same order, each with its p adjusted by Holm over all of them.
+
+    Tests that cannot come out either way (`Difference.varies`) keep their p and do not count.
+    """
+    tests = [i for i, d in enumerate(differences) if d.varies]
+    found = list(differences)
+    for i, p in zip(tests, holm(np.array([differences[i].p for i in tests]))):
+        found[i] = replace(found[i], p_holm=float(p))
+    return found
+
+
+def holm(p: Array) -> Array:
+    """p-values (M,) adjusted so that the chance of any false one at level α stays below α (Holm 1979, step-down).
+
+    The smallest is multiplied by M, the next by M − 1, …; none is less than a smaller one's, none more than 1.
+    """
+    order = np.argsort(p, kind="stable")
+    result = np.empty(len(p))
+    result[order] = np.minimum(1.0, np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order]))
+    return result
+
+
+def fewest(tests: int) -> int:
+    """Trials that it takes for one of so many tests to be certain: p is at least 2 / 2ᴺ, and Holm's factor `tests`."""
+    return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
+
+
+def interval(values: Array) -> tuple[float, float]:
+    """Bounds of the confidence interval of the mean of values (N,); NaN with fewer than two."""
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    if np.ptp(values) == 0:  # no spread to resample
+        return float(values[0]), float(values[0])
+    return _bootstrap(tuple(values.tolist()))
 
 
 def interval_and_test(d: Array) -> tuple[float, float, float]:
     """Bounds of the mean of paired differences (N,), and the sign-flip test's p; NaN with fewer than two."""
     if len(d) < 2:
         return float("nan"), float("nan"), float("nan")
-    if np.ptp(d) == 0:  # no spread to resample
-        return float(d[0]), float(d[0]), 1.0 if d[0] == 0 else _sign_flip(d)
-    return *_bootstrap(d), _sign_flip(d)
+    return *interval(d), sign_flip(d)
 
 
-def _bootstrap(d: Array) -> tuple[float, float]:
+@lru_cache(maxsize=4096)  # tables, report and the words on the terminal ask for the same
+def _bootstrap(values: tuple[float, ...]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # BCa says so where it is not defined; then percentiles are taken
         for method in ("BCa", "percentile"):
             result = bootstrap(
-                (d,), np.mean, confidence_level=LEVEL, n_resamples=_RESAMPLES, method=method,
+                (np.array(values),), np.mean, confidence_level=LEVEL, n_resamples=_RESAMPLES, method=method,
                 rng=np.random.default_rng(_SEED),
             )  # fmt: skip
             low, high = result.confidence_interval
@@ -128,29 +195,25 @@ def _bootstrap(d: Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _sign_flip(d: Array) -> float:
-    """Exact up to 13 pairs, else by seeded sampling."""
-    from scipy.stats import permutation_test
+def sign_flip(d: Array) -> float:
+    """The p-value of the sign-flip permutation test, two-sided, of paired differences (N,).
 
-    result = permutation_test(
-        (d,), lambda x, axis: np.mean(x, axis=axis), permutation_type="samples", vectorized=True,
-        n_resamples=_RESAMPLES, rng=np.random.default_rng(_SEED),
-    )  # fmt: skip
-    return float(result.pvalue)
-
-
-def _verdict(d: Array, low: float, high: float, p: float) -> Verdict:
-    if not len(d):
-        return Verdict.NONE
+    Exact up to 16 pairs. For more, 2¹⁶ patterns of signs are drawn with a fixed seed, and the one observed counts as
+    one of them (Phipson and Smyth 2010), so p is never zero.
+    """
     if not d.any():
-        return Verdict.EQUAL
-    if len(d) == 1:
-        return Verdict.SINGLE
-    if low <= 0 <= high:
-        return Verdict.OPEN
-    if p <= 1 - LEVEL:
-        return Verdict.CERTAIN
-    return Verdict.LIKELY if p <= _LIKELY else Verdict.HINT
+        return 1.0
+    sums = np.abs(_signs(len(d)) @ d)
+    as_large = int((sums >= np.abs(d.sum()) * (1 - 1e-12)).sum())
+    return as_large / len(sums) if len(d) <= _EXACT else (as_large + 1) / (len(sums) + 1)
+
+
+@lru_cache(maxsize=4)
+def _signs(count: int) -> Array:
+    """Patterns of signs (M, count): all, or where these are too many 2¹⁶ at random."""
+    if count <= _EXACT:
+        return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
+    return np.random.default_rng(_SEED).choice((-1.0, 1.0), (2**_EXACT, count))
 
 
 def _dishonesty(values: Array) -> Array:

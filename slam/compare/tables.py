@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from slam.compare.measure import BY_KEY, COMPLETED, METRICS, Metric, object_metric
+from slam.compare.measure import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, object_metric
 from slam.compare.plan import Plan, Variant
-from slam.compare.statistics import Difference, difference
+from slam.compare.statistics import Difference, adjusted, difference, interval
 from slam.compare.sweep import Run
 from slam.geometry.se3 import Array
 
@@ -23,12 +23,14 @@ class Group:
     Attributes:
         sequence, variant, mode: what they share.
         runs: by back end, each in the order of seeds.
+        compared: each other back end against the first, by key of the figure and by name; see `groups`.
     """
 
     sequence: str
     variant: Variant
     mode: str
     runs: dict[str, list[Run]]
+    compared: dict[str, dict[str, Difference]] = field(default_factory=dict)
 
     @property
     def trials(self) -> int:
@@ -42,25 +44,35 @@ class Group:
         others = [object_metric(key) for key in sorted(keys - set(BY_KEY))]
         return [COMPLETED, *(m for m in METRICS if m.key in keys), *others]
 
+    @property
+    def shown(self) -> list[Metric]:
+        """The metrics of tables for people: without the ways in which no frame was left untracked."""
+        return [
+            m for m in self.metrics if m.key not in UNTRACKED or any(self.finite(b, m.key).any() for b in self.runs)
+        ]
+
     def values(self, backend: str, key: str) -> Array:
         """A figure by trial (N,), NaN where the run failed or has none."""
         if key == COMPLETED.key:
             return np.array([run.completed for run in self.runs[backend]], float)
         return np.array([run.metrics.get(key, np.nan) for run in self.runs[backend]], float)
 
+    def finite(self, backend: str, key: str) -> Array:
+        """A figure of the runs that have it."""
+        values = self.values(backend, key)
+        return values[np.isfinite(values)]
+
     def failures(self, backend: str) -> int:
         """Number of runs that failed."""
         return sum(not run.completed for run in self.runs[backend])
 
     def differences(self, metric: Metric) -> dict[str, Difference]:
-        """Each other back end against the first, by name."""
-        first, *others = self.runs
-        reference = self.values(first, metric.key)
-        return {other: difference(metric, reference, self.values(other, metric.key)) for other in others}
+        """Each other back end against the first, by name, p adjusted over all figures of all groups."""
+        return self.compared[metric.key]
 
 
 def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
-    """The runs, sorted by what they share, in the plan's order."""
+    """The runs, sorted by what they share, in the plan's order, and compared: the tests of all are one family."""
     found = []
     for sequence in plan.sequences:
         for variant in plan.variants:
@@ -70,14 +82,27 @@ def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:
                 ]
                 by_name = {b: [r for r in own if r.trial.backend == b] for b in plan.backends}
                 found.append(Group(sequence, variant, mode, by_name))
+    places = [(group, m, other) for group in found for m in group.metrics for other in plan.backends[1:]]
+    alone = [difference(m, group.values(plan.backends[0], m.key), group.values(b, m.key)) for group, m, b in places]
+    for (group, m, other), d in zip(places, adjusted(alone)):
+        group.compared.setdefault(m.key, {})[other] = d
     return found
+
+
+def count_tests(every: Sequence[Group]) -> int:
+    """Tests that p is adjusted for; with one trial of everything, as many as there would be with more."""
+    found = [d for group in every for by_name in group.compared.values() for d in by_name.values()]
+    tests = sum(d.varies for d in found)
+    return tests or sum(d.better is not None for d in found)
 
 
 DIFFERENCE_COLUMNS = (
     "sequence", "variant", "mode", "figure", "reference", "other", "pairs", "missing", "mean_reference", "mean_other",
-    "difference", "low", "high", "p", "other_lower", "other_higher", "verdict",
+    "difference", "low", "high", "p", "p_holm", "other_lower", "other_higher", "verdict",
 )  # fmt: skip
-MEAN_COLUMNS = ("sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "min", "max")
+MEAN_COLUMNS = (
+    "sequence", "variant", "mode", "backend", "figure", "runs", "failed", "mean", "sd", "low", "high", "min", "max",
+)  # fmt: skip
 RUN_COLUMNS = ("sequence", "variant", "frontend", "mode", "seed", "backend", "outcome")
 
 
@@ -106,17 +131,10 @@ def _cells(run: Run, keys: Sequence[str]) -> list[str]:
 def _mean_rows(group: Group) -> Iterable[tuple[object, ...]]:
     for metric in group.metrics:
         for backend in group.runs:
-            values = group.values(backend, metric.key)
-            values = values[np.isfinite(values)]
+            values = group.finite(backend, metric.key)
+            figures = (*mean_figures(values), *((values.min(), values.max()) if len(values) else (np.nan,) * 2))
             head = (group.sequence, group.variant.name, group.mode, backend, metric.key)
-            yield (*head, len(values), group.failures(backend), *map(_number, _figures(values)))
-
-
-def _figures(values: Array) -> tuple[float, ...]:
-    """Mean, standard deviation, least and greatest; NaN where there are no values."""
-    if not len(values):
-        return (np.nan,) * 4
-    return float(values.mean()), _sd(values), float(values.min()), float(values.max())
+            yield (*head, len(values), group.failures(backend), *map(_number, figures))
 
 
 def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
@@ -124,12 +142,15 @@ def _difference_rows(group: Group) -> Iterable[tuple[object, ...]]:
     for metric in group.metrics:
         for other, d in group.differences(metric).items():
             head = (group.sequence, group.variant.name, group.mode, metric.key, first, other, d.pairs, d.missing)
-            figures = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p))
+            figures = map(_number, (d.reference, d.other, d.mean, d.low, d.high, d.p, d.p_holm))
             yield (*head, *figures, d.lower, d.higher, d.verdict.value)
 
 
-def _sd(values: Array) -> float:
-    return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+def mean_figures(values: Array) -> tuple[float, float, float, float]:
+    """Mean, standard deviation, and the bounds of the mean's confidence interval, of values (N,); NaN where unknown."""
+    mean = float(values.mean()) if len(values) else float("nan")
+    sd = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+    return mean, sd, *interval(values)
 
 
 def _number(value: float | None) -> str:

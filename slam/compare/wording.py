@@ -3,36 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam.compare.measure import COMPLETED
-from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
+from slam.compare.measure import Metric
+from slam.compare.plan import REPLAY
+from slam.compare.statistics import ALPHA, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
+from slam.evaluation.metrics import chi_square_band
 
-_STRENGTH = {
-    Verdict.CERTAIN: f"certain at the level of {round(100 * LEVEL)} %",
-    Verdict.LIKELY: "likely, not certain",
-    Verdict.HINT: "a hint, no more",
+#: How sure a verdict is, in the usual words.
+STRENGTH = {
+    Verdict.CERTAIN: f"certain (Holm-adjusted p ≤ {ALPHA:g})",
+    Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
+    Verdict.HINT: f"a hint (p ≤ {HINT_ALPHA:g})",
     Verdict.SINGLE: "in one trial, which cannot say whether that is chance",
 }
 _VERB = {Verdict.CERTAIN: "is", Verdict.LIKELY: "seems", Verdict.HINT: "seems", Verdict.SINGLE: "was"}
 
+#: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
+_HONESTY = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof")
 
-def headline(differences: Sequence[Difference], reference: str, other: str) -> str:
-    """One line on two back ends: who is better in what, by how much and how surely, and what remains open."""
-    parts = []
-    for verdict, strength in _STRENGTH.items():
-        for winner, wins in ((other, True), (reference, False)):
-            own = [d for d in differences if d.verdict is verdict and d.better is wins]
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a headline.
+
+    Attributes:
+        text: a sentence.
+        short: who, and which figures; `direction` and `verdict` say the rest.
+        direction: "better" or "worse", of the other back end; empty where neither.
+        verdict: how sure that is.
+    """
+
+    text: str
+    short: str
+    direction: str
+    verdict: Verdict
+
+
+def headline(differences: Sequence[Difference], reference: str, other: str) -> list[Line]:
+    """What the other back end does better and worse than the reference, the surest first, and what remains open.
+
+    All that is certain, likely, or a hint is named, in both directions; of the rest the main figures.
+    """
+    lines = []
+    for verdict, strength in STRENGTH.items():
+        for direction, wins in (("better", True), ("worse", False)):
+            own = [d for d in differences if d.verdict is verdict and d.better is wins and _is_named(d)]
             if own:
-                parts.append(f"{winner} {_VERB[verdict]} better in {_listed([_brief(d) for d in own])}: {strength}.")
-    rest = [_name(d) for d in differences if d.verdict in (Verdict.OPEN, Verdict.EQUAL)]
-    if rest:
-        parts.append(f"No difference can be concluded in {_listed(rest)}.")
-    missing = [_name(d) for d in differences if d.verdict is Verdict.NONE]
-    if missing:
-        parts.append(f"Nothing to compare in {_listed(missing)}.")
-    return " ".join(parts)
+                text = f"{other} {_VERB[verdict]} {direction} than {reference}, {strength}: {_listed(own)}."
+                lines.append(Line(text, f"{other}: {_listed(own)}", direction, verdict))
+    rest = [d for d in differences if worth_saying(d)]
+    for verdict, text in ((Verdict.OPEN, "No difference can be concluded in"), (Verdict.NONE, "Nothing to compare in")):
+        names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
+        if names:
+            listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+            lines.append(Line(f"{text} {listed}.", f"{other}: {listed}", "", verdict))
+    return lines
 
 
 def sentence(d: Difference, reference: str, other: str) -> str:
@@ -49,15 +77,36 @@ def sentence(d: Difference, reference: str, other: str) -> str:
     if d.better is None:
         return f"{label}: {reference} {values[reference]}, {other} {values[other]}{unit}, mean of {trials}."
     if d.verdict is Verdict.SINGLE:
-        return f"{label}: {first} was better, {against}, {_STRENGTH[d.verdict]}."
+        return f"{label}: {first} was better, {against}, {STRENGTH[d.verdict]}."
     if d.verdict is Verdict.OPEN:
-        nothing = "one" if d.metric.better == "one" else "zero"
-        return (
-            f"{label}: no difference can be concluded, {first} {against}, mean of {trials}; {_interval(d)} holds "
-            f"{nothing}."
+        return f"{label}: no difference can be concluded, {first} {against}, mean of {trials}; {_evidence(d)}."
+    how = f"{against}{_less(d)}, in {d.wins} of {trials}; {_evidence(d)}"
+    return f"{label}: {first} {_VERB[d.verdict]} better than {second}, {how}: {STRENGTH[d.verdict]}."
+
+
+def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
+    """Whether the covariances hold, a sentence per back end: what its mean NEES is, and what is to be expected.
+
+    Args:
+        values: mean over the runs by key of the figure and by back end; NaN where there is none.
+        runs: how many. The band holds even if all frames of a run are as good as one.
+    """
+    low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
+    lines = []
+    for backend in next(iter(values.values()), {}):
+        key = next((k for k in _HONESTY if np.isfinite(values.get(k, {}).get(backend, np.nan))), None)
+        if key is None:
+            continue
+        value = values[key][backend]
+        where = {"nees_10m_per_dof": "over 10 m of path", "nees_1m_per_dof": "over 1 m of path"}.get(
+            key, "from the start"
         )
-    how = f"{against}{_share(d)}, in {d.wins} of {trials}; {_interval(d)}, p = {d.p:.2g}"
-    return f"{label}: {first} {_VERB[d.verdict]} better than {second}, {how}: {_STRENGTH[d.verdict]}."
+        judged = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
+        lines.append(
+            f"{backend}: {judged}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
+            f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
+        )
+    return lines
 
 
 def failures(runs: dict[str, int], trials: int) -> str:
@@ -71,24 +120,49 @@ def failures(runs: dict[str, int], trials: int) -> str:
     )
 
 
-def caution(trials: int) -> str:
-    """What so many trials can show at best; empty where they are enough to be certain of something."""
-    if trials >= FEWEST:
+def caution(trials: int, tests: int = 1) -> str:
+    """What so many trials can show at best; empty where they are enough to be certain of something.
+
+    Args:
+        trials: of the sequence that has most.
+        tests: that p is adjusted for.
+    """
+    enough = fewest(tests)
+    if trials >= enough:
         return ""
     if trials == 1:
         return (
             "One trial cannot tell a difference from chance: synthetic worlds have as many as are asked for (--trials, "
-            f"{FEWEST} or more), a recorded sequence has one."
+            f"{enough} or more), a recorded sequence has one."
         )
-    return (
-        f"With {trials} trials nothing can be certain: even where all agree, chance alone does as much in "
-        f"{100 * 2 / 2**trials:.2g} % of such comparisons. It takes {FEWEST} or more (--trials)."
-    )
+    least = 2 / 2**trials
+    what = "nothing can be certain"
+    if trials < fewest(1):
+        why = f"even where all agree, chance alone does as much in {100 * least:.2g} % of such comparisons"
+    else:
+        why = f"even where all agree, p is {least:.2g}, and {tests} tests multiply it (Holm)"
+        what += ", but likely at best"
+    return f"With {trials} trials {what}: {why}. It takes {enough} or more (--trials)."
+
+
+def measurements(mode: str, reference: str) -> str:
+    """Which measurements the back ends were given, for captions."""
+    if mode == REPLAY:
+        return f"Replay: all back ends are given the measurements of {reference}'s closed loop"
+    return "Closed loop: each back end steers its own data association"
 
 
 def shown_mean(d: Difference) -> str:
-    """The mean difference for people; of figures that should be one, the ratio of the factors by which they are off."""
-    return f"× {10**d.mean:.3f}" if d.metric.better == "one" and np.isfinite(d.mean) else d.metric.show(d.mean)
+    """The mean difference for people, with the digits of its interval.
+
+    Of figures that should be one it is the ratio of the factors by which they are off.
+    """
+    if d.metric.better == "one" and np.isfinite(d.mean):
+        return f"× {10**d.mean:.3f}"
+    if not np.isfinite(d.low):
+        return d.metric.show(d.mean)
+    digits = decimals(d.metric.scale * max(abs(d.low), abs(d.high)))
+    return f"{d.metric.scale * d.mean:.{digits}f}".replace("-", "−")
 
 
 def shown_interval(d: Difference, between: str = " … ") -> str:
@@ -97,37 +171,91 @@ def shown_interval(d: Difference, between: str = " … ") -> str:
         return "–"
     if d.metric.better == "one":
         return f"{10**d.low:.3f}{between}{10**d.high:.3f}"
-    low, high = d.metric.scale * d.low, d.metric.scale * d.high
-    largest = max(abs(low), abs(high))
-    digits = max(0, 2 - int(np.floor(np.log10(largest)))) if largest > 0 else 0
+    return shown_bounds(d.metric, d.low, d.high, between)
+
+
+def shown_bounds(metric: Metric, low: float, high: float, between: str = " … ") -> str:
+    """Two values of a figure for people; a dash where there are none."""
+    if not np.isfinite(low):
+        return "–"
+    low, high = metric.scale * low, metric.scale * high
+    digits = decimals(max(abs(low), abs(high)))
     return f"{low:.{digits}f}{between}{high:.{digits}f}".replace("-", "−")
 
 
-def _interval(d: Difference) -> str:
+def shown_spread(metric: Metric, mean: float, sd: float) -> tuple[str, str]:
+    """Mean and standard deviation for people, with as many digits as the mean needs; empty where there is none."""
+    mean, sd = metric.scale * mean, metric.scale * sd
+    if not np.isfinite(mean):
+        return "–", ""
+    digits = decimals(mean)
+    shown = f"{mean:.{digits}f}".replace("-", "−")
+    return shown, f"± {sd:.{digits}f}" if np.isfinite(sd) else ""
+
+
+def decimals(value: float) -> int:
+    """Digits after the point that show three of a value; at most six."""
+    return min(6, max(0, 2 - int(np.floor(np.log10(abs(value)))))) if value else 0
+
+
+def shown_p(p: float) -> str:
+    """A p-value for people; a dash where there is none."""
+    if not np.isfinite(p):
+        return "–"
+    return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
+
+
+def worth_saying(d: Difference) -> bool:
+    """Whether a summary speaks of it whatever its verdict: not of what has the same ideal value in every run."""
+    perfect = d.metric.better == "higher" and d.reference == 1
+    return d.metric.main and not (perfect and d.verdict is Verdict.EQUAL)
+
+
+def _is_named(d: Difference) -> bool:
+    return d.metric.main or d.verdict is not Verdict.SINGLE
+
+
+def _is_open(d: Difference) -> bool:
+    return d.verdict in (Verdict.OPEN, Verdict.EQUAL)
+
+
+def _evidence(d: Difference) -> str:
+    """Interval and p."""
     what = f"{round(100 * LEVEL)} % interval"
     if d.metric.better == "one":
         what += " of the ratio of the factors by which they are off"
-    return f"{what} {shown_interval(d, ' to ')}{d.metric.unit and f' {d.metric.unit}'}"
+    unit = d.metric.unit and f" {d.metric.unit}"
+    text = f"{what} {shown_interval(d, ' to ')}{unit}, p {_equals(d.p)}"
+    return text if d.p_holm == d.p else f"{text}, Holm-adjusted {shown_p(d.p_holm)}"
 
 
-def _name(d: Difference) -> str:
+def _equals(p: float) -> str:
+    return shown_p(p) if shown_p(p).startswith("<") else f"= {shown_p(p)}"
+
+
+def _name(metric: Metric) -> str:
     """A label that can stand in a list."""
-    return d.metric.label.replace(", ", " ").removesuffix(" (1 is honest)")
+    return metric.label.replace(", ", " ").removesuffix(" (expected 1)")
+
+
+def _listed(differences: Sequence[Difference]) -> str:
+    return "; ".join(map(_brief, differences))
 
 
 def _brief(d: Difference) -> str:
-    return f"{_name(d)}{_share(d)}"
+    """The figure from the reference's value to the other's, and by how much of the reference's that is."""
+    unit = d.metric.unit and f" {d.metric.unit}"
+    share = ""
+    if d.metric.better == "lower" and d.reference > 0:
+        share = f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
+    values = [shown_spread(d.metric, value, np.nan)[0] for value in (d.reference, d.other)]
+    return f"{_name(d.metric)} {' → '.join(values)}{unit}{share}"
 
 
-def _share(d: Difference) -> str:
+def _less(d: Difference) -> str:
     """By how much of the worse one the better one is lower."""
     return f" ({100 * abs(d.mean) / max(d.reference, d.other):.2g} % less)" if d.metric.better == "lower" else ""
 
 
-def _listed(words: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
-
-
-def worth_saying(d: Difference) -> bool:
-    """Whether a summary speaks of it: not of runs that all came to their end."""
-    return d.metric.main and not (d.metric is COMPLETED and d.verdict is Verdict.EQUAL)
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2f}"

@@ -93,9 +93,10 @@ def test_the_cameras_error_since_the_first_sight_is_in_the_covariance():
     blind = {name: deviations(name, lost) for name in ("ekf", "smoother")}
     for name in blind:
         assert (blind[name] > 5 * deviations(name, scene)).all()
-    # 8 to 15 degrees and as many centimetres, told by the motion model alone: the two linearise it differently
+    # 5 to 16 degrees and 15 to 21 cm, from the motion model alone. Rotations this uncertain are no longer linear: the
+    # filter transports its covariance to each corrected state and says up to three times as much as the smoother.
     ratio = blind["smoother"] / blind["ekf"]
-    assert (ratio > 0.4).all() and (ratio < 2.5).all()
+    assert (ratio > 0.25).all() and (ratio < 2.5).all()
 
 
 # --- parts of the filter ---

@@ -1,11 +1,33 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from slam.compare.measure import BY_KEY, COMPLETED, object_figures, object_metric
-from slam.compare.statistics import FEWEST, Verdict, difference
-from slam.compare.wording import caution, headline, sentence, worth_saying
+from slam.compare.statistics import (
+    ALPHA,
+    HINT_ALPHA,
+    Verdict,
+    adjusted,
+    difference,
+    fewest,
+    holm,
+    interval,
+    sign_flip,
+)
+from slam.compare.wording import (
+    STRENGTH,
+    caution,
+    headline,
+    honesty,
+    measurements,
+    sentence,
+    shown_p,
+    worth_saying,
+)
 
 ATE, NEES, PRECISION = BY_KEY["ate_online_m"], BY_KEY["nees_per_dof"], BY_KEY["association_precision"]
 
@@ -17,11 +39,81 @@ def pairs(n, shift=-0.01, seed=0):
     return hard, hard + shift + 0.001 * rng.standard_normal(n)
 
 
-def test_six_trials_that_agree_are_certain_and_five_are_not():
-    assert FEWEST == 6
+def test_six_trials_that_agree_are_certain_where_they_are_the_only_test_and_five_are_not():
+    assert fewest(1) == 6
     assert difference(ATE, *pairs(6)).verdict is Verdict.CERTAIN
-    assert difference(ATE, *pairs(5)).verdict is Verdict.LIKELY
-    assert difference(ATE, *pairs(3)).verdict is Verdict.HINT
+    assert difference(ATE, *pairs(5)).verdict is Verdict.HINT  # p = 0.0625
+    assert difference(ATE, *pairs(4)).verdict is Verdict.OPEN  # p = 0.125
+
+
+def test_p_near_a_tenth_is_not_likely():
+    change = np.array([0.05, -0.06, -0.1, -0.11, -0.12, -0.13, 0.02])
+    d = difference(ATE, np.ones(7), 1 + change)
+    assert 0.05 < d.p <= 0.1
+    assert d.verdict is Verdict.HINT
+
+
+def test_words_have_their_thresholds_in_one_place():
+    assert (ALPHA, HINT_ALPHA) == (0.05, 0.1)
+    assert "Holm-adjusted p ≤ 0.05" in STRENGTH[Verdict.CERTAIN]
+    assert "p ≤ 0.05" in STRENGTH[Verdict.LIKELY]
+    assert "p ≤ 0.1" in STRENGTH[Verdict.HINT]
+    page = (Path(__file__).parents[3] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    assert f"| certain | leaves out zero | Holm-adjusted p ≤ {ALPHA:g} |" in page
+    assert f"| likely | leaves out zero | p ≤ {ALPHA:g} before the adjustment |" in page
+    assert f"| a hint | leaves out zero | p ≤ {HINT_ALPHA:g} before the adjustment |" in page
+    trials = re.search(r"with (\d+) trials, 20 tests with (\d+), 70 with (\d+), 300 with\s(\d+)", page)
+    assert [int(n) for n in trials.groups()] == [fewest(1), fewest(20), fewest(70), fewest(300)]
+
+
+def test_holm_is_that_of_his_paper():
+    np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(holm(np.array([0.5, 0.9])), [1, 1])
+    assert len(holm(np.zeros(0))) == 0
+
+
+def test_several_tests_need_more_trials():
+    """Six trials that agree are likely where ten figures are tested; nine are enough for all ten."""
+    assert (fewest(10), fewest(67)) == (9, 12)
+    for trials, verdict in ((6, Verdict.LIKELY), (8, Verdict.LIKELY), (9, Verdict.CERTAIN)):
+        found = adjusted([difference(ATE, *pairs(trials, seed=k)) for k in range(10)])
+        assert {d.verdict for d in found} == {verdict}
+        assert {d.p_holm for d in found} == {min(1, 10 * 2 / 2**trials)}
+
+
+def test_what_cannot_come_out_either_way_is_no_test():
+    reference, other = pairs(6)
+    every = [
+        difference(ATE, reference, other),
+        difference(ATE, reference, reference),
+        difference(ATE, reference[:1], other[:1]),
+        difference(BY_KEY["map_size"], reference, other),
+    ]
+    found = adjusted(every)
+    verdicts = [d.verdict for d in found]
+    assert verdicts == [Verdict.CERTAIN, Verdict.EQUAL, Verdict.SINGLE, Verdict.UNTESTED]
+    assert found[0].p_holm == found[0].p
+    assert np.isnan(found[3].p)
+
+
+def test_the_sign_flip_test_is_exact_for_few_pairs_and_never_zero_for_many():
+    d = np.array([1.0, 2, 3, -0.5])
+    signs = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, -1).T
+    assert sign_flip(d) == np.mean(np.abs(signs @ d) >= d.sum() - 1e-9)
+    assert sign_flip(np.ones(16)) == 2 / 2**16
+    assert 0 < sign_flip(np.ones(40)) < 1e-4
+    noise = np.random.default_rng(0).standard_normal(40)
+    assert 0.05 < sign_flip(noise) == sign_flip(noise) <= 1
+    assert sign_flip(np.zeros(3)) == 1
+
+
+def test_the_interval_of_a_mean():
+    values = np.random.default_rng(0).standard_normal(50)
+    low, high = interval(values)
+    assert low < values.mean() < high
+    assert high - low == pytest.approx(2 * 1.96 / np.sqrt(50), rel=0.25)
+    assert interval(np.ones(3)) == (1, 1)
+    assert np.isnan(interval(np.ones(1))).all()
 
 
 def test_pairs_take_the_difficulty_of_a_trial_out():
@@ -31,6 +123,16 @@ def test_pairs_take_the_difficulty_of_a_trial_out():
     assert -0.012 < d.low < d.mean < d.high < -0.008  # although trials spread over 0.9
     assert d.better is True
     assert difference(ATE, other, reference).better is False
+
+
+def test_noise_alone_is_certain_in_few_reports_however_many_figures():
+    """The chance of any false one among 20 tests keeps to the level: 5 % of 200 reports are 10."""
+    rng = np.random.default_rng(2)
+    wrong = 0
+    for _ in range(200):
+        p = [sign_flip(d) for d in rng.standard_normal((20, 12))]
+        wrong += bool((holm(np.array(p)) <= ALPHA).any())
+    assert 1 <= wrong <= 18  # p < 0.01 for more
 
 
 def test_noise_alone_is_seldom_certain():
@@ -79,6 +181,7 @@ def test_higher_is_better_where_it_is():
     d = difference(PRECISION, *pairs(8, shift=0.05))
     assert d.better is True
     assert sentence(d, "a", "b").startswith("association precision: b is better than a")
+    assert "p = 0.008: certain" in sentence(d, "a", "b")
     assert "in 8 of 8 trials" in sentence(d, "a", "b")
 
 
@@ -86,10 +189,40 @@ def test_sentences_say_how_much_and_how_sure():
     text = sentence(difference(ATE, *pairs(6)), "ekf", "smoother")
     for words in ("smoother is better than ekf", "mm", "% less", "6 of 6", "95 % interval", "certain"):
         assert words in text
-    assert "likely, not certain" in sentence(difference(ATE, *pairs(5)), "ekf", "smoother")
+    few = adjusted([difference(ATE, *pairs(6, seed=k)) for k in range(3)])[0]
+    assert "p = 0.031, Holm-adjusted 0.094: likely (p ≤ 0.05, not after" in sentence(few, "ekf", "smoother")
+    assert "a hint (p ≤ 0.1)" in sentence(difference(ATE, *pairs(5)), "ekf", "smoother")
+
+
+def test_the_caution_says_how_many_trials_it_takes():
     assert "6.2 %" in caution(5)
-    assert "One trial" in caution(1)
+    assert "One trial" in caution(1, 67)
+    assert "12 or more" in caution(1, 67)
     assert not caution(6)
+    assert "67 tests multiply it (Holm). It takes 12 or more" in caution(6, 67)
+    assert not caution(12, 67)
+
+
+def test_p_values_are_short_and_never_zero():
+    assert [shown_p(p) for p in (float("nan"), 1e-5, 0.03125, 0.5)] == ["–", "< 0.001", "0.031", "0.50"]
+
+
+def test_mean_nees_stands_beside_what_is_to_be_expected():
+    """A NEES of 3500 says little; that errors are 24 times what is claimed says what is wrong."""
+    values = {"nees_per_dof": {"ekf": 3500 / 6, "smoother": 1.2}, "nees_10m_per_dof": {"ekf": np.nan, "smoother": 0.1}}
+    frightening, cautious = honesty(values, 6)
+    assert frightening.startswith(
+        "ekf: overconfident. NEES / 6 from the start is 583, expected 1, 0.59 to 1.51 by chance"
+    )
+    assert "errors are 24 times as large" in frightening
+    assert cautious.startswith("smoother: too cautious. NEES / 6 over 10 m of path is 0.10")
+    assert honesty({"nees_per_dof": {"ekf": 1.2}}, 6)[0].startswith("ekf: consistent")
+    assert honesty({}, 6) == []
+
+
+def test_captions_tell_closed_loop_from_replay():
+    assert measurements("closed loop", "ekf").startswith("Closed loop:")
+    assert "ekf's closed loop" in measurements("replay", "ekf")
 
 
 def test_the_same_input_gives_the_same_figures():
@@ -122,17 +255,29 @@ def test_figures_of_objects_from_a_summary():
     assert object_figures({}) == {}
 
 
-def test_a_headline_says_who_is_better_in_what_and_what_is_open():
-    same = np.full(6, 0.5)
+def test_a_headline_names_all_that_is_certain_in_both_directions_and_what_is_open():
+    same = np.full(9, 0.5)
+    noise = np.array([0.1, -0.1, 0.11, -0.12, 0.09, -0.08, 0.1, -0.1, 0.01])
     differences = [
-        difference(ATE, *pairs(6)),
+        difference(ATE, *pairs(9)),
+        difference(BY_KEY["rpe_1s_m"], *pairs(9, shift=0.01)),  # no main figure
         difference(PRECISION, same, same),
-        difference(BY_KEY["landmark_error_m"], same, same + np.array([0.1, -0.1, 0.11, -0.12, 0.09, -0.08])),
+        difference(BY_KEY["landmark_error_m"], same, same + noise),
+        difference(BY_KEY["landmark_error_90_m"], same, same + noise),
     ]
-    text = headline(differences, "ekf", "smoother")
-    assert text.startswith("smoother is better in ATE RMSE online (")
-    assert "% less): certain at the level of 95 %." in text
-    assert "No difference can be concluded in association precision and landmark error median." in text
+    lines = headline(adjusted(differences), "ekf", "smoother")
+    assert [(line.direction, line.verdict) for line in lines] == [
+        ("better", Verdict.CERTAIN),
+        ("worse", Verdict.CERTAIN),
+        ("", Verdict.OPEN),
+    ]
+    better, worse, rest = (line.text for line in lines)
+    assert better.startswith("smoother is better than ekf, certain (Holm-adjusted p ≤ 0.05): ATE RMSE online ")
+    assert "→" in better
+    assert "(−1" in better  # per cent of the reference
+    assert worse.startswith("smoother is worse than ekf, certain (Holm-adjusted p ≤ 0.05): RPE RMSE over 1 s ")
+    assert "(+1" in worse
+    assert rest == "No difference can be concluded in landmark error median."
 
 
 def test_runs_that_failed_are_a_difference_of_their_own():
@@ -140,6 +285,7 @@ def test_runs_that_failed_are_a_difference_of_their_own():
     all_failed = difference(COMPLETED, np.ones(6), np.zeros(6))
     assert (all_failed.verdict, all_failed.better, all_failed.wins) == (Verdict.CERTAIN, False, 6)
     some = difference(COMPLETED, np.array([0.0, 0, 0, 1, 1, 1]), np.ones(6))
-    assert (some.verdict, some.better, some.wins) == (Verdict.HINT, True, 3)
-    assert "in 3 of 6 trials" in sentence(some, "a", "b")
+    assert (some.verdict, some.better, some.wins) == (Verdict.OPEN, True, 3)  # p = 0.25
+    assert "b 100 against 50 %, mean of 6 trials" in sentence(some, "a", "b")
     assert not worth_saying(difference(COMPLETED, np.ones(6), np.ones(6)))
+    assert worth_saying(difference(COMPLETED, np.zeros(6), np.zeros(6)))

@@ -1,0 +1,160 @@
+"""A comparison for papers: tables and figures for LaTeX, the same bytes for the same runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from slam.compare.figures import as_pdf, pictures
+from slam.compare.measure import Metric
+from slam.compare.plan import Plan, short_name
+from slam.compare.statistics import LEVEL, Difference
+from slam.compare.sweep import Run
+from slam.compare.tables import Group, count_tests, groups, mean_figures
+from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
+
+TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
+
+_HEAD = "% Written by slam compare. Needs: \\usepackage{{{}}}\n"
+
+#: What LaTeX reads otherwise, and what older engines lack.
+_LATEX = str.maketrans(
+    {
+        **{c: f"\\{c}" for c in "_&%#${}"},
+        "\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}",
+        "<": "$<$", ">": "$>$", "−": "$-$", "×": "$\\times$", "±": "$\\pm$", "σ": "$\\sigma$", "≤": "$\\leq$",
+        "–": "--", "…": "\\ldots{}", "·": "$\\cdot$", "²": "$^2$", "³": "$^3$", "ᴺ": "$^N$", "→": "$\\to$",
+    }
+)  # fmt: skip
+
+
+def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
+    """Write ``tables.tex`` (package booktabs), ``figures.tex`` (graphicx) and the pictures as ``figures/*.pdf``.
+
+    Every caption says which measurements the back ends were given. Only ``figures/*_time.pdf`` depends on the machine.
+    """
+    every = groups(plan, runs)
+    tests = count_tests(every)
+    tables = [table for group in every for table in (means_table(group), differences_table(group, tests))]
+    _write(out / TABLES, _HEAD.format("booktabs") + "\n" + "\n".join(tables))
+    (out / FOLDER).mkdir(exist_ok=True)
+    shown = [text for group in every for text in _figures(group, out / FOLDER)]
+    _write(out / FIGURES, _HEAD.format("graphicx") + "\n" + "\n".join(shown))
+
+
+def means_table(group: Group) -> str:
+    """Mean, standard deviation and confidence interval of every figure of each back end."""
+    names = list(group.runs)
+    head = ["figure", *(f"{latex(name)} & {round(100 * LEVEL)} \\% CI" for name in names)]
+    rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.shown]
+    caption = (
+        f"{_what(group)}: mean $\\pm$ standard deviation over the completed of {group.trials} trials, and the "
+        f"{round(100 * LEVEL)} \\% bootstrap confidence interval (BCa) of the mean. {_given(group)}."
+    )
+    return _table("l" + "rl" * len(names), head, rows, caption, f"tab:{_label(group)}_means")
+
+
+def differences_table(group: Group, tests: int) -> str:
+    """Effect, interval and p of every figure that has a better side, each other back end against the first.
+
+    Args:
+        group: the runs.
+        tests: that p is adjusted for.
+    """
+    first, *others = group.runs
+    rows = []
+    for metric in group.shown:
+        for other, d in group.differences(metric).items():
+            if metric.better:
+                rows.append([latex(metric.title), *([latex(other)] if len(others) > 1 else []), *_difference_cells(d)])
+    head = ["figure", *(["back end"] if len(others) > 1 else []), "difference", f"{round(100 * LEVEL)} \\% CI"]
+    head += ["$p$", "$p_\\mathrm{Holm}$", "pairs"]
+    caption = (
+        f"{_what(group)}: mean paired difference, {' and '.join(map(latex, others)) or 'other'} less {latex(first)} "
+        "(for figures that should be 1, the ratio of the factors by which the two are off), with its "
+        f"{round(100 * LEVEL)} \\% bootstrap confidence interval (BCa). $p$: two-sided sign-flip permutation test, and "
+        f"adjusted by Holm's method over {tests} tests. {_given(group)}."
+    )
+    columns = "ll" if len(others) > 1 else "l"
+    return _table(columns + "rlrrr", head, rows, caption, f"tab:{_label(group)}_differences")
+
+
+def latex(text: str) -> str:
+    """Plain text for LaTeX."""
+    return text.translate(_LATEX)
+
+
+def _figures(group: Group, folder: Path) -> Iterable[str]:
+    """Write a group's pictures; a figure environment for each."""
+    for picture in pictures(group):
+        name = f"{_label(group)}_{picture.name}"
+        caption = f"{_what(group)}: {_lower(latex(picture.caption))} {_given(group)}."
+        part = folder / f"{name}.pdf.part"
+        part.write_bytes(as_pdf(picture.draw(), f"{picture.title}: {group.sequence}, {group.mode}"))
+        part.replace(folder / f"{name}.pdf")
+        yield (
+            "\\begin{figure}\n  \\centering\n"
+            f"  \\includegraphics[width=\\linewidth]{{{FOLDER}/{name}}}\n"
+            f"  \\caption{{{caption}}}\n  \\label{{fig:{name}}}\n\\end{{figure}}\n"
+        )
+
+
+def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str) -> str:
+    lines = [" & ".join(row) + " \\\\" for row in rows]
+    return "\n    ".join(
+        [
+            "\\begin{table}\n  \\centering\n  \\small\n  \\setlength{\\tabcolsep}{4pt}\n"
+            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n  \\begin{{tabular}}{{{columns}}}",
+            "\\toprule",
+            " & ".join(head) + " \\\\",
+            "\\midrule",
+            *lines,
+            "\\bottomrule\n  \\end{tabular}\n\\end{table}\n",
+        ]
+    )
+
+
+def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
+    mean, sd, low, high = (metric.scale * x for x in mean_figures(group.finite(backend, metric.key)))
+    if not np.isfinite(mean):
+        return "-- & --"
+    digits = decimals(mean)
+    shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
+    return f"{shown[0]} $\\pm$ {shown[1]} & [{shown[2]}, {shown[3]}]" if np.isfinite(sd) else f"{shown[0]} & --"
+
+
+def _difference_cells(d: Difference) -> list[str]:
+    interval = shown_interval(d, ", ")
+    bounds = latex(interval if interval == "–" else f"[{interval}]")
+    return [
+        latex(shown_mean(d)),
+        bounds,
+        *(latex(shown_p(p)) if d.varies else "--" for p in (d.p, d.p_holm)),
+        str(d.pairs),
+    ]
+
+
+def _what(group: Group) -> str:
+    variant = "" if group.variant.name == "surf" else f", {latex(group.variant.name)}"
+    return f"\\texttt{{{latex(group.sequence)}}}{variant}"
+
+
+def _given(group: Group) -> str:
+    return latex(measurements(group.mode, next(iter(group.runs))))
+
+
+def _label(group: Group) -> str:
+    return "_".join([short_name(group.sequence), short_name(group.variant.name), group.mode.replace(" ", "_")])
+
+
+def _lower(text: str) -> str:
+    """A sentence that goes on after a colon; abbreviations stay."""
+    return text if text[1:2].isupper() else text[0].lower() + text[1:]
+
+
+def _write(path: Path, text: str) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)

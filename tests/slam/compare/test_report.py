@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import csv
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from slam.compare.paper import differences_table, latex, means_table, write_paper
+from slam.compare.report import conclusions, write_report
+from slam.compare.statistics import Verdict
+from slam.compare.tables import count_tests, groups, write_tables
+from tests.slam.compare.made_up import make, plan
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """Twelve trials of three back ends, the last one with covariances that do not hold, and a run that failed."""
+    out = tmp_path_factory.mktemp("three")
+    of = plan(12, ("ekf", "smoother", "batch"))
+    runs = make(out, of, "batch", (("smoother", 3),))
+    write_tables(of, runs, out)
+    return out, of, runs, groups(of, runs)
+
+
+@pytest.fixture(scope="module")
+def text(three):
+    out, of, runs, _ = three
+    return write_report(of, runs, out, "here").read_text()
+
+
+@pytest.fixture(scope="module")
+def paper(three):
+    out, of, runs, _ = three
+    write_paper(of, runs, out)
+    return out
+
+
+def test_the_headlines_name_what_is_certainly_worse_beside_what_is_better(three):
+    found = conclusions(three[3])[0]
+    lines = {(line.short.split(":")[0], line.direction, line.verdict): line.short for line in found.headlines}
+    assert "ATE RMSE final" in lines["smoother", "better", Verdict.CERTAIN]
+    assert "RPE RMSE over 1 s" in lines["smoother", "worse", Verdict.CERTAIN]
+    assert "NEES / 6 over 10 m" in lines["batch", "worse", Verdict.CERTAIN]
+    assert "frames tracked 100 → 90.0 %" in lines["batch", "worse", Verdict.CERTAIN]
+    assert "1 of 12 of smoother" in found.failed
+    assert any("batch: overconfident. NEES / 6 over 10 m of path is 58, expected 1" in line for line in found.full)
+    assert found.short[0] == found.failed
+
+
+def test_better_and_worse_have_badges_of_their_own(text):
+    assert '<span class="verdict better certain">better: certain</span>' in text
+    assert '<span class="verdict worse certain">worse: certain</span>' in text
+    better, worse = (re.search(rf"\.{word} {{ --full: (#\w+)", text)[1] for word in ("better", "worse"))
+    assert better != worse
+
+
+def test_the_report_says_the_usual_words(text, three):
+    tests = count_tests(three[3])
+    assert f"{tests} tests" in text
+    for word in ("Holm", "sign-flip permutation test", "BCa", "± SD", "p, Holm", "p ≤ 0.05", "Replay: all back ends"):
+        assert word in text
+    assert "Closed loop: each back end steers its own data association.</figcaption>" in text
+    assert "frames lost" in text
+    assert "frames predicted" not in text  # there was none
+
+
+def test_p_is_adjusted_over_all_groups_of_the_report(three):
+    out, _, _, every = three
+    with (out / "differences.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["p"] and row["verdict"] != "equal"]
+    assert len(rows) == count_tests(every)
+    smallest = min(float(row["p"]) for row in rows)
+    assert min(float(row["p_holm"]) for row in rows) == pytest.approx(min(1, len(rows) * smallest))
+    with (out / "means.csv").open() as file:
+        means = [row for row in csv.DictReader(file) if row["figure"] == "ate_final_m"]
+    assert all(float(row["low"]) < float(row["mean"]) < float(row["high"]) for row in means)
+
+
+def test_tables_for_latex(paper, three):
+    tables = (paper / "tables.tex").read_text()
+    assert tables.startswith("% Written by slam compare. Needs: \\usepackage{booktabs}\n")
+    captions = re.findall(r"\\caption\{(.*)\}\n", tables)
+    assert len(captions) == 4
+    assert sum("Closed loop: each back end steers" in caption for caption in captions) == 2
+    assert sum("Replay: all back ends are given the measurements of ekf's" in caption for caption in captions) == 2
+    assert tables.count("\\toprule") == tables.count("\\bottomrule") == 4
+    for table in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", tables, re.S):
+        rows = [line for line in table[1].splitlines() if line.endswith("\\\\")]
+        assert {row.count(" & ") for row in rows} == {len(table[0]) - 1}
+    assert tables.isascii()
+    assert "ATE RMSE, final [mm] & $3.0" in means_table(three[3][0])
+    assert "Holm's method over 7 tests" in differences_table(three[3][0], 7)
+
+
+def test_latex_has_no_character_that_it_reads_otherwise():
+    assert latex("a_b & 5 % #1 ~ ^ \\ {x} −3 × ≤") == (
+        "a\\_b \\& 5 \\% \\#1 \\textasciitilde{} \\textasciicircum{} \\textbackslash{} \\{x\\} $-$3 $\\times$ $\\leq$"
+    )
+
+
+def test_figures_for_papers(paper):
+    figures = (paper / "figures.tex").read_text()
+    names = re.findall(r"\\includegraphics\[width=\\linewidth\]\{(.*)\}", figures)
+    assert sorted(f"{name}.pdf" for name in names) == sorted(
+        path.relative_to(paper).as_posix() for path in (paper / "figures").iterdir()
+    )
+    assert {name.rsplit("_", 1)[1] for name in names} == {"trials", "paths", "errors", "nees", "time"}
+    captions = re.findall(r"\\caption\{(.*)\}\n", figures)
+    assert len(captions) == len(names) == 10
+    assert all("Closed loop: " in caption or "Replay: " in caption for caption in captions)
+    assert figures.isascii()
+    for name in names:
+        content = (paper / f"{name}.pdf").read_bytes()
+        assert content.startswith(b"%PDF")
+        assert b"CreationDate" not in content
+        assert b"/Type3" not in content  # fonts that many publishers refuse
+
+
+WRITE = """
+import sys
+from pathlib import Path
+from tests.slam.compare.test_report import write_small
+write_small(Path(sys.argv[1]))
+"""
+
+
+def write_small(out):
+    """Tables and figures of two trials in closed loop; their bytes by name."""
+    out.mkdir()
+    of = replace(plan(2), replay=False)
+    write_paper(of, make(out, of), out)
+    files = [out / "tables.tex", out / "figures.tex", *sorted((out / "figures").iterdir())]
+    return {path.name: path.read_bytes() for path in files}
+
+
+def test_tables_and_figures_have_the_same_bytes_in_any_process(tmp_path):
+    here = write_small(tmp_path / "here")
+    environment = {**os.environ, "PYTHONHASHSEED": "7"}
+    there = tmp_path / "there"
+    subprocess.run([sys.executable, "-c", WRITE, str(there)], check=True, env=environment, timeout=120)
+    files = [there / "tables.tex", there / "figures.tex", *sorted((there / "figures").iterdir())]
+    assert {path.name: path.read_bytes() for path in files} == here
+
+
+def test_one_trial_and_nothing_that_completed(tmp_path):
+    of = plan(1)
+    runs = make(tmp_path, of, failed=(("ekf", 0), ("smoother", 0)))
+    write_tables(of, runs, tmp_path)
+    write_paper(of, runs, tmp_path)
+    text = write_report(of, runs, tmp_path, "here").read_text()
+    assert "4 of 4 runs failed" in text
+    assert not list((tmp_path / "figures").iterdir())
+
+
+def test_one_trial_says_that_it_proves_nothing(tmp_path):
+    of = plan(1)
+    runs = make(tmp_path, of)
+    every = groups(of, runs)
+    found = conclusions(every)[0]
+    assert {line.verdict for line in found.headlines} <= {Verdict.SINGLE, Verdict.OPEN}
+    assert any(line.startswith("smoother was better than ekf, in one trial") for line in found.short)
+    assert count_tests(every) > 0  # as many as more trials would have
+    text = write_report(of, runs, tmp_path, "here").read_text()
+    assert "One trial cannot tell a difference from chance" in text
