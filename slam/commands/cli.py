@@ -346,7 +346,7 @@ def demo_command(
 def _title(sequence: Sequence | Recording, backend: str) -> str:
     """A short name for a progress bar: of a world its name alone."""
     name = sequence.name.partition("?")[0]
-    return f"{name if len(name) <= 16 else f'…{name[-15:]}'} · {backend}"
+    return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
 
 
 def _leave_picture(folder: Path, wanted: bool) -> None:
