@@ -8,7 +8,7 @@ from typing import Any
 from slam.calibration.disparity_offset import SelfCalibrationConfig
 from slam.errors import ConfigurationError
 from slam.mapping.config import MapConfig
-from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for
+from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
 from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracking.association import AssociationConfig
@@ -57,6 +57,9 @@ class SystemConfig:
         objects: the detector of moving objects.
         frontend: options of the front end by name.
         backend: options of the back end by name.
+
+    Raises:
+        ConfigurationError: a part is of the wrong type.
     """
 
     models: EstimatorModels = field(default_factory=EstimatorModels)
@@ -68,6 +71,9 @@ class SystemConfig:
     backend: dict[str, Any] = field(default_factory=dict)
 
     __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        require_not_negative(self)
 
     @classmethod
     def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:

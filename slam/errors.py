@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+_LONGEST = 600  # characters of a message
+
+
+def one_line(text: str, length: int = _LONGEST) -> str:
+    """The text on one line of bounded length: control characters are escaped, the middle of a long text is left out."""
+    if len(text) > length:
+        text = f"{text[: 2 * length // 3]} … {text[-(length // 3) :]}"
+    return "".join(c if c.isprintable() else " " if c in "\n\t" else repr(c)[1:-1] for c in text).strip()
+
 
 class SlamError(Exception):
     """Root of every exception that this package raises on purpose.
 
-    The message is one line that says what is wrong and where. Commands print it and exit with status 2.
+    The message is one line that says what is wrong and where, whatever the input was called. Commands print it and
+    exit with status 2.
     """
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class ConfigurationError(SlamError):

@@ -139,7 +139,10 @@ class RevisingBackend(Protocol):
 
 @runtime_checkable
 class MapBackend(Protocol):
-    """What a back end offers besides, where it can start in a map that is known beforehand."""
+    """What a back end offers besides, where it can start in a map that is known beforehand.
+
+    One whose memory grows faster than the map says in an attribute ``most_landmarks`` how large a map it takes.
+    """
 
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """Add landmarks with known positions (N, 3) [m] and covariances (N, 3, 3) [m²], independent of the pose.

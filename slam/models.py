@@ -3,32 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam.bounds import require_not_negative as require_not_negative
+from slam.bounds import require_positive
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
 from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
+_DENSITIES = (1e-6, 1e6)  # of velocity noise
+_FARTHEST = 1e8  # coordinate of the first position [m]: beyond it, the rounding of a position is no longer small
+_SIGMAS = (1e-7, 1e6)  # of the initial state
+_RANGES = {
+    "pixel_sigma": (1e-3, 1e3),
+    "gate_probability": (0.0, 1.0),
+    "initial_position_sigma": _SIGMAS,
+    "initial_rotation_sigma": (1e-7, 10.0),
+    "initial_velocity_sigma": _SIGMAS,
+    "initial_angular_velocity_sigma": (1e-7, 1e3),
+}
 
-def _require_positive(config: object) -> None:
-    """Raise where a float field of a configuration dataclass is not positive and finite."""
-    for f in fields(config):  # type: ignore[arg-type]
-        value = getattr(config, f.name)
-        if isinstance(value, (int, float)) and not (np.isfinite(value) and value > 0):
-            raise ConfigurationError(f"{f.name} must be positive and finite, got {value}")
+
+def _numbers(value: object) -> Array:
+    """An array of numbers; an empty one where there are none."""
+    try:
+        return np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
 
 
-def require_not_negative(config: object) -> None:
-    """Raise where a number of a configuration dataclass, or one in a tuple of it, is negative or not finite."""
-    for f in fields(config):  # type: ignore[arg-type]
-        value = getattr(config, f.name)
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, (int, float)) and not (np.isfinite(number) and number >= 0):
-                raise ConfigurationError(f"{f.name} must be finite and not negative, got {value}")
+def _is_rotation(R: Array) -> bool:
+    """Whether a matrix (3, 3) is a rotation, to within the rounding of six digits."""
+    return bool(np.abs(R).max() < 1.1 and np.abs(R @ R.T - np.eye(3)).max() <= 1e-6 and np.linalg.det(R) > 0)
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,7 @@ class MotionModel:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        _require_positive(self)
+        require_positive(self, {"acceleration": _DENSITIES, "angular_acceleration": _DENSITIES})
 
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of w_v [m²/s²] and w_ω [rad²/s²] over `dt` [s]."""
@@ -85,14 +95,10 @@ class EstimatorModels:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        _require_positive(self)
+        require_positive(self, _RANGES)
         if self.T_world_left is not None:
-            T = np.array(self.T_world_left, float)
-            if (
-                T.shape != (4, 4)
-                or not np.isfinite(T).all()
-                or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6
-            ):
+            T = _numbers(self.T_world_left)
+            if T.shape != (4, 4) or not (np.abs(T) <= _FARTHEST).all() or not _is_rotation(T[:3, :3]):
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:

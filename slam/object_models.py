@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import numpy as np
-
+from slam.bounds import require_positive
 from slam.errors import ConfigurationError
 
 #: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
 FORBID_UNKNOWN = {"extra": "forbid"}
+
+_RANGES = {
+    "acceleration": (1e-6, 1e6),
+    "angular_acceleration": (1e-6, 1e6),
+    "initial_velocity_sigma": (1e-7, 1e6),
+    "initial_angular_velocity_sigma": (1e-7, 1e3),
+    "points": (1, 1000),
+}
 
 
 @dataclass(frozen=True)
@@ -38,10 +45,7 @@ class ObjectModels:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigurationError(f"objects: {f.name} must be positive and finite, got {value}")
+        require_positive(self, _RANGES, "objects")
         if self.points < 3:
             raise ConfigurationError(f"objects: points must be at least 3, got {self.points}")
 

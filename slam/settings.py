@@ -11,6 +11,9 @@ from slam.naming import unknown
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
+_LONGEST = 10_000  # characters of a setting
+_BRACKETS = 100  # in its value
+
 
 def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
     """Change leaves of a configuration's tree in place; types and ranges are checked when it is read back.
@@ -23,6 +26,8 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
         ConfigurationError: a text is not of that form, or its section or key is unknown.
     """
     for setting in settings:
+        if len(setting) > _LONGEST:
+            raise ConfigurationError(f"setting {setting!r} is longer than {_LONGEST} characters")
         path, equals, text = setting.partition("=")
         if not equals:
             raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
@@ -30,10 +35,12 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
 
 
 def _value(text: str) -> Any:
-    """JSON where it is JSON, else the text itself."""
+    """JSON where it is JSON, else the text itself; what nests too deeply or has too many digits is no JSON either."""
+    if text.count("[") + text.count("{") > _BRACKETS:
+        return text
     try:
         return json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -9,6 +9,8 @@ from slam.errors import ConfigurationError
 MEASUREMENTS = ("stereo", "left")
 LANDMARKS = ("inverse_depth", "euclidean")
 
+_MOST_ITERATIONS = 1000
+
 
 @dataclass(frozen=True)
 class EkfConfig:
@@ -42,5 +44,7 @@ class EkfConfig:
             raise ConfigurationError(f"ekf: landmarks must be one of {LANDMARKS}, got {self.landmarks!r}")
         if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
             raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
+        if self.iterations > _MOST_ITERATIONS:
+            raise ConfigurationError(f"ekf: iterations must be at most {_MOST_ITERATIONS}, got {self.iterations}")
         if not isinstance(self.consistent, bool):
             raise ConfigurationError(f"ekf: consistent must be true or false, got {self.consistent!r}")

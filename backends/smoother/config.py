@@ -8,6 +8,9 @@ import numpy as np
 
 from slam.errors import ConfigurationError
 
+_MOST = 1_000_000  # poses or landmarks
+_LEAST_ERROR, _MOST_ERROR = 1e-9, 1e6  # [px]
+
 
 @dataclass(frozen=True)
 class SmootherConfig:
@@ -41,10 +44,17 @@ class SmootherConfig:
         if self.lag is not None:
             _require_whole(self.lag, "lag", self.window)
         value = self.relinearise
-        if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not (number and (isinstance(value, int) or np.isfinite(value)) and value > 0):
             raise ConfigurationError(f"smoother: relinearise must be positive and finite, got {value!r}")
+        if not _LEAST_ERROR <= value <= _MOST_ERROR:
+            raise ConfigurationError(
+                f"smoother: relinearise must lie between {_LEAST_ERROR:g} and {_MOST_ERROR:g}, got {value}"
+            )
 
 
 def _require_whole(value: object, name: str, least: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ConfigurationError(f"smoother: {name} must be an integer of at least {least}, got {value!r}")
+    if value > _MOST:
+        raise ConfigurationError(f"smoother: {name} must be at most {_MOST}, got {value}")

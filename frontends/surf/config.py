@@ -66,6 +66,8 @@ class SurfConfig:
         grid = self.grid
         if not (isinstance(grid, (tuple, list)) and len(grid) == 2 and all(_is_count(n) for n in grid)):
             raise ConfigurationError(f"grid: must be two whole numbers of at least 1, not {grid!r}")
+        if max(grid) > _MOST_CELLS:
+            raise ConfigurationError(f"grid: at most {_MOST_CELLS} columns and rows, not {grid!r}")
         object.__setattr__(self, "grid", (int(grid[0]), int(grid[1])))
         for key in ("features", "threads"):
             if not _is_count(getattr(self, key)):
@@ -87,6 +89,8 @@ class SurfConfig:
         base = {} if config is None else {f.name: getattr(config, f.name) for f in fields(cls)}
         return from_options(cls, "surf", {**base, **options})
 
+
+_MOST_CELLS = 1000
 
 _RANGES = (
     ("features", 1, 100_000),

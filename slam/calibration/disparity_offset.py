@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam.bounds import require_positive
 from slam.data import IdArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
@@ -24,6 +25,17 @@ _DEGREES = 4.0  # of Student's t, the weight of a landmark's residual
 _MEDIAN = 2.366  # of χ² with three degrees of freedom
 _SURPRISING = 2.0  # deviation of a pair from the posterior, in standard deviations, at which it counts half
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
+
+_SIGMAS = (1e-4, 1e4)  # [px]
+_RANGES = {
+    "prior_sigma": _SIGMAS,
+    "pixel_sigma": _SIGMAS,
+    "disparity_sigma": _SIGMAS,
+    "strongest_pair": _SIGMAS,
+    "weakest_pair": _SIGMAS,
+    "max_radius": (1e-3, 1e3),
+    "inflation": (1e-3, 1e3),
+}
 
 
 @dataclass(frozen=True)
@@ -60,11 +72,7 @@ class SelfCalibrationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        positive = ("prior_sigma", "pixel_sigma", "disparity_sigma", "max_radius", "strongest_pair", "inflation")
-        for name in positive:
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigurationError(f"self_calibration: {name} must be positive and finite, got {value}")
+        require_positive(self, _RANGES, "self_calibration")
         if not self.strongest_pair <= self.weakest_pair:
             raise ConfigurationError("self_calibration: strongest_pair <= weakest_pair is required")
         if not 0 < self.kept_share <= 1:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,7 +31,8 @@ from slam.commands.options import (
     SequenceArgument,
     SetOption,
 )
-from slam.errors import SlamError
+from slam.errors import SlamError, one_line
+from slam.files import reason
 
 if TYPE_CHECKING:
     from slam.data import FrameResult
@@ -46,6 +48,10 @@ app = typer.Typer(
 )
 
 
+#: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
 class _Stopped(BaseException):
     """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out."""
 
@@ -57,16 +63,33 @@ class _Stopped(BaseException):
 def main() -> None:
     """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _stop)
+    for name in _SIGNALS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
+            signal.signal(number, _stop)
     try:
         app(prog_name="slam")
     except SlamError as error:
-        print(f"slam: {error}", file=sys.stderr)
-        sys.exit(2)
+        _end(f"slam: {error}", 2)
+    except BrokenPipeError:  # whoever read the output has gone
+        _end("", 1)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _end(f"slam: {one_line(f'{place}{reason(error)}')}", 2)
+    except MemoryError:
+        _end("slam: there is not enough memory for this", 2)
     except _Stopped as stopped:
-        print(f"slam: stopped by {stopped}; frames done so far are kept", file=sys.stderr)
-        sys.exit(128 + stopped.number)
+        _end(f"slam: stopped by {stopped}; frames done so far are kept", 128 + stopped.number)
+
+
+def _end(line: str, status: int) -> None:
+    """Say why, where there is still a terminal to say it on, and end."""
+    with suppress(OSError):
+        if line:
+            print(line, file=sys.stderr, flush=True)
+        else:
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 Python flushes it at the end
+    sys.exit(status)
 
 
 def _print_version(wanted: bool) -> None:

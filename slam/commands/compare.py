@@ -16,6 +16,7 @@ from slam.compare.wording import caution
 from slam.errors import ConfigurationError
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
+_MOST_WORKERS = 1024
 
 
 def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
@@ -54,8 +55,9 @@ def compare(
     """
     from slam.commands.display import counting
 
-    if workers is not None and workers < 1:
-        raise ConfigurationError(f"comparison: there must be at least one worker, got {workers}")
+    if workers is not None and not 1 <= workers <= _MOST_WORKERS:
+        wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
+        raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
     count = workers or available_cores()
     scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
     where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"

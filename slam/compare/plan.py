@@ -15,6 +15,8 @@ SYNTHETIC = "synthetic:"
 #: Measurements straight from a world's landmarks in place of a front end's: no image is made.
 SIMULATED = "simulated"
 
+_MOST_TRIALS = 100_000
+
 CLOSED_LOOP, REPLAY = "closed loop", "replay"
 
 
@@ -70,6 +72,8 @@ class Plan:
                 raise ConfigurationError(f"comparison: {what} {twice!r} is given twice")
         if self.trials < 1:
             raise ConfigurationError(f"comparison: there must be at least one trial, got {self.trials}")
+        if self.trials > _MOST_TRIALS:
+            raise ConfigurationError(f"comparison: at most {_MOST_TRIALS} trials, got {self.trials}")
         for sequence in self.sequences:
             if is_world(sequence) and re.search(r"[?&]seed=", sequence):
                 raise ConfigurationError(f"{sequence}: leave the seed out, the trials have seeds 0 to N − 1")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -13,6 +14,9 @@ from slam.geometry.se3 import Array
 
 #: Distortion models and the number of coefficients each accepts.
 DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
+
+_MOST = 1e9  # of a calibration's numbers
+_WIDEST = 100_000  # width or height [px]
 
 _UNDISTORT_ITERATIONS = 50
 _UNDISTORT_TOLERANCE = 1e-13  # in normalised coordinates: 1e-10 px at any usual focal length
@@ -46,12 +50,16 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.u0, self.v0, *self.distortion)
-        if not np.all(np.isfinite(values)):
-            raise CalibrationError(f"camera calibration is not finite: {values}")
+        if not all(isinstance(v, numbers.Real) for v in (*values, self.width, self.height)):
+            raise CalibrationError(f"camera calibration is not of numbers: {values}")
+        if not all(-_MOST <= v <= _MOST for v in values):
+            raise CalibrationError(f"camera calibration is not finite, or impossibly large: {values}")
         if self.fu <= 0 or self.fv <= 0:
             raise CalibrationError(f"focal lengths must be positive, got fu={self.fu}, fv={self.fv}")
         if self.width <= 0 or self.height <= 0:
             raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
+        if not (self.width <= _WIDEST and self.height <= _WIDEST):
+            raise CalibrationError(f"image size must be at most {_WIDEST}, got {self.width}x{self.height}")
         if self.model not in DISTORTION_MODELS:
             raise CalibrationError(f"unknown distortion model {self.model!r}: {', '.join(DISTORTION_MODELS)}")
         if len(self.distortion) not in DISTORTION_MODELS[self.model]:

@@ -12,6 +12,8 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, nearest_rotation
 
+_LONGEST = 1e6  # baseline [m]
+
 _ZERO_DISPARITY = 1024  # OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 
 _FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
@@ -47,11 +49,16 @@ class StereoRig:
     b: Array
 
     def __post_init__(self) -> None:
-        R, b = np.array(self.R, float), np.array(self.b, float).reshape(-1)
+        try:
+            R, b = np.array(self.R, float), np.array(self.b, float).reshape(-1)
+        except (TypeError, ValueError, OverflowError):
+            raise CalibrationError("stereo extrinsics must be numbers") from None
         if R.shape != (3, 3) or b.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(b).all()):
             raise CalibrationError("stereo extrinsics must be a finite (3, 3) rotation and (3,) translation")
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+        if np.abs(R).max() > 1.1 or np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
             raise CalibrationError("stereo extrinsics: R is not a rotation matrix")
+        if np.abs(b).max() > _LONGEST:
+            raise CalibrationError(f"stereo baseline is impossibly long: {b.tolist()} m")
         if (self.left.width, self.left.height) != (self.right.width, self.right.height):
             raise CalibrationError(
                 f"left images are {self.left.width}x{self.left.height}, "
@@ -174,7 +181,8 @@ class StereoRig:
         """
         _, J = self.project_stereo(points)
         out = np.full((len(points), 3, 3), np.nan)
-        good = np.isfinite(J).all(axis=(1, 2))
+        good = np.asarray(np.isfinite(J).all(axis=(1, 2)))
+        good[good] = np.linalg.det(J[good]) != 0  # of points so far away that nothing tells their depth: NaN
         inverse = np.linalg.inv(J[good]) * np.broadcast_to(sigma, (3,))
         out[good] = inverse @ np.swapaxes(inverse, 1, 2)
         return out
@@ -272,11 +280,14 @@ def _stereo_rectify(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
     size = (rig.width, rig.height)
     D_left, D_right = np.array(a.distortion or (0.0,) * 4), np.array(c.distortion or (0.0,) * 4)
     t = (rig.R @ rig.b).reshape(3, 1)
-    if a.model == c.model == "equidistant":
-        return cv2.fisheye.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, _ZERO_DISPARITY)[:4]
-    if "equidistant" in (a.model, c.model):
+    if "equidistant" in (a.model, c.model) and a.model != c.model:
         raise CalibrationError("one camera is a fisheye and the other is not: such a pair cannot be rectified")
-    return cv2.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, alpha=0)[:4]
+    try:
+        if a.model == "equidistant":
+            return cv2.fisheye.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, _ZERO_DISPARITY)[:4]
+        return cv2.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, alpha=0)[:4]
+    except cv2.error as error:
+        raise CalibrationError("stereo rig cannot be rectified") from error
 
 
 def _move_pixels(source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:

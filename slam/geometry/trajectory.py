@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import TrajectoryError
+from slam.files import read_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
 
 
@@ -53,6 +54,11 @@ class Trajectory:
     def select(self, rows: np.ndarray | slice) -> Trajectory:
         """The poses of these rows (a mask, indices or a slice)."""
         return Trajectory(self.stamps[rows], self.poses[rows])
+
+    @classmethod
+    def empty(cls) -> Trajectory:
+        """No pose."""
+        return cls(np.zeros(0), np.zeros((0, 4, 4)))
 
     @classmethod
     def joined(cls, parts: Sequence[Trajectory]) -> Trajectory:
@@ -127,8 +133,9 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # an empty file is an error below
-            rows = np.loadtxt(path, delimiter=delimiter, ndmin=2, comments="#")
-    except (OSError, ValueError) as error:
+            text = read_text(path, error=TrajectoryError)
+            rows = np.loadtxt(text.splitlines(), delimiter=delimiter, ndmin=2, comments="#")
+    except ValueError as error:
         raise TrajectoryError(f"{path}: cannot be read as a trajectory: {error}") from error
     if rows.shape[1] < columns or not len(rows):
         raise TrajectoryError(f"{path}: a trajectory has {columns} columns, found {rows.shape}")

@@ -8,6 +8,7 @@ from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
+_LARGEST = 1e18  # variance [m²]; those of a landmark that is hardly known at all are far smaller
 _SYMMETRIC = 1e-6  # largest share by which a covariance may differ from its transpose
 
 
@@ -46,4 +47,6 @@ def _positive_definite(covariances: Array) -> np.ndarray:
     C = np.where(good[:, None, None], covariances, np.eye(3))
     scale = np.abs(C).max(axis=(1, 2))
     good &= np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2)) <= _SYMMETRIC * scale
+    good &= scale < _LARGEST
+    C = np.where(good[:, None, None], C, np.eye(3))
     return np.asarray(good & (np.linalg.eigvalsh(C)[:, 0] > 0))

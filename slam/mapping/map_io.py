@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -18,8 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.archives import array, json_text, unpack
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
+from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.mapping.known_landmarks import require_known
@@ -39,6 +40,11 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.
 FIRST_FRAME = "left camera at the first frame"
+
+_LARGEST = 2**31  # bytes of a file
+_MOST_ID = 2**53  # of landmarks and of counts: there is room for those that follow
+_MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # of descriptors
+_FARTHEST = 1e8  # coordinate of a landmark [m]
 
 _TYPES = {
     "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,
@@ -82,12 +88,14 @@ class SavedMap:
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
+        if any(np.ndim(getattr(self, name)) == 0 for name in _TYPES if name != "seen_from"):
+            raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
         n = len(self.ids)
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((n, 3), np.nan))
         for name, dtype in _TYPES.items():
             array = getattr(self, name)
-            if array.dtype != dtype or len(array) != n:
+            if array.dtype != dtype or array.ndim == 0 or len(array) != n:
                 raise SlamError(f"{self.source}: {name} must be {n} rows of {np.dtype(dtype)}")
         if self.descriptors.ndim != 2 or any(
             getattr(self, a).ndim != 1 for a in ("ids", "laplacian", "seen", "in_view")
@@ -95,10 +103,14 @@ class SavedMap:
             raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
         if self.seen_from.shape != (n, 3):
             raise SlamError(f"{self.source}: seen_from must be {n} rows of 3 numbers")
-        if n and (self.ids[0] < 0 or (np.diff(self.ids) <= 0).any()):
-            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on")
-        if not np.isfinite(self.descriptors).all():
-            raise SlamError(f"{self.source}: a descriptor is not finite")
+        if n and (self.ids[0] < 0 or self.ids[-1] > _MOST_ID or (np.diff(self.ids) <= 0).any()):
+            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on, up to {_MOST_ID}")
+        if not (np.abs(self.descriptors) <= _LONGEST).all() or self.dimensions > _MOST_DIMENSIONS:
+            raise SlamError(f"{self.source}: a descriptor is not finite, or far too long")
+        if not (np.abs(self.positions) <= _FARTHEST).all() or (np.abs(self.seen_from) > _FARTHEST).any():
+            raise SlamError(f"{self.source}: the position of a landmark is not finite, or too far away")
+        if any(((c := getattr(self, name)) < 0).any() or (c > _MOST_ID).any() for name in ("seen", "in_view")):
+            raise SlamError(f"{self.source}: a number of frames is impossible")
         try:
             require_known(self.source, self.ids, self.positions, self.covariances)
         except MeasurementError as error:
@@ -155,17 +167,8 @@ def save_map(path: str | Path, what: HasMap | SavedMap) -> None:
         SlamError: there is no map yet, or the file cannot be written.
     """
     data = encode(what if isinstance(what, SavedMap) else what.snapshot())
-    path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise SlamError(f"{path}: the map cannot be written: {error.strerror or error}") from error
+    with whole_file(path) as file:
+        file.write(data)
 
 
 def load_map(path: str | Path) -> SavedMap:
@@ -175,11 +178,7 @@ def load_map(path: str | Path) -> SavedMap:
         SlamError: the file is missing, is no map, is of a version that this program does not know, or was altered or
             cut short.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise SlamError(f"{path}: the map cannot be read: {error.strerror or error}") from error
-    return decode(data, str(path))
+    return decode(read_bytes(path, _LARGEST, SlamError), str(path))
 
 
 def encode(saved: SavedMap) -> bytes:
@@ -209,21 +208,22 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: a map of version {version!r}; this program reads version {_VERSION}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    try:
-        content = _members(body)
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-        raise SlamError(f"{source}: the map cannot be read: {error}") from error
-    return SavedMap(**content, source=source)
+    return SavedMap(**_members(body, source), source=source)
 
 
-def _members(body: bytes) -> dict[str, Any]:
+def _members(body: bytes, source: str) -> dict[str, Any]:
     """The attributes of `SavedMap` in an archive."""
-    with zipfile.ZipFile(io.BytesIO(body)) as file:
-        header = json.loads(file.read("header.json"))
-        texts = [f.name for f in fields(SavedMap) if f.name in ("frontend", "world_frame", "written_by")]
-        if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
-            raise ValueError(f"header.json must give {', '.join(texts)}")
-        content: dict[str, Any] = {name: header[name] for name in texts}
-        for name in _TYPES:
-            content[name] = np.lib.format.read_array(io.BytesIO(file.read(f"{name}.npy")), allow_pickle=False)
+    members = unpack(body, source)
+    missing = {"header.json", *(f"{name}.npy" for name in _TYPES)} - set(members)
+    if missing:
+        raise SlamError(f"{source}: the map lacks {min(missing)}")
+    header = json_text(members["header.json"], f"{source}: header.json")
+    texts = [f.name for f in fields(SavedMap) if f.name in ("frontend", "world_frame", "written_by")]
+    if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
+        raise SlamError(f"{source}: header.json must give {', '.join(texts)}")
+    content: dict[str, Any] = {name: header[name] for name in texts}
+    for name, kind in _TYPES.items():
+        content[name] = found = array(members[f"{name}.npy"], name, source)
+        if found.dtype != kind:  # of the other byte order, or of another kind
+            raise SlamError(f"{source}: {name} must be of {np.dtype(kind)}")
     return content

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam import registry
 from slam.data import Estimate, FrameResult, FrameStatus, Prediction, StereoFeatures, UpdateReport, UpdateStatus
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -148,9 +148,17 @@ class MapSearch:
 
         Raises:
             ConfigurationError: it cannot start in a known map.
+            SlamError: it cannot hold a map of this size.
         """
         if not isinstance(backend, MapBackend):
             raise ConfigurationError(f"{type(backend).__name__} cannot start in a known map: it has no insert")
+        most = getattr(backend, "most_landmarks", None)
+        if most is not None and len(self.known) > most:
+            name = type(backend).__name__
+            raise SlamError(
+                f"{self.known.source}: {len(self.known)} landmarks, but {name} takes a map of at most {most}: "
+                "start in a smaller map, or with another back end"
+            )
         backend.insert(self.known.ids, self.known.positions, self.known.covariances)
 
     def estimate(self, stamp: float) -> Estimate:

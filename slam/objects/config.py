@@ -72,7 +72,7 @@ class ObjectsConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_not_negative(self)
+        require_not_negative(self, {"max_points": (0, 10_000), "search_limit": (0, 1e4)}, "objects")
         if self.mode not in MODES:
             raise ConfigurationError(f"objects: mode must be one of {MODES}, got {self.mode!r}")
         if self.mode == "procedure1" and not self.database:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.archives import array, unpack
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.errors import ConfigurationError
+from slam.files import read_bytes, whole_file
 from slam.geometry.euler import angles
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
@@ -26,6 +27,8 @@ from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
 
+_LARGEST = 2**28  # bytes of a database's file
+_FARTHEST = 1e8  # of its numbers
 _STEP = 1e-5  # of the finite differences [m]
 _CANDIDATES = 12  # features with the largest determinants among which a triple is looked for
 
@@ -66,10 +69,11 @@ class ObjectDatabase:
         return cls(points, features.descriptors[rows], features.laplacian[rows], A)
 
     def save(self, path: Path) -> None:
-        """Write an .npz file."""
-        np.savez(
-            path, points=self.points, descriptors=self.descriptors, laplacian=self.laplacian, origin=self.origin
-        )  # fmt: skip
+        """Write an .npz file, whole or not at all; raises ConfigurationError where it cannot be written."""
+        with whole_file(path, ConfigurationError) as file:
+            np.savez(
+                file, points=self.points, descriptors=self.descriptors, laplacian=self.laplacian, origin=self.origin
+            )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path) -> ObjectDatabase:
@@ -78,19 +82,29 @@ class ObjectDatabase:
         Raises:
             ConfigurationError: there is no such file, or it is none of a database.
         """
-        try:
-            with path.open("rb") as stream, np.load(stream) as file:
-                database = cls(*(file[name] for name in ("points", "descriptors", "laplacian", "origin")))
-        except OSError as error:
-            raise ConfigurationError(f"object database {path}: {error.strerror or error}") from None
-        except (KeyError, ValueError, EOFError, BadZipFile):
-            raise ConfigurationError(f"object database {path}: damaged, or no database of an object") from None
+        source = f"object database {path}"
+        members = unpack(read_bytes(path, _LARGEST, ConfigurationError), source, ConfigurationError)
+        names = ("points", "descriptors", "laplacian", "origin")
+        missing = [name for name in names if f"{name}.npy" not in members]
+        if missing:
+            raise ConfigurationError(f"{source}: damaged, or no database of an object: it lacks {missing[0]}")
+        arrays = [array(members[f"{name}.npy"], name, source, ConfigurationError) for name in names]
+        if any(a.ndim == 0 or a.dtype.kind not in "fi" for a in arrays):
+            raise ConfigurationError(f"{source}: its arrays are not of numbers")
+        points, descriptors, laplacian, origin = arrays
+        with np.errstate(over="ignore"):
+            database = cls(
+                points.astype(float), descriptors.astype(np.float32), np.sign(laplacian).astype(np.int8),
+                origin.astype(float),
+            )  # fmt: skip
         n = len(database.points)
         if not (
             database.points.shape == (n, 3) and database.origin.shape == (3,) and database.laplacian.shape == (n,)
             and database.descriptors.ndim == 2 and len(database.descriptors) == n
         ):  # fmt: skip
-            raise ConfigurationError(f"object database {path}: its arrays do not belong together")
+            raise ConfigurationError(f"{source}: its arrays do not belong together")
+        if not all((np.abs(a.astype(float)) < _FARTHEST).all() for a in arrays):
+            raise ConfigurationError(f"{source}: a number is not finite, or impossibly large")
         return database
 
 

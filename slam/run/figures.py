@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
+from slam.files import read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.schema import STAGES
@@ -63,11 +65,13 @@ class RunData:
         """Read the files of a finished run.
 
         Raises:
-            SlamError: a file is missing or not as a run leaves it.
+            SlamError: the folder does not hold a finished run.
         """
+        if not (folder / "landmarks.csv").exists():
+            raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
         try:
             return cls._read(folder, name)
-        except (OSError, KeyError, ValueError, IndexError) as error:
+        except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:
             raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
 
     @classmethod
@@ -76,7 +80,7 @@ class RunData:
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
         truth = folder / "truth.txt"
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        config = json.loads(read_text(folder / "config.json"))
         return cls(
             name,
             Trajectory.read_tum(folder / "trajectory.txt"),
@@ -96,8 +100,20 @@ class RunData:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
+
+
+def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
+    """Stamp [s], id and position [m] of every row of objects.csv.
+
+    Raises:
+        SlamError: the file is missing or damaged.
+    """
+    path = folder / "objects.csv"
+    try:
+        return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
+        raise SlamError(f"{path}: no list of objects: {error}") from error
 
 
 def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:

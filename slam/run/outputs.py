@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
+from slam.files import RowFile, lock_folder, reason, write_text
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, tum_line
@@ -27,27 +30,31 @@ FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LAND
 class RunFiles:
     """Writer of a run's folder; a context manager that closes the files.
 
+    The folder is locked meanwhile: two runs in one would spoil each other's files.
+
     Args:
         folder: made if it does not exist; files of an earlier run in it are overwritten.
 
     Raises:
-        SlamError: the folder or a file in it cannot be made or written; so do all methods.
+        SlamError: the folder cannot be made or written, or another run has it.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        with self._writing():
+        with ExitStack() as stack, naming_folder(folder):
             folder.mkdir(parents=True, exist_ok=True)
+            lock = lock_folder(folder)
+            if lock is not None:
+                stack.callback(os.close, lock)
             for stale in ("trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png"):
                 (folder / stale).unlink(missing_ok=True)
-            self._trajectory = self._open("trajectory.txt")
-            self._frames = self._open("frames.csv")
-            self._objects = self._open("objects.csv")
-        self._frame_rows = csv.writer(self._frames, lineterminator="\n")
-        self._frame_rows.writerow(FRAME_COLUMNS)
-        self._object_rows = csv.writer(self._objects, lineterminator="\n")
-        self._object_rows.writerow(OBJECT_COLUMNS)
-        self._objects.flush()
+            self._trajectory, self._frames, self._objects = (
+                stack.enter_context(closing(RowFile(folder / name)))
+                for name in ("trajectory.txt", "frames.csv", "objects.csv")
+            )
+            self._frames.write(_rows([FRAME_COLUMNS]))
+            self._objects.write(_rows([OBJECT_COLUMNS]))
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> RunFiles:
         return self
@@ -55,30 +62,15 @@ class RunFiles:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with self._writing(), ExitStack() as stack:
-            for file in (self._trajectory, self._frames, self._objects):
-                stack.callback(file.close)
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        """A fault of the disk as one line."""
-        try:
-            yield
-        except OSError as error:
-            raise SlamError(f"cannot write to {self.folder}: {error.strerror or error}") from error
-
-    def _open(self, name: str) -> TextIO:
-        return (self.folder / name).open("w", encoding="utf-8", newline="")
+        self._stack.close()
 
     def write_frame(self, number: int, result: FrameResult) -> None:
-        """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv."""
-        with self._writing():
-            self._write_frame(number, result)
+        """Append one frame, `number` in its sequence, to trajectory.txt, frames.csv and objects.csv.
 
-    def _write_frame(self, number: int, result: FrameResult) -> None:
+        Raises:
+            SlamError: a row cannot be written whole; those before stay.
+        """
         e, r = result.estimate, result.report
-        if result.located:
-            self._trajectory.write(tum_line(e.stamp, e.T_world_left))
         row: list[Any] = [number, f"{e.stamp:.9f}", result.status.value, result.reason]
         features = result.features
         row += [len(features), int(features.has_stereo.sum()), result.predicted]
@@ -87,46 +79,76 @@ class RunFiles:
         deviations = _deviations(e) if result.located else [float("nan")] * 4
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
-        self._frame_rows.writerow(row)
-        self._object_rows.writerows(_object_row(number, thing) for thing in result.objects)
-        for file in (self._trajectory, self._frames, self._objects):
-            file.flush()
+        line = tum_line(e.stamp, e.T_world_left) if result.located else ""
+        things = _rows(_object_row(number, thing) for thing in result.objects)
+        with naming_folder(self.folder):
+            self._frames.write(_rows([row]))
+            self._objects.write(things)
+            self._trajectory.write(line)
 
-    def write_final(
-        self, trajectory: Trajectory, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]
-    ) -> None:
-        """Write trajectory_final.txt and landmarks.csv; `numbers` are the frames' numbers by step."""
-        with self._writing():
-            trajectory.write_tum(self.folder / "trajectory_final.txt")
-        with self._writing(), self._open("landmarks.csv") as file:
-            rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(LANDMARK_COLUMNS)
-            if landmarks is None:
-                return
-            upper = np.triu_indices(3)
-            for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
-                at = int(landmarks.rows(np.array([i]))[0])
-                values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
-                step = int(landmarks.last_seen[at])
-                last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
-                rows.writerow([int(i), *values, int(landmarks.seen[at]), last])
+    def write_trajectory(self, trajectory: Trajectory) -> None:
+        """Write trajectory_final.txt; raises SlamError where it cannot be written, and nothing is left of it."""
+        write_text(self.folder / "trajectory_final.txt", _tum(trajectory))
+
+    def write_landmarks(self, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]) -> None:
+        """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
+        rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
+        write_text(self.folder / "landmarks.csv", _rows([LANDMARK_COLUMNS, *rows]))
 
     def write_truth(self, trajectory: Trajectory) -> None:
-        """Write truth.txt, the true path at the frames' stamps."""
-        with self._writing():
-            trajectory.write_tum(self.folder / "truth.txt")
+        """Write truth.txt, the true path at the frames' stamps; raises as `write_trajectory`."""
+        write_text(self.folder / "truth.txt", _tum(trajectory))
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
-        """Write a JSON file at once or not at all."""
-        with self._writing():
-            write_json(self.folder / name, tree)
+        """Write a JSON file at once or not at all; raises as `write_trajectory`."""
+        write_json(self.folder / name, tree)
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:
-    """Write a JSON file at once or not at all; numbers that JSON cannot hold become null."""
-    temporary = path.with_suffix(".json.part")
-    temporary.write_text(json.dumps(_finite(tree), indent=2) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    """Write a JSON file at once or not at all; numbers that JSON cannot hold become null.
+
+    Raises:
+        SlamError: it cannot be written.
+    """
+    write_text(path, json.dumps(_finite(tree), indent=2) + "\n")
+
+
+@contextmanager
+def naming_folder(folder: Path) -> Iterator[None]:
+    """Turn what the system says of a failed write into an error of ours.
+
+    Raises:
+        SlamError: something could not be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise SlamError(f"cannot write to {folder}: {reason(error)}") from error
+    except ValueError as error:  # a NUL in the name
+        raise SlamError(f"cannot write to {folder}: no possible file name") from error
+
+
+def _rows(rows: Iterable[Sequence[Any]]) -> str:
+    """Rows of a CSV file."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _tum(trajectory: Trajectory) -> str:
+    """All lines of a TUM file."""
+    return "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
+
+
+def _landmark_rows(estimate: Estimate, landmarks: LandmarkRows, numbers: list[int]) -> Iterator[list[Any]]:
+    """A row of landmarks.csv for each landmark."""
+    upper = np.triu_indices(3)
+    for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):
+        at = int(landmarks.rows(np.array([i]))[0])
+        values = (f"{x:.9g}" for x in (*position, *covariance[upper]))
+        step = int(landmarks.last_seen[at])
+        last = numbers[step] if step >= 0 else ""  # empty: known from the start, and not seen yet
+        yield [int(i), *values, int(landmarks.seen[at]), last]
 
 
 def _object_row(number: int, thing: MovingObject) -> list[Any]:

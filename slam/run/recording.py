@@ -9,8 +9,6 @@ earlier frames were mended ``shift``, and, where the true path is known, ``truth
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -18,16 +16,20 @@ from typing import Any
 
 import numpy as np
 
+from slam.archives import array, json_text, unpack
 from slam.errors import SequenceError, SlamError
+from slam.files import read_bytes, whole_file
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.models import EstimatorModels, MotionModel
+from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_models import ObjectModels
 from slam.run.replay import RecordedRows, Recording
 
 _FORMAT = "surf-stereo-slam recording"
 _VERSION = 1
+_LARGEST = 2**32  # bytes of a file
+_OBSERVED, _ADDED, _REMOVED = 0, 1, 2
 _ROWS = ("frame", "ids", "uv_left", "uv_right")
 
 
@@ -56,15 +58,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         arrays["shift"] = r.shift
     if r.ground_truth is not None:
         arrays.update(truth_stamps=r.ground_truth.stamps, truth_poses=r.ground_truth.poses)
-    path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise SequenceError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with whole_file(path, SequenceError) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -73,32 +68,29 @@ def load_recording(path: str | Path) -> Recording:
     Raises:
         SequenceError: the file is missing, no recording, of another version, or damaged.
     """
-    try:
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-    except (OSError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise SequenceError(f"{path}: cannot be read as a recording: {_one_line(error)}") from error
+    members = unpack(read_bytes(path, _LARGEST), str(path), SequenceError)
+    arrays = {name.removesuffix(".npy"): array(data, name, str(path), SequenceError) for name, data in members.items()}
     try:
         return _recording(arrays)
     except KeyError as error:
         raise SequenceError(f"{path}: the recording lacks {error.args[0]!r}") from error
-    except (SlamError, TypeError, ValueError) as error:
-        raise SequenceError(f"{path}: {_one_line(error)}") from error
+    except (SlamError, TypeError, ValueError, OverflowError, AttributeError, IndexError) as error:
+        raise SequenceError(f"{path}: {error}") from error
 
 
 def _recording(arrays: Mapping[str, np.ndarray]) -> Recording:
-    if str(arrays.get("format")) != _FORMAT:
+    if str(arrays.get("format", "")) != _FORMAT:
         raise SequenceError("is no recording")
-    version = int(arrays["version"])
-    if version != _VERSION:
+    version = arrays["version"]
+    if version.ndim or version.dtype.kind not in "iu" or version != _VERSION:
         raise SequenceError(f"is a recording of version {version}; this program reads version {_VERSION}")
     truth = None
     if "truth_stamps" in arrays:
         truth = Trajectory(_array(arrays, "truth_stamps", 1, float), _array(arrays, "truth_poses", 3, float))
     recording = Recording(
-        str(arrays["name"]),
-        _rig(json.loads(str(arrays["rig"]))),
-        _models(json.loads(str(arrays["models"]))),
+        _word(arrays, "name"),
+        _rig(json_text(_word(arrays, "rig"), "rig", SequenceError)),
+        _models(json_text(_word(arrays, "models"), "models", SequenceError)),
         _array(arrays, "numbers", 1, np.int64),
         _array(arrays, "stamps", 1, float),
         _rows(arrays, "observed"),
@@ -107,10 +99,19 @@ def _recording(arrays: Mapping[str, np.ndarray]) -> Recording:
         _array(arrays, "removed", 1, np.int64),
         truth,
         shift=_array(arrays, "shift", 1, float) if "shift" in arrays else None,
-        kind=str(arrays.get("kind", "handheld")),
+        kind=_word(arrays, "kind") if "kind" in arrays else "handheld",
     )
-    _check_lives(recording)
+    models_for(recording.kind)
+    require_lives(recording)
     return recording
+
+
+def _word(arrays: Mapping[str, np.ndarray], key: str) -> str:
+    """A text of the file."""
+    value = arrays[key]
+    if value.ndim or value.dtype.kind != "U":
+        raise SequenceError(f"{key} is no text")
+    return str(value)
 
 
 def _rows(arrays: Mapping[str, np.ndarray], what: str) -> RecordedRows:
@@ -130,19 +131,32 @@ def _array(arrays: Mapping[str, np.ndarray], key: str, dimensions: int, kind: ty
     return array.astype(kind)
 
 
-def _check_lives(recording: Recording) -> None:
-    """Every landmark is added before it is observed or removed, and not twice."""
-    known: set[int] = set()
-    for k, frame in enumerate(recording):
-        for what, ids in (("observed", frame.observed.ids), ("removed", frame.removed)):
-            unknown = set(ids.tolist()) - known - (set(frame.added.ids.tolist()) if what == "removed" else set())
-            if unknown:
-                raise SequenceError(f"frame {k}: landmark {min(unknown)} is {what} but not in the map")
-        again = known.intersection(frame.added.ids.tolist())
-        if again:
-            raise SequenceError(f"frame {k}: landmark {min(again)} is added but in the map already")
-        known.update(frame.added.ids.tolist())
-        known.difference_update(frame.removed.tolist())
+def require_lives(recording: Recording) -> None:
+    """Check that every landmark is added before it is observed or removed, and not twice.
+
+    Each landmark's events are put in order (observed, added, removed within a frame): additions and removals must take
+    turns, and what comes before an observation must be an addition.
+
+    Raises:
+        SequenceError: one is not.
+    """
+    r = recording
+    parts = ((r.observed.frame, r.observed.ids), (r.added.frame, r.added.ids), (r.removed_frame, r.removed))
+    frame, ids = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    what = np.repeat([_OBSERVED, _ADDED, _REMOVED], [len(part[0]) for part in parts])
+    order = np.lexsort((what, frame, ids))
+    frame, ids, what = frame[order], ids[order], what[order]
+    row = np.arange(len(ids))
+    changes = np.where(what == _OBSERVED, -1, row)  # row of the last change at or before each
+    before = np.concatenate([[-1], np.maximum.accumulate(changes)[:-1]]) if len(row) else row
+    same = (before >= 0) & (ids[before] == ids)
+    in_map = same & (what[before] == _ADDED)
+    bad = np.where(what == _ADDED, in_map, ~in_map)
+    if bad.any():
+        k = int(np.argmin(np.where(bad, frame, np.iinfo(np.int64).max)))
+        said = {_OBSERVED: "is observed but not in the map", _ADDED: "is added but in the map already"}
+        wrong = said.get(int(what[k]), "is removed but not in the map")
+        raise SequenceError(f"frame {frame[k]}: landmark {ids[k]} {wrong}")
 
 
 def _rig_tree(rig: StereoRig) -> dict[str, Any]:
@@ -162,7 +176,3 @@ def _camera(tree: dict[str, Any]) -> PinholeCamera:
 def _models(tree: dict[str, Any]) -> EstimatorModels:
     nested = {"motion": MotionModel(**tree["motion"]), "objects": ObjectModels(**tree.get("objects", {}))}
     return EstimatorModels(**{**tree, **nested})
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -33,6 +33,9 @@ from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
 
+_FARTHEST = 1e7  # pixel
+_MOST_ID = 2**53
+_LATEST = 1e12  # stamp [s], either side of zero
 _TRACKED = 3  # stereo points that fix a pose
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
@@ -148,6 +151,8 @@ class Recording:
         count = len(self.stamps)
         if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
+        if count and np.abs(self.stamps).max() > _LATEST:
+            raise MeasurementError(f"recording: a stamp is beyond {_LATEST:g} s")
         if self.shift is not None and (self.shift.shape != (count,) or not np.isfinite(self.shift).all()):
             raise MeasurementError("recording: shift must be finite, with a value for each stamp")
         if self.removed.shape != self.removed_frame.shape:
@@ -231,6 +236,10 @@ def _check_rows(what: str, rows: RecordedRows) -> None:
         raise MeasurementError(f"recording: arrays of {what} differ in length")
     if not np.isfinite(rows.uv_left).all():
         raise MeasurementError(f"recording: a left pixel of {what} is not finite")
+    if (np.abs(rows.uv_left) > _FARTHEST).any() or (np.abs(rows.uv_right) > _FARTHEST).any():
+        raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
+    if count and (rows.ids.min() < 0 or rows.ids.max() > _MOST_ID):
+        raise MeasurementError(f"recording: ids of landmarks must go from 0 to {_MOST_ID}")
     order = np.lexsort((rows.ids, rows.frame))
     frame, ids = rows.frame[order], rows.ids[order]
     twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(ids) == 0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,16 @@ import numpy as np
 from slam import registry
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFrame
-from slam.errors import SlamError
+from slam.errors import SlamError, one_line
 from slam.evaluation.summary import consistency, evaluate, true_path
+from slam.files import require_target
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.run.last_files import LastFiles
 from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
@@ -33,6 +34,8 @@ from slam.system import StereoSlam
 
 #: Frames whose pose was measured; accuracy is that of these alone.
 _MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
+
+_MOST_FRAMES = 10**12  # of a sequence: more than any has
 
 #: Is shown each step: its images, what came of it, and the system after it.
 Watch = Callable[[StereoFrame, FrameResult, StereoSlam], None]
@@ -134,8 +137,10 @@ def run(
         SlamError: bad input; one line says what and where.
     """
     for target in (options.record, options.save_map):
-        if target is not None and not target.parent.is_dir():
-            raise SlamError(f"{target}: there is no folder {target.parent}")
+        if target is not None:
+            require_target(target)
+    if options.record is not None and options.record == options.save_map:
+        raise SlamError(f"{options.record}: the recording and the map cannot be one file")
     if options.known_map is not None and options.record is not None:
         raise SlamError("a run that starts in a known map cannot be recorded: the recording would lack the map")
     if options.config.map.monocular and options.record is not None:
@@ -183,15 +188,17 @@ def _drive(
     """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
 
     Raises:
-        The first error, after all that can be written has been.
+        SlamError: a file cannot be written; all others are.
     """
     tape: list[RecordedFrame] = []
     score = score_for(sequence)
-    first, summary = _FirstError(), dict[str, Any]()
-    with first.kept(), RunFiles(options.out) as files:
+    last = LastFiles()
+    ended, stopped_by = "completed", None
+    with RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
-        files.write_json("schema.json", schema(options.config, getattr(system, "frontend", None), system.backend))
-        with first.kept(BaseException):
+        with last.each():
+            files.write_json("schema.json", schema(options.config, getattr(system, "frontend", None), system.backend))
+        try:
             for number, result in results:
                 record.add(number, result)
                 files.write_frame(number, result)
@@ -201,47 +208,35 @@ def _drive(
                     tape.append(RecordedFrame.of(result, number))
                 if on_frame is not None:
                     on_frame(result)
-        summary = _summary(sequence, options, record, first.ended)
-        with first.kept():
-            summary |= _figures(sequence, system, record, score)
-        with first.kept():
-            files.write_json("summary.json", summary)
-        with first.kept():
-            if record.stamps:
-                files.write_final(system.trajectory(), system.estimate(), system.landmarks, record.numbers)
-        with first.kept():
-            truth = true_path(record.trajectory, sequence)
-            if truth is not None:
-                files.write_truth(truth)
-        with first.kept():
-            if options.record is not None:
-                save_recording(_recording(sequence, options, system, tape), options.record)
-        with first.kept():
-            if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
-                save_map(options.save_map, system)
-    if first.error is not None:
-        raise first.error
+        except BaseException as error:
+            ended, stopped_by = f"stopped: {one_line(str(error)) or type(error).__name__}", error
+            raise
+        finally:
+            summary = _finish(sequence, options, system, record, files, ended, score, last)
+            _write_copies(sequence, options, system, record, tape, last)
+            if last.failures:
+                summary["failures"] = last.lines
+                with last.each():
+                    files.write_json("summary.json", summary)
+            last.report(stopped_by)
     return summary
 
 
-@dataclass
-class _FirstError:
-    """The first error of several pieces of work, each of which is to be done whatever became of the others."""
-
-    error: BaseException | None = None
-
-    @contextmanager
-    def kept(self, kind: type[BaseException] = Exception) -> Iterator[None]:
-        """Keep an error of this kind in place of raising it; an interrupt while the last files are written goes on."""
-        try:
-            yield
-        except kind as error:
-            self.error = self.error or error
-
-    @property
-    def ended(self) -> str:
-        """How the frames ended, for the summary."""
-        return "completed" if self.error is None else f"stopped: {self.error or type(self.error).__name__}"
+def _write_copies(
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    tape: list[RecordedFrame],
+    last: LastFiles,
+) -> None:
+    """The recording and the map, where they were asked for."""
+    if options.record is not None:
+        with last.each():
+            save_recording(_recording(sequence, options, system, tape), options.record)
+    if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
+        with last.each():
+            save_map(options.save_map, system)
 
 
 def _recording(
@@ -312,9 +307,18 @@ class _Reading:
             yield frame
 
 
-def _summary(sequence: Sequence | Recording, options: RunOptions, record: RunRecord, ended: str) -> dict[str, Any]:
-    """What was run and how it ended, for ``summary.json``."""
-    return {
+def _finish(
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    files: RunFiles,
+    ended: str,
+    score: ObjectScore | None,
+    last: LastFiles,
+) -> dict[str, Any]:
+    """Write the last files, each whether or not another fails, and return the summary."""
+    summary: dict[str, Any] = {
         "sequence": sequence.name,
         "format": sequence.format,
         "frontend": options.frontend,
@@ -323,20 +327,38 @@ def _summary(sequence: Sequence | Recording, options: RunOptions, record: RunRec
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
         "warnings": list(sequence.warnings),
-        "seed": getattr(sequence, "values", {}).get("seed", 0),  # a world's; nothing else is random
-        "configuration": options.config.to_json(),
-        "versions": versions(),
     }
+    if record.stamps:
+        final = Trajectory.empty()
+        with last.each():
+            final = system.trajectory()
+            files.write_trajectory(final)
+        with last.each():
+            truth = true_path(record.trajectory, sequence)
+            if truth is not None:
+                files.write_truth(truth)
+        with last.each():
+            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+        with last.each():
+            summary.update(_results(sequence, system, record, final, score))
+    summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
+    summary["configuration"] = options.config.to_json()
+    summary["versions"] = versions()
+    with last.each():
+        files.write_json("summary.json", summary)
+    return summary
 
 
-def _figures(
-    sequence: Sequence | Recording, system: StereoSlam | _Replayed, record: RunRecord, score: ObjectScore | None
+def _results(
+    sequence: Sequence | Recording,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    final: Trajectory,
+    score: ObjectScore | None,
 ) -> dict[str, Any]:
-    """How well the run went, for ``summary.json``; nothing where no frame has a pose."""
-    if not record.stamps:
-        return {}
-    final, measured = system.trajectory(), np.array(record.measured)
-    figures: dict[str, Any] = {
+    """The part of a summary that says how good the run was."""
+    measured = np.array(record.measured)
+    found: dict[str, Any] = {
         "path_length_m": record.trajectory.length,
         "landmarks": 0 if system.landmarks is None else len(system.landmarks),
         "observations": {"used": record.used, "rejected": record.rejected},
@@ -349,14 +371,12 @@ def _figures(
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
             **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
         },
-        "milliseconds": _timings(record),
-        "frames_per_second": _rate(record),
     }
     if isinstance(system, StereoSlam):
-        figures["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
+        found["disparity_offset_px"] = {"mean": system.calibration.offset, "sigma": system.calibration.sigma}
     if score is not None:
-        figures["objects"] = score.summary()
-    return figures
+        found["objects"] = score.summary()
+    return {**found, "milliseconds": _timings(record), "frames_per_second": _rate(record)}
 
 
 def _rate(record: RunRecord) -> float | None:
@@ -401,6 +421,9 @@ def parse_frames(text: str | None) -> tuple[int, int | None]:
     try:
         if not colon:
             raise ValueError
-        return int(first or 0), int(last) if last else None
+        start, stop = int(first or 0), int(last) if last else None
     except ValueError:
         raise SlamError(f"frames {text!r} is not of the form A:B") from None
+    if start < 0 or max(start, stop or 0) > _MOST_FRAMES:
+        raise SlamError(f"frames {text!r}: numbers of frames go from 0 to {_MOST_FRAMES}")
+    return start, stop

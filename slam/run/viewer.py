@@ -5,7 +5,6 @@ Rerun is an optional dependency (``pip install 'surf-stereo-slam[viewer]'``), lo
 
 from __future__ import annotations
 
-import csv
 import logging
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +17,7 @@ from slam.errors import SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, quaternion
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import RunData
+from slam.run.figures import RunData, read_objects
 from slam.system import StereoSlam
 
 LIVE = "live"
@@ -141,18 +140,13 @@ def view_run(folder: Path, target: str) -> None:
     Raises:
         SlamError: the folder does not hold a finished run, or see `Viewer`.
     """
-    try:
-        run = RunData.read(folder, folder.name)
-        with (folder / "objects.csv").open(encoding="utf-8", newline="") as file:
-            objects = list(csv.DictReader(file))
-    except OSError as error:
-        raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
+    run, objects = RunData.read(folder, folder.name), read_objects(folder)
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
             viewer.show_pose(number, float(stamp), pose)
-            for row in objects:
-                if abs(float(row["stamp"]) - stamp) < 1e-6:
-                    viewer.show_object(row["id"], [float(row[c]) for c in "xyz"])
+            for seen, name, position in objects:
+                if abs(seen - stamp) < 1e-6:
+                    viewer.show_object(name, position)
         viewer.show_map(run.positions, run.covariances, run.seen_last)
 
 

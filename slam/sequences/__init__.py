@@ -7,11 +7,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
+from itertools import chain, islice
 from pathlib import Path
 from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
+from slam.files import expanded, reason
 from slam.naming import suggestion, unknown
 from slam.sequences.base import RecordedSequence, Sequence
 
@@ -27,6 +30,8 @@ _FORMATS = {
     "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
     "folders": ("slam.sequences.folders", "two folders or videos (left, right) with an OpenCV or Kalibr calibration"),
 }
+_MOST_OPTIONS = 100
+_LOOKED_AT = 1000  # files and folders below one that is no sequence
 _COMMON_OPTIONS = frozenset({"kind"})
 
 
@@ -57,6 +62,14 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
         raise ConfigurationError(f"{text}: format {format!r} does not go with a synthetic world")
     if format == "synthetic" or text.startswith(_SYNTHETIC):
         return _open_world(text)
+    try:
+        return _open_folder(text, format)
+    except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
+        raise SequenceError(f"{error.filename or text}: {reason(error)}") from error
+
+
+def _open_folder(text: str, format: str | None) -> RecordedSequence:
+    """A sequence on disk."""
     folder, options = _split(text)
     _require_folder(folder, text)
     name = _detect(folder, options) if format is None else _known(format)
@@ -75,11 +88,25 @@ def _open_world(text: str) -> Sequence:
 
 def _split(text: str) -> tuple[Path, dict[str, str]]:
     """The path, ``~`` expanded, and the options behind the question mark."""
-    whole = Path(text).expanduser()
-    if "?" not in text or whole.exists():
-        return whole.absolute(), {}
-    name, _, query = text.rpartition("?")
-    return Path(name).expanduser().absolute(), dict(parse_qsl(query, keep_blank_values=True))
+    name, mark, query = text.rpartition("?")
+    if not mark or _exists(text):
+        return expanded(text).absolute(), {}
+    try:
+        options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
+    except ValueError:
+        raise ConfigurationError(f"more than {_MOST_OPTIONS} options") from None
+    for key, value in options.items():
+        if "\0" in value:
+            raise ConfigurationError(f"option {key!r} holds a NUL")
+    return expanded(name).absolute(), options
+
+
+def _exists(text: str) -> bool:
+    """Whether a whole text, question mark and all, is a folder's name; options may make it too long for one."""
+    try:
+        return expanded(text).exists()
+    except OSError:
+        return False
 
 
 def _require_folder(folder: Path, text: str) -> None:
@@ -106,11 +133,22 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
         return "folders"
     name = _format_of(folder)
     if name is None:
-        below = [p for pattern in ("*", "*/*") for p in sorted(folder.glob(pattern)) if p.is_dir() and _format_of(p)]
+        below = _sequences_below(folder)
         names = ", ".join(str(p.relative_to(folder)) for p in below[:3]) + (", …" if len(below) > 3 else "")
         hint = f"; below it are {names}" if below else ""
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     return name
+
+
+def _sequences_below(folder: Path) -> list[Path]:
+    """Sequences one or two folders further down, for a hint; what cannot be looked at is passed over."""
+    found: list[Path] = []
+    with suppress(OSError):
+        for path in islice(chain(folder.glob("*"), folder.glob("*/*")), _LOOKED_AT):
+            with suppress(OSError):
+                if path.is_dir() and _format_of(path):
+                    found.append(path)
+    return sorted(found)
 
 
 def _format_of(folder: Path) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
+from slam.sequences.yaml_files import read_calibration, read_yaml
 
 _MODELS = {
     "radial-tangential": "radtan",
@@ -83,52 +83,6 @@ def kalibr_cameras(path: Path) -> list[ImuCamera]:
         return [ImuCamera(camera, T) for camera, T in zip(cameras, poses)]
 
 
-def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The mapping in a YAML (or JSON) file, in OpenCV's dialect, too.
-
-    That has ``%YAML:1.0`` in its first line, ``.Nan`` and ``.Inf``, and a mark on matrices (mappings with ``data``).
-
-    Raises:
-        CalibrationError: the file is missing, no YAML, or no mapping.
-    """
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Reads values with an unknown mark as if they had none."""
-
-    def unmarked(loader: Any, _: str, node: Any) -> Any:
-        return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
-
-    Loader.add_multi_constructor("", unmarked)
-    text = read_text(path)
-    if text.startswith("%YAML:"):
-        text = text.partition("\n")[2]
-    text = re.sub(r"\.(Nan|Inf)\b", lambda match: match[0].lower(), text)
-    try:
-        node = yaml.load(text, Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", row {mark.line + 1}" if mark else ""
-        raise CalibrationError(f"{path}{where}: no valid YAML") from error
-    if not isinstance(node, Mapping):
-        raise CalibrationError(f"{path}: no calibration in this file")
-    return node
-
-
-def read_text(path: Path) -> str:
-    """A calibration file's text.
-
-    Raises:
-        CalibrationError: the file is missing or cannot be read.
-    """
-    try:
-        return path.read_text(encoding="utf-8-sig", errors="replace")
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: the calibration is missing") from None
-    except OSError as error:
-        raise CalibrationError(f"{path}: {error.strerror or error}") from error
-
-
 def _yaml_camera(node: Mapping[str, Any], coefficients: str) -> PinholeCamera:
     """A camera by the keys that EuRoC and Kalibr share."""
     kind = node.get("camera_model", "pinhole")
@@ -155,13 +109,31 @@ def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
     """A flat list of finite numbers, `count` of them."""
     try:
         numbers = np.array(value, dtype=float).reshape(-1)
-    except (ValueError, TypeError):
+    except NO_NUMBERS:
         raise CalibrationError(f"{name} is not a list of numbers") from None
     if count is not None and len(numbers) != count:
         raise CalibrationError(f"{name} has {len(numbers)} numbers, {count} expected")
+    require_possible(numbers, name)
+    return [float(x) for x in numbers]
+
+
+#: What making an array of numbers raises where the values are none: text, ragged lists, numbers of 400 digits.
+NO_NUMBERS = (ValueError, TypeError, OverflowError)
+
+#: Numbers of a calibration are smaller than this; larger ones overflow in what is made of them.
+_MOST = 1e9
+
+
+def require_possible(numbers: Array, name: str) -> None:
+    """Raise where a number of a calibration is not finite, or larger than any in a calibration.
+
+    Raises:
+        CalibrationError: one is.
+    """
     if not np.isfinite(numbers).all():
         raise CalibrationError(f"{name} is not finite: {numbers.tolist()}")
-    return [float(x) for x in numbers]
+    if np.abs(numbers).max(initial=0) > _MOST:
+        raise CalibrationError(f"{name} is impossibly large: {numbers.tolist()}")
 
 
 def _transform(value: Any, name: str) -> Array:
@@ -185,7 +157,7 @@ def read_kitti(path: Path) -> dict[str, Array]:
         CalibrationError: the file is missing or holds no such row.
     """
     rows: dict[str, Array] = {}
-    for line in read_text(path).splitlines():
+    for line in read_calibration(path).splitlines():
         name, _, rest = line.replace(":", " ", 1).strip().partition(" ")
         try:
             rows[name] = np.array([float(word) for word in rest.split()])
@@ -203,8 +175,7 @@ def kitti_matrix(rows: Mapping[str, Array], name: str, shape: tuple[int, ...]) -
     value = rows[name]
     if value.size != np.prod(shape):
         raise CalibrationError(f"{name} has {value.size} numbers, {int(np.prod(shape))} expected")
-    if not np.isfinite(value).all():
-        raise CalibrationError(f"{name} is not finite: {value.tolist()}")
+    require_possible(value, name)
     return value.reshape(shape)
 
 

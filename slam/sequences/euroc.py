@@ -19,11 +19,14 @@ from slam.sequences.source import (
     hardware_tolerance,
     image_names,
     in_order,
+    in_seconds,
+    number_of,
     pair_listings,
     present,
     require_size,
 )
 from slam.sequences.tables import read_rows, shorten, stamp_and_name
+from slam.sequences.truth import LARGEST, require_truth
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
@@ -48,14 +51,9 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         left, right_names = pair_listings(left_all, right_all, hardware_tolerance(left_all), "ns", faults)
         cameras, calibration = _cameras(root)
         rig = rig_from_cameras(cameras[0], cameras[1], calibration)
-        source = ImagePairs(
-            1e-9 * left.keys.astype(float),
-            left.folder,
-            left.names,
-            right_all.folder,
-            right_names,
-            (rig.width, rig.height),
-        )
+        left, right_names, stamps = in_seconds(left, right_names, faults)
+        size = (rig.width, rig.height)
+        source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
         require_size(source.first_size(), (rig.width, rig.height), calibration)
         truth = _ground_truth(root, cameras[0].T_body_camera, faults)
     name = folder.parent.name if folder.name == "mav0" else folder.name
@@ -74,20 +72,15 @@ def _listing(camera: Path, faults: FaultLog) -> Listing:
         raise SequenceError(f"{camera}: {reason}")
     data, table = camera / "data", camera / "data.csv"
     if not table.exists():
-        names = [n for n in image_names(data) if n.rpartition(".")[0].isdecimal()]
-        if not names:
+        by_stamp = [(stamp, name) for name in image_names(data) if (stamp := number_of(name)) is not None]
+        if not by_stamp:
             raise SequenceError(f"{camera}: no data.csv, and no images named by their stamps in data")
-        names.sort(key=_stem_number)
-        keys = np.array([_stem_number(n) for n in names], np.int64)
-        return in_order(Listing(data, keys, names), str(data), faults)
+        by_stamp.sort()
+        keys = np.array([stamp for stamp, _ in by_stamp], np.int64)
+        return in_order(Listing(data, keys, [name for _, name in by_stamp]), str(data), faults)
     rows = [row for row in read_rows(table, stamp_and_name, faults) if row is not None]
     listing = Listing(data, np.array([s for s, _ in rows], np.int64), [n for _, n in rows])
     return present(in_order(listing, str(table), faults), str(table), faults)
-
-
-def _stem_number(name: str) -> int:
-    """The number that is the name of a file without its ending."""
-    return int(name.rpartition(".")[0])
 
 
 def _cameras(root: Path) -> tuple[list[ImuCamera], Path]:
@@ -119,7 +112,7 @@ def _camera_path(path: Path, T_body_camera: Array, faults: FaultLog) -> Trajecto
     rows = np.array([row for row in read_rows(path, _pose_row, faults) if row is not None])
     rows = rows[increasing(rows[:, 0])]
     bodies = pose(rotation_from_quaternion(rows[:, [5, 6, 7, 4]]), rows[:, 1:4])
-    return Trajectory(rows[:, 0] * 1e-9, bodies @ T_body_camera)
+    return require_truth(Trajectory(rows[:, 0] * 1e-9, bodies @ T_body_camera), path)
 
 
 def _pose_row(text: str) -> list[float]:
@@ -128,6 +121,8 @@ def _pose_row(text: str) -> list[float]:
         row = [float(word) for word in text.split(",")[:8]]
     except ValueError:
         raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) < 8 or not np.isfinite(row).all() or abs(np.linalg.norm(row[4:]) - 1) > 0.1:
+    if len(row) < 8 or not np.isfinite(row).all() or max(map(abs, row[4:])) > 2:
+        raise ValueError(f"{shorten(text)} is not stamp, position and unit quaternion")
+    if abs(np.linalg.norm(row[4:]) - 1) > 0.1 or max(map(abs, row[1:4])) > LARGEST or not 0 <= row[0] < 2**63:
         raise ValueError(f"{shorten(text)} is not stamp, position and unit quaternion")
     return row

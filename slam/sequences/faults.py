@@ -6,6 +6,8 @@ import logging
 from collections import Counter
 from types import TracebackType
 
+from slam.errors import one_line
+
 logger = logging.getLogger("slam.sequences")
 
 #: So many faults of one kind are reported one by one; the others are counted.
@@ -37,6 +39,7 @@ class FaultLog:
         self._counts.clear()
 
     def _emit(self, line: str) -> None:
+        line = one_line(line)
         logger.warning("%s", line)
         if line not in self._lines:
             self._lines.append(line)

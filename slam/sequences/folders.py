@@ -9,25 +9,29 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import kalibr_cameras, read_text, rig_from_cameras
+from slam.sequences.calibration import kalibr_cameras, rig_from_cameras
 from slam.sequences.faults import FaultLog
+from slam.sequences.images import Size
 from slam.sequences.opencv_storage import opencv_rig
 from slam.sequences.source import (
+    MOST_FRAMES,
     ImagePairs,
     Listing,
-    Size,
     hardware_tolerance,
     image_names,
     in_order,
+    in_seconds,
     pair_listings,
     require_size,
     stamped,
 )
-from slam.sequences.tables import read_rows, seconds
-from slam.sequences.videos import VIDEO_SUFFIXES, VideoPairs, open_videos
+from slam.sequences.tables import MOST_NANOSECONDS, read_rows, seconds
+from slam.sequences.videos import FASTEST, SLOWEST, VIDEO_SUFFIXES, VideoPairs, open_videos
+from slam.sequences.yaml_files import read_calibration
 
 #: Options of this format besides ``kind``.
 OPTIONS = frozenset({"left", "right", "calibration", "times", "fps", "unit", "rectified", "fisheye"})
@@ -85,7 +89,7 @@ def _side(folder: Path, side: int, options: dict[str, str]) -> Path:
     """Folder, video or pattern of files of one side (0 left, 1 right), by option or by convention."""
     name = ("left", "right")[side]
     if name in options:
-        path = folder / Path(options[name]).expanduser()
+        path = folder / expanded(options[name])
         if "*" not in path.name and not path.exists():
             raise SequenceError(f"{path}: there is no such folder or video")
         return path
@@ -144,7 +148,8 @@ def _image_pairs(
     tolerance = hardware_tolerance(listings[0]) if by_stamp else 0
     paired, partners = pair_listings(listings[0], listings[1], tolerance, unit, faults)
     if by_stamp:
-        return ImagePairs(1e-9 * paired.keys.astype(float), left_folder, paired.names, right_folder, partners)
+        paired, partners, stamps_ = in_seconds(paired, partners, faults)
+        return ImagePairs(stamps_, left_folder, paired.names, right_folder, partners)
     keep, seconds_ = _times(times, paired, listings[0], rate, faults)
     paired, partners = paired.select(keep), [partners[i] for i in keep]
     return ImagePairs(seconds_, left_folder, paired.names, right_folder, partners)
@@ -163,12 +168,14 @@ def _stamps_in(left: list[str], right: list[str]) -> tuple[np.ndarray, np.ndarra
 
 def _stamp(stem: str) -> int | None:
     """Nanoseconds of a name that is a stamp; None where it is none."""
-    if re.fullmatch(r"\d{18,19}", stem):
-        return int(stem)
-    if re.fullmatch(r"\d{16}", stem):
-        return int(stem) * 1000
-    match = re.fullmatch(r"(\d{9,10})\.(\d{1,9})", stem)
-    return int(match[1]) * 10**9 + int(match[2].ljust(9, "0")) if match else None
+    stamp = None
+    if re.fullmatch(r"\d{18,19}", stem, re.ASCII):
+        stamp = int(stem)
+    elif re.fullmatch(r"\d{16}", stem, re.ASCII):
+        stamp = int(stem) * 1000
+    elif match := re.fullmatch(r"(\d{9,10})\.(\d{1,9})", stem, re.ASCII):
+        stamp = int(match[1]) * 10**9 + int(match[2].ljust(9, "0"))
+    return stamp if stamp is not None and stamp <= MOST_NANOSECONDS else None
 
 
 def _numbers_in(
@@ -177,8 +184,8 @@ def _numbers_in(
     """Frame numbers: the last number in each name where that tells the images apart, else their order."""
     keys = []
     for names in (left, right):
-        found = [re.findall(r"\d+", name.rpartition(".")[0]) for name in names]
-        numbers = [int(f[-1]) for f in found if f and len(f[-1]) < 19]
+        found = [re.findall(r"\d+", name.rpartition(".")[0], re.ASCII) for name in names]
+        numbers = [int(f[-1]) for f in found if f and int(f[-1]) <= MOST_FRAMES]
         if len(set(numbers)) != len(names):
             break
         keys.append(np.array(numbers, np.int64))
@@ -198,7 +205,7 @@ def _numbers_in(
 def _times_file(folder: Path, options: dict[str, str]) -> Path | None:
     """The file of times, by option or by convention."""
     if "times" in options:
-        return folder / Path(options["times"]).expanduser()
+        return folder / expanded(options["times"])
     return next((folder / n for n in _TIMES if (folder / n).is_file()), None)
 
 
@@ -212,8 +219,7 @@ def _times(
     if path is None:
         if rate is None:
             faults.report("stamps", f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
-        times = (paired.keys - paired.keys[0]) / (rate or RATE)
-        return np.arange(len(paired)), times
+        return np.arange(len(paired)), (paired.keys - paired.keys[0]) / (rate or RATE)
     rows = read_rows(path, seconds, faults)
     if len(rows) != len(left):
         faults.report("stamps", f"{path} has {len(rows)} rows, {left.folder} has {len(left)} images")
@@ -229,8 +235,8 @@ def _rate(options: dict[str, str]) -> float | None:
         rate = float(options["fps"])
     except ValueError:
         rate = float("nan")
-    if not (np.isfinite(rate) and rate > 0):
-        raise ConfigurationError(f"fps must be a positive number, got {options['fps']!r}")
+    if not SLOWEST <= rate <= FASTEST:
+        raise ConfigurationError(f"fps must be a positive number ({SLOWEST:g} to {FASTEST:g}), got {options['fps']!r}")
     return rate
 
 
@@ -262,7 +268,7 @@ def _rig(folder: Path, options: dict[str, str], size: Size, faults: FaultLog) ->
 def _calibration_files(folder: Path, options: dict[str, str]) -> list[Path]:
     """The file, or the two files, by option (names joined by a comma) or by convention."""
     if "calibration" in options:
-        return [folder / Path(name).expanduser() for name in options["calibration"].split(",")]
+        return [folder / expanded(name, CalibrationError) for name in options["calibration"].split(",")]
     for name in _CALIBRATIONS:
         if (folder / name).is_file():
             return [folder / name]
@@ -274,7 +280,7 @@ def _calibration_files(folder: Path, options: dict[str, str]) -> list[Path]:
 
 def _is_camchain(path: Path) -> bool:
     """Whether a calibration is Kalibr's: its cameras are called cam0, cam1."""
-    return re.search(r"^cam\d+:", read_text(path), re.MULTILINE) is not None
+    return re.search(r"^cam\d+:", read_calibration(path), re.MULTILINE) is not None
 
 
 def _flag(options: dict[str, str], name: str) -> bool:

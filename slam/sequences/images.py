@@ -4,80 +4,85 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from slam.errors import SequenceError
+from slam.files import read_bytes
+from slam.sequences.image_headers import JPEG_SCAN, JPEG_START, PNG_SIGNATURE, Size, header_size
+from slam.sequences.quiet import quiet_libraries
 
 #: Endings of image files, in lower case.
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp"})
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_SCAN = 0xDA
+#: Most pixels of an image: 64 Mi, twice what the largest stereo cameras have.
+MOST_PIXELS = 2**26
+
+_LARGEST = 8 * MOST_PIXELS  # bytes of a file
+_JPEG_END = b"\xff\xd9"
 
 
-def read_image(path: Path) -> np.ndarray:
+def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     """The image (H, W) in grey, uint8 or uint16 as stored; colour is converted, EXIF rotation ignored.
 
-    PNG checksums and the end marks of PNG and JPEG are checked first, so that a file that is cut off is never taken
-    for a partly grey image.
+    Before anything is decoded the size is taken from the header. PNG checksums and the end marks of PNG and JPEG are
+    checked, so that a file that is cut off is never taken for a partly grey image.
+
+    Args:
+        path: the file.
+        size: width and height that the image must have; None for any up to `MOST_PIXELS`.
 
     Raises:
-        SequenceError: the file is missing, cut off, damaged, or no image; the message names it.
+        SequenceError: the file is missing, cut off, damaged, or no image, or of another size; the message names it.
     """
     import cv2
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SequenceError(f"{path}: {error.strerror or error}") from error
-    fault = _fault(data)
+    data = read_bytes(path, _LARGEST)
+    fault = _fault(data, size)
     if fault:
         raise SequenceError(f"{path}: {fault}")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    with quiet_opencv():
+    with quiet_libraries():
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error as error:
+        except (cv2.error, SystemError, MemoryError) as error:
             raise SequenceError(f"{path}: cannot be decoded") from error
     if image is None:
         raise SequenceError(f"{path}: not a readable image")
+    if size is not None and image.shape[1::-1] != size:
+        raise SequenceError(f"{path}: image is {size_text(image.shape[1::-1])}, not {size_text(size)}")
     if image.dtype not in (np.uint8, np.uint16):
         raise SequenceError(f"{path}: pixels are {image.dtype}, not 8 or 16 bit")
     return image
 
 
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from logging what is about to be reported as an error of ours."""
-    from cv2.utils import logging
-
-    level = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        logging.setLogLevel(level)
+def size_text(size: tuple[int, ...]) -> str:
+    """A size as text, width first."""
+    return "x".join(str(s) for s in size)
 
 
-def _fault(data: bytes) -> str:
+def _fault(data: bytes, expected: Size | None) -> str:
     """What is wrong with the bytes of an image file, as far as its frame shows; empty if nothing."""
     if not data:
         return "the file is empty"
-    if data.startswith(_PNG_SIGNATURE):
-        return _png_fault(data)
-    if data.startswith(_JPEG_START):
-        return _jpeg_fault(data)
+    if data.startswith(PNG_SIGNATURE) and (fault := _png_fault(data)):
+        return fault
+    if data.startswith(JPEG_START) and (fault := _jpeg_fault(data)):
+        return fault
+    size = header_size(data)
+    if size is None:
+        return "not a readable image"
+    if expected is not None and size != expected:
+        return f"image is {size_text(size)}, not {size_text(expected)}"
+    if min(size) < 1 or size[0] * size[1] > MOST_PIXELS:
+        return f"image is {size_text(size)}: at most {MOST_PIXELS} pixels are read"
     return ""
 
 
 def _png_fault(data: bytes) -> str:
     """Walk the chunks: each must be whole and agree with its checksum, and the last one must be IEND."""
-    at = len(_PNG_SIGNATURE)
+    at = len(PNG_SIGNATURE)
     view = memoryview(data)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -95,10 +100,10 @@ def _png_fault(data: bytes) -> str:
 
 def _jpeg_fault(data: bytes) -> str:
     """Walk the segments to the first scan (an embedded preview is jumped over) and look for the end mark."""
-    at = len(_JPEG_START)
+    at = len(JPEG_START)
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], struct.unpack_from(">H", data, at + 2)[0]
-        if marker == _JPEG_SCAN:
+        if marker == JPEG_SCAN:
             return "" if data.rfind(_JPEG_END, at) >= 0 else f"JPEG is cut off after {len(data)} bytes"
         at += 1 if marker == 0xFF else 2 + length
     return f"JPEG is cut off or damaged at byte {min(at, len(data))}"

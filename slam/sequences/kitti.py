@@ -19,8 +19,10 @@ from slam.sequences.calibration import (
     rig_from_projections,
 )
 from slam.sequences.faults import FaultLog
-from slam.sequences.source import ImagePairs, Listing, Size, numbered, pair_listings, stamped
+from slam.sequences.images import Size
+from slam.sequences.source import ImagePairs, Listing, numbered, pair_listings, stamped
 from slam.sequences.tables import read_rows, seconds
+from slam.sequences.truth import require_truth
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 0.1° in heading, 2 cm.
 OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.1)), translation=0.02)
@@ -48,9 +50,11 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         cameras = choose_pair(folder, "image_{}", _PAIRS)
         left_all, right_all = (numbered(folder / f"image_{c}", faults) for c in cameras)
         left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
-        times = _times(folder / "times.txt", int(left.keys[-1]) + 1, faults)
-        keep, stamps = stamped(left.keys, times, folder / "times.txt", faults)
-        left, right_names = left.select(keep), [right_names[i] for i in keep]
+        times = _times(folder / "times.txt", faults)
+        stamps: Array = left.keys / RATE
+        if times is not None:
+            keep, stamps = stamped(left.keys, times, folder / "times.txt", faults)
+            left, right_names = left.select(keep), [right_names[i] for i in keep]
         source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names)
         size = source.first_size()
         rig, T_reference_left = _rig(folder / "calib.txt", cameras, size)
@@ -79,11 +83,11 @@ def choose_pair(folder: Path, pattern: str, pairs: tuple[tuple[str, str], ...]) 
     raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
 
 
-def _times(path: Path, count: int, faults: FaultLog) -> Array:
-    """Times by frame number (T,), NaN for unreadable rows; 10 frames per second where there is no file."""
+def _times(path: Path, faults: FaultLog) -> Array | None:
+    """Times by frame number (T,), NaN for unreadable rows; None for 10 frames per second where there is no file."""
     if not path.exists():
         faults.report("stamps", f"{path} is missing: {RATE:g} frames per second assumed")
-        return np.arange(count) / RATE
+        return None
     rows = read_rows(path, seconds, faults)
     return np.array([np.nan if row is None else row for row in rows])
 
@@ -115,7 +119,9 @@ def read_poses(
         if not inside.all():
             line = f"{path}: {len(table)} poses, {int((~inside).sum())} frames are beyond them"
             faults.report("ground truth", line)
-        return Trajectory(stamps[inside], table.poses[left.keys[inside]] @ T_reference_left)
+        truth = Trajectory(stamps[inside], table.poses[left.keys[inside]])
+        require_truth(truth, path)
+        return Trajectory(truth.stamps, truth.poses @ T_reference_left)
     except TrajectoryError as error:
         faults.report("ground truth", f"{error}; there is no ground truth")
         return None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.errors import CalibrationError, SequenceError
+from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, pose
 from slam.geometry.trajectory import Trajectory
@@ -19,10 +19,12 @@ from slam.sequences.calibration import (
     rig_from_projections,
 )
 from slam.sequences.faults import FaultLog
+from slam.sequences.images import Size
 from slam.sequences.kitti import OXTS_NOISE, RATE, choose_pair, read_poses
 from slam.sequences.oxts import read_oxts
-from slam.sequences.source import ImagePairs, Listing, Size, numbered, pair_listings, stamped
+from slam.sequences.source import MOST_FRAMES, ImagePairs, Listing, numbered, pair_listings, stamped
 from slam.sequences.tables import date_time, read_rows, shorten
+from slam.sequences.truth import require_truth
 
 _PAIRS = (("00", "01"), ("02", "03"))  # grey first, colour where there is no grey
 
@@ -45,9 +47,11 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         left_all, right_all = (numbered(folder / f"image_{c}" / "data", faults) for c in cameras)
         left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
         path = left.folder.parent / "timestamps.txt"
-        origin, times = _times(path, int(left.keys[-1]) + 1, faults)
-        keep, stamps = stamped(left.keys, times, path, faults)
-        left, right_names = left.select(keep), [right_names[i] for i in keep]
+        origin, times = _times(path, faults)
+        stamps: Array = left.keys / RATE
+        if times is not None:
+            keep, stamps = stamped(left.keys, times, path, faults)
+            left, right_names = left.select(keep), [right_names[i] for i in keep]
         source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names)
         size = source.first_size()
         day = _day(folder)
@@ -64,11 +68,11 @@ def _day(folder: Path) -> Path:
     return folder if (folder / "calib_cam_to_cam.txt").exists() else folder.parent
 
 
-def _times(path: Path, count: int, faults: FaultLog) -> tuple[int | None, Array]:
-    """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on."""
+def _times(path: Path, faults: FaultLog) -> tuple[int | None, Array | None]:
+    """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on; None without file."""
     if not path.exists():
         faults.report("stamps", f"{path} is missing: {RATE:g} frames per second assumed")
-        return None, np.arange(count) / RATE
+        return None, None
     rows = read_rows(path, date_time, faults)
     origin = next(row for row in rows if row is not None)
     return origin, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows])
@@ -83,7 +87,7 @@ def _rig(path: Path, cameras: tuple[str, str], size: Size) -> tuple[StereoRig, A
         if tuple(expected) != size:
             raise CalibrationError(_wrong_size(rows, expected, size, cameras[0]))
         R_rect = kitti_matrix(rows, "R_rect_00", (3, 3))
-        T = pose(np.eye(3), projection_offset(P_left)) @ pose(R_rect, np.zeros(3))
+        T = pose(np.eye(3), projection_offset(P_left)) @ pose(_rotation(R_rect, "R_rect_00"), np.zeros(3))
         return rig_from_projections(P_left, P_right, size), T
 
 
@@ -95,7 +99,7 @@ def _wrong_size(rows: dict[str, Array], expected: Array, size: Size, camera: str
     return text
 
 
-def _gps(path: Path, times: Array, faults: FaultLog) -> Array | None:
+def _gps(path: Path, times: Array | None, faults: FaultLog) -> Array | None:
     """The positions-only track (N, 4): stamp [s], forward, right, third [m]; rows are ``frame forward right third``."""
     if not path.exists():
         return None
@@ -104,7 +108,11 @@ def _gps(path: Path, times: Array, faults: FaultLog) -> Array | None:
     except SequenceError as error:
         faults.report("GPS", f"{error}; there is no GPS track")
         return None
-    table = np.array([row for row in rows if row[0] < len(times)]).reshape(-1, 4)
+    table = np.array(rows).reshape(-1, 4)
+    if times is None:
+        table[:, 0] /= RATE
+        return table
+    table = table[table[:, 0] < len(times)]
     table[:, 0] = times[table[:, 0].astype(int)]
     return table[np.isfinite(table[:, 0])]
 
@@ -115,7 +123,9 @@ def _gps_row(text: str) -> list[float]:
         row = [float(word) for word in text.split()]
     except ValueError:
         raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) != 4 or not np.isfinite(row).all() or row[0] < 0 or row[0] != int(row[0]):
+    if len(row) != 4 or not np.isfinite(row).all() or not 0 <= row[0] <= MOST_FRAMES or row[0] != int(row[0]):
+        raise ValueError(f"{shorten(text)} is not frame, forward, right, third")
+    if max(map(abs, row)) > MOST_FRAMES:
         raise ValueError(f"{shorten(text)} is not frame, forward, right, third")
     return row
 
@@ -141,7 +151,8 @@ def _ground_truth(
         T_left_imu = T_left_camera0 @ _extrinsics(day / "calib_velo_to_cam.txt")
         T_left_imu = T_left_imu @ _extrinsics(day / "calib_imu_to_velo.txt")
         body = read_oxts(folder / "oxts", origin, dict(zip(left.keys.tolist(), stamps.tolist())), faults)
-    except (SequenceError, CalibrationError) as error:
+        require_truth(body, folder / "oxts")
+    except (SequenceError, CalibrationError, TrajectoryError) as error:
         faults.report("ground truth", f"{error}; there is no ground truth")
         return None
     poses = body.poses @ inverse(T_left_imu)
@@ -152,4 +163,15 @@ def _extrinsics(path: Path) -> Array:
     """The rigid motion (4, 4) of a file with rows R and T."""
     rows = read_kitti(path)
     with naming(path):
-        return pose(kitti_matrix(rows, "R", (3, 3)), kitti_matrix(rows, "T", (3,)))
+        return pose(_rotation(kitti_matrix(rows, "R", (3, 3)), "R"), kitti_matrix(rows, "T", (3,)))
+
+
+def _rotation(R: Array, name: str) -> Array:
+    """The matrix (3, 3), where it is a rotation.
+
+    Raises:
+        CalibrationError: it is none.
+    """
+    if np.abs(R).max() > 1.01 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise CalibrationError(f"{name} is not a rotation: {R.tolist()}")
+    return R

@@ -13,8 +13,15 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, pose, so3_exp
-from slam.sequences.calibration import naming, read_text, read_yaml, rig_from_projections, rig_from_transform
-from slam.sequences.source import Size
+from slam.sequences.calibration import (
+    NO_NUMBERS,
+    naming,
+    require_possible,
+    rig_from_projections,
+    rig_from_transform,
+)
+from slam.sequences.images import Size
+from slam.sequences.yaml_files import read_calibration, read_yaml
 
 # Names as people have them, in lower case and without anything but letters and digits; {i} is 1 or 2, {s} is left or
 # right, {l} is l or r. K1, M1, cameraMatrix1, camera_matrix_left, left_camera_matrix and LEFT.K are all found.
@@ -73,17 +80,21 @@ def _read(path: Path) -> dict[str, Any]:
 
     The files are read by the YAML and XML libraries: OpenCV's own reader can crash on a damaged one.
     """
-    text = read_text(path).strip()
+    text = read_calibration(path).strip()
     root = _read_xml(path, text) if text.startswith("<") else read_yaml(path)
     return {"".join(filter(str.isalnum, str(k).lower())): value for k, value in root.items()}
 
 
 def _read_xml(path: Path, text: str) -> dict[str, Any]:
     """The entries of a storage in XML: texts, and the parts of matrices."""
+    if "<!" in text.replace("<!--", ""):  # OpenCV writes no entities, which may stand for gigabytes
+        raise CalibrationError(f"{path}: a calibration has no document type and no entities")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise CalibrationError(f"{path}, row {error.position[0]}: no valid XML") from error
+    except ValueError as error:  # a declared encoding that is none
+        raise CalibrationError(f"{path}: no valid XML") from error
     return {node.tag: {part.tag: part.text or "" for part in node} if len(node) else node.text or "" for node in root}
 
 
@@ -110,10 +121,9 @@ def _matrix(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
     try:
         matrix = np.array(data.split() if isinstance(data, str) else data, dtype=float)
         matrix = matrix.reshape(-1 if shape is None else shape)
-    except (ValueError, TypeError):
+    except NO_NUMBERS:
         raise CalibrationError(f"{name} is no matrix" + (f" of shape {shape}" if shape else "")) from None
-    if not np.isfinite(matrix).all():
-        raise CalibrationError(f"{name} is not finite: {matrix.tolist()}")
+    require_possible(matrix, name)
     return matrix
 
 

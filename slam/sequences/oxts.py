@@ -11,6 +11,7 @@ from slam.geometry.se3 import Array, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
+from slam.sequences.source import number_of
 from slam.sequences.tables import date_time, read_rows, shorten
 
 _EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
@@ -26,15 +27,15 @@ def read_oxts(folder: Path, origin: int | None, frame_stamps: dict[int, float], 
         SequenceError: there are no records, or none is readable and has a stamp.
     """
     files = sorted((folder / "data").glob("*.txt")) if (folder / "data").is_dir() else []
-    files = [f for f in files if f.stem.isdecimal()]
-    if not files:
+    numbered = [(number, f) for f in files if (number := number_of(f.name)) is not None]
+    if not numbered:
         raise SequenceError(f"{folder / 'data'}: no OXTS records")
     stamps = _stamps(folder / "timestamps.txt", origin, frame_stamps, faults)
     rows = []
-    for file in files:
+    for number, file in numbered:
         record = _record(file, faults)
-        if record is not None and int(file.stem) in stamps:
-            rows.append([stamps[int(file.stem)], *record])
+        if record is not None and number in stamps:
+            rows.append([stamps[number], *record])
     if not rows:
         raise SequenceError(f"{folder}: no OXTS record is readable and has a stamp")
     table = np.array(rows)
@@ -82,7 +83,8 @@ def _six_numbers(text: str) -> list[float]:
         row = [float(word) for word in text.split()[:6]]
     except ValueError:
         raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) < 6 or not np.isfinite(row).all() or abs(row[0]) >= 90:
+    angles = (*row[1:2], *row[3:])
+    if len(row) < 6 or not np.isfinite(row).all() or abs(row[0]) >= 90 or max(map(abs, angles)) > 360:
         raise ValueError(f"{shorten(text)} is not latitude, longitude, altitude, roll, pitch, yaw")
     return row
 

@@ -14,12 +14,13 @@ from slam.errors import SequenceError
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import IMAGE_SUFFIXES, read_image
-
-Size = tuple[int, int]
+from slam.sequences.images import IMAGE_SUFFIXES, Size, read_image, size_text
 
 #: Stamps of one pair may differ by so much: hardware-triggered cameras agree far better [ns].
 TOLERANCE = 5_000_000
+
+#: Numbers of frames go up to this: as floating-point numbers they are still told apart.
+MOST_FRAMES = 10**12
 
 
 @dataclass(frozen=True)
@@ -89,11 +90,7 @@ class ImagePairs:
             return None
 
     def _read_one(self, path: Path) -> np.ndarray:
-        image = read_image(path)
-        size = (image.shape[1], image.shape[0])
-        if self.size is not None and size != self.size:
-            raise SequenceError(f"{path}: image is {_text(size)}, not {_text(self.size)}")
-        return image
+        return read_image(path, self.size)
 
     def first_size(self) -> Size:
         """Width and height of the first pair of images that can be read.
@@ -112,7 +109,7 @@ class ImagePairs:
                 reason = str(error)
                 continue
             if left.shape != right.shape:
-                sizes = f"{left_path} is {_text(left.shape[::-1])}, {right_path} is {_text(right.shape[::-1])}"
+                sizes = f"{left_path} is {size_text(left.shape[::-1])}, {right_path} is {size_text(right.shape[::-1])}"
                 raise SequenceError(f"left and right images differ in size: {sizes}")
             return left.shape[1], left.shape[0]
         raise SequenceError(f"{self.left_folder}: no pair of images can be read: {reason}")
@@ -125,7 +122,7 @@ def require_size(size: Size, expected: Size, calibration: Path) -> None:
         SequenceError: they are not.
     """
     if size != expected:
-        raise SequenceError(f"images are {_text(size)}, but {calibration} is for {_text(expected)}")
+        raise SequenceError(f"images are {size_text(size)}, but {calibration} is for {size_text(expected)}")
 
 
 def image_names(folder: Path) -> list[str]:
@@ -152,9 +149,9 @@ def numbered(folder: Path, faults: FaultLog) -> Listing:
     """
     by_number: dict[int, str] = {}
     for name in image_names(folder):
-        stem = name.rpartition(".")[0]
-        if stem.isdecimal():
-            by_number.setdefault(int(stem), name)
+        number = number_of(name)
+        if number is not None and number <= MOST_FRAMES:
+            by_number.setdefault(number, name)
     if not by_number:
         raise SequenceError(f"{folder}: no images with numbers for names")
     keys = np.array(sorted(by_number), np.int64)
@@ -163,6 +160,27 @@ def numbered(folder: Path, faults: FaultLog) -> Listing:
         after = by_number[int(keys[int(np.argmax(np.diff(keys) > 1))])]
         faults.report("images", f"{folder}: {gaps} images are missing between the first and the last (after {after})")
     return Listing(folder, keys, [by_number[k] for k in keys.tolist()])
+
+
+def number_of(name: str) -> int | None:
+    """The number that is the name of a file without its ending, in 64 bits; None where it is none."""
+    stem = name.rpartition(".")[0]
+    if not (stem.isascii() and stem.isdecimal()):
+        return None
+    number = int(stem)
+    return number if number < 2**63 else None
+
+
+def in_seconds(
+    listing: Listing, partners: list[str | None], faults: FaultLog
+) -> tuple[Listing, list[str | None], Array]:
+    """A listing by stamps [ns] with its stamps [s]; those that are the same in floating point are left out."""
+    stamps = 1e-9 * listing.keys.astype(float)
+    rows = increasing(stamps)
+    if len(rows) < len(stamps):
+        line = f"{listing.folder}: {len(stamps) - len(rows)} stamps are nearer than a microsecond to the one before"
+        faults.report("stamps", f"{line}; images left out")
+    return listing.select(rows), [partners[i] for i in rows], stamps[rows]
 
 
 def in_order(listing: Listing, what: str, faults: FaultLog) -> Listing:
@@ -274,8 +292,3 @@ def _no_pair(left: Listing, right: Listing, tolerance: int, unit: str) -> str:
         f"no image of {left.folder} has a partner in {right.folder}: the nearest two are {gaps.min()} {unit} apart, "
         f"{tolerance} {unit} are allowed"
     )
-
-
-def _text(size: tuple[int, ...]) -> str:
-    """A size as text, width first."""
-    return "x".join(str(s) for s in size)

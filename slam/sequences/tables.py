@@ -10,9 +10,15 @@ from typing import TypeVar
 import numpy as np
 
 from slam.errors import SequenceError
+from slam.files import read_text
 from slam.sequences.faults import FaultLog
 
 T = TypeVar("T")
+
+#: Latest time [ns]: in the year 2262, where 64 bits end.
+MOST_NANOSECONDS = 2**63 - 1
+
+_MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
@@ -27,10 +33,7 @@ def read_rows(path: Path, parse: Callable[[str], T], faults: FaultLog) -> list[T
         SequenceError: the file cannot be read or holds no row, or more than half of its rows are refused (the
             message names the first of them).
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise SequenceError(f"{path}: {error.strerror or error}") from error
+    text = read_text(path)
     rows: list[T | None] = []
     refused: list[str] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -59,6 +62,8 @@ def seconds(text: str) -> float:
         raise ValueError(f"{shorten(text)} is not a time in seconds") from None
     if not np.isfinite(value):
         raise ValueError(f"{shorten(text)} is not a finite time")
+    if abs(value) > _MOST_SECONDS:
+        raise ValueError(f"{shorten(text)} is no possible time in seconds")
     return value
 
 
@@ -68,7 +73,7 @@ def nanoseconds(text: str) -> int:
         value = int(text)
     except ValueError:
         raise ValueError(f"{shorten(text)} is not a time in whole nanoseconds") from None
-    if not 0 <= value < 2**63:
+    if not 0 <= value <= MOST_NANOSECONDS:
         raise ValueError(f"{shorten(text)} is no possible time in nanoseconds")
     return value
 

@@ -13,13 +13,19 @@ import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
+from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import quiet_opencv
-from slam.sequences.source import Size
+from slam.sequences.images import MOST_PIXELS, Size
+from slam.sequences.quiet import quiet_libraries
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
+
+#: Frame rates that are believed [1/s].
+SLOWEST, FASTEST = 1e-3, 1e5
+
+_MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,9 @@ class VideoPairs:
         converted.
         """
         with open_video(self.left) as left, open_video(self.right) as right:
-            for _ in range(start):
-                left.grab(), right.grab()
+            with quiet_libraries():
+                for _ in range(start):
+                    left.grab(), right.grab()
             for index in range(start, stop):
                 images = [_next_grey(video) for video in (left, right)]
                 for path, image in zip((self.left, self.right), images):
@@ -72,7 +79,7 @@ def open_videos(left: Path, right: Path, rate: float | None, faults: FaultLog) -
         line = f"{left} has {count_left} frames, {right} has {count_right}: the surplus is left out"
         faults.report("videos", line)
     rate = rate or rate_left
-    if not (np.isfinite(rate) and rate > 0):
+    if not SLOWEST <= rate <= FASTEST:
         raise SequenceError(f"{left}: the frame rate is not known, add fps=…")
     return VideoPairs(np.arange(min(count_left, count_right)) / rate, left, right, size_left)
 
@@ -86,15 +93,19 @@ def open_video(path: Path) -> Iterator[Any]:
     """
     import cv2
 
+    require_content(path)  # a pipe would be waited for
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
-    with quiet_opencv():
+    with quiet_libraries():
         capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():
-            raise SequenceError(f"{path}: not a readable video" if path.exists() else f"{path}: no such file")
+            raise SequenceError(f"{path}: not a readable video")
+        if capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT) > MOST_PIXELS:
+            raise SequenceError(f"{path}: frames of more than {MOST_PIXELS} pixels are not read")
         yield capture
     finally:
-        capture.release()
+        with quiet_libraries():
+            capture.release()
 
 
 def _describe(path: Path) -> tuple[int, float, Size]:
@@ -102,14 +113,16 @@ def _describe(path: Path) -> tuple[int, float, Size]:
     import cv2
 
     with open_video(path) as video:
-        count, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), float(video.get(cv2.CAP_PROP_FPS))
+        claimed, rate = video.get(cv2.CAP_PROP_FRAME_COUNT), float(video.get(cv2.CAP_PROP_FPS))
+        count = int(min(claimed, _MOST_FRAMES)) if claimed > 0 else 0
         first = _next_grey(video)
         if first is None:
             raise SequenceError(f"{path}: no frame of the video can be decoded")
         if count <= 0:
             count = 1
-            while video.grab():
-                count += 1
+            with quiet_libraries():
+                while count < _MOST_FRAMES and video.grab():
+                    count += 1
     return count, rate, (first.shape[1], first.shape[0])
 
 
@@ -117,7 +130,11 @@ def _next_grey(video: Any) -> np.ndarray | None:
     """The next frame in grey (H, W) uint8; None at the end or where it cannot be decoded."""
     import cv2
 
-    good, image = video.read()
+    try:
+        with quiet_libraries():
+            good, image = video.read()
+    except cv2.error:
+        return None
     if not good or image is None:
         return None
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))

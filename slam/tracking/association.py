@@ -23,6 +23,17 @@ _NONE = np.float32(np.inf)
 _CELL = 24.0  # side of the cells that features are sorted into [px]
 _LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
 
+_POSES = (0, 100_000)  # tried in a frame
+_RANGES = {
+    "hypotheses": _POSES,
+    "wide_hypotheses": _POSES,
+    "window_sigmas": (0.0, 1e3),
+    "window_min": (0.0, 1e4),
+    "window_max": (0.0, 1e4),
+    "window_sizes": (0.0, 1e4),
+    "refined_window": (0.0, 1e4),
+}
+
 
 @dataclass(frozen=True)
 class AssociationConfig:
@@ -86,7 +97,7 @@ class AssociationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_not_negative(self)
+        require_not_negative(self, _RANGES, "association")
         if self.windows not in ("covariance", "fixed"):
             raise ConfigurationError(f"association: windows must be 'covariance' or 'fixed', got {self.windows!r}")
         name = "window_sizes" if self.windows == "fixed" else "window_sigmas"

@@ -72,8 +72,8 @@ def test_ranges_are_those_that_are_checked(every):
     ranges = {(s.owner, s.key): s.range for s in every}
     assert ranges["surf", "frontend.descriptor"] == "16, 64"
     assert ranges["surf", "frontend.octaves"] == "[1, 4]"
-    assert ranges["", "association.ratio"] == "(0, 1]"
-    assert ranges["", "models.gate_probability"] == "(0, 1)"
+    assert ranges["", "association.ratio"] == "[1e-09, 1]"
+    assert ranges["surf", "frontend.min_correlation"] == "[0, 1]"
     assert ranges["", "objects.mode"] == "detect, procedure1, off"
     assert ranges["", "objects.database"] == "text"
     assert ranges["", "map.monocular"] == "true or false"

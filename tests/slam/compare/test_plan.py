@@ -72,3 +72,12 @@ def test_quick_cuts_down():
     plan = quick(Plan(WORLDS, ("ekf",), trials=9, start=10, stop=None))
     assert (plan.trials, plan.start, plan.stop) == (2, 10, 40)
     assert quick(Plan(WORLDS, ("ekf",), stop=7)).stop == 7
+
+
+def test_no_more_trials_and_workers_than_anybody_has(tmp_path):
+    from slam.commands.compare import compare
+
+    with pytest.raises(ConfigurationError, match="at most 100000 trials"):
+        Plan(("synthetic:desk",), ("ekf",), trials=10**9)
+    with pytest.raises(ConfigurationError, match="at most 1024 workers"):
+        compare(Plan(("synthetic:desk",), ("ekf",)), tmp_path, workers=10**9)

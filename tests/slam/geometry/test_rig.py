@@ -134,3 +134,11 @@ def test_impossible_rigs(change, message):
     values = {"left": LEFT, "right": RIGHT, "R": np.eye(3), "b": [-0.11, 0, 0], **change}
     with pytest.raises(CalibrationError, match=message):
         StereoRig(**values)
+
+
+def test_points_without_depth_have_no_covariance():
+    from slam.geometry.rig import StereoRig
+
+    rig = StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
+    found = rig.triangulation_covariance(np.array([[0.0, 0.0, 1e300], [0.0, 0.0, 2.0], [np.nan, 0.0, 1.0]]), 0.5)
+    assert np.isnan(found[[0, 2]]).all() and np.isfinite(found[1]).all()

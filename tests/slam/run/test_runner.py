@@ -119,7 +119,7 @@ def test_what_can_still_be_written_is_written_and_the_first_error_is_raised(tmp_
     """A folder stands where the recording is to go: it cannot be written, map and files can."""
     (tmp_path / "taken").mkdir()
     wanted = {"record": tmp_path / "taken", "save_map": tmp_path / "map"}
-    for sequence, words, files in ((Broken(5), "disk gone", FILES), (open_sequence(WORLD), "taken", WITH_TRUTH)):
+    for sequence, words, files in ((open_sequence(WORLD), "taken", WITH_TRUTH), (Broken(5), "disk gone", FILES)):
         with pytest.raises(SlamError, match=words):
             run(sequence, options(tmp_path / "out", **wanted))
         assert {p.name for p in (tmp_path / "out").iterdir()} == files

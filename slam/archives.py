@@ -1,0 +1,113 @@
+"""Zip archives of NumPy arrays from anybody: sizes are checked before anything is unpacked, nothing is executed."""
+
+from __future__ import annotations
+
+import io
+import json
+import lzma
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+
+from slam.errors import SlamError
+
+#: Bytes that an archive may unpack to: so much at any size, and so many times its own size.
+_AT_LEAST, _TIMES = 64 * 2**20, 50
+
+_MEMBERS = 100  # most of them
+_HEADER = 10_000  # bytes of an array's header
+_KINDS = "biufU"  # of arrays: numbers and text, never objects
+_TEXT = 2**20  # characters of a text that is read as JSON
+
+#: What unpacking damaged archives raises.
+_DAMAGED = (
+    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, ArithmeticError, SyntaxError, MemoryError,
+    AttributeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error,
+)  # fmt: skip
+
+
+def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict[str, bytes]:
+    """The members of a zip archive by name.
+
+    Args:
+        data: the archive.
+        source: its name, for messages.
+        error: what is raised.
+
+    Raises:
+        SlamError: of type `error`, where it is damaged, encrypted, packed in an unusual way, or would unpack to far
+            more than its own size.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            members = file.infolist()
+            _require_plain(members, len(data))
+            return {m.filename: file.read(m) for m in members}
+    except _DAMAGED as fault:
+        raise error(f"{source}: damaged, or no archive of arrays: {_text(fault)}") from fault
+
+
+def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:
+    """Raise ValueError for an archive that should not be unpacked."""
+    names = [m.filename for m in members]
+    if len(members) > _MEMBERS or len(set(names)) < len(names):
+        raise ValueError(f"an archive of {len(members)} members")
+    total = sum(m.file_size for m in members)
+    if total > max(_AT_LEAST, _TIMES * size):
+        raise ValueError(f"{size} bytes that would unpack to {total}")
+    for m in members:
+        if m.flag_bits & 1:
+            raise ValueError(f"{m.filename} is encrypted")
+        if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError(f"{m.filename} is packed in a way that is not known")
+
+
+def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
+    """The array of an ``.npy`` member; its header must be true of what follows.
+
+    Raises:
+        SlamError: of type `error`, where it is none, or one of objects.
+    """
+    try:
+        return _array(data)
+    except _DAMAGED as fault:
+        raise error(f"{source}: {name} cannot be read as an array: {_text(fault)}") from fault
+
+
+def _array(data: bytes) -> np.ndarray:
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(stream, max_header_size=_HEADER)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"of type {dtype}")
+    body = data[stream.tell() :]
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(body) or max(shape, default=0) >= 2**31:
+        raise ValueError(f"{len(body)} bytes for shape {shape} of {dtype}")
+    flat = np.frombuffer(body, dtype) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
+    return flat.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:
+    """What a text in JSON says.
+
+    Raises:
+        SlamError: of type `error`, where it is none, or too long.
+    """
+    if len(text) > _TEXT:
+        raise error(f"{source}: {len(text)} characters of JSON")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as fault:
+        raise error(f"{source}: no valid JSON: {_text(fault)}") from fault
+
+
+def _text(fault: BaseException) -> str:
+    return str(fault) or type(fault).__name__

@@ -1,0 +1,225 @@
+"""Files as input that may be hostile, and as output that must be whole: every reader and writer goes through here.
+
+Only regular files are read, never a pipe or a device that would block, and never more than a limit. Files are written
+beside their place and moved there: a full disk or a kill leaves the old file or the new one, but no part of one.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from slam.errors import SequenceError, SlamError
+
+_MEBI = 2**20
+
+#: Most bytes of a text file: tables of stamps and poses, calibrations.
+TEXT_LIMIT = 128 * _MEBI
+
+
+def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: the file.
+        limit: most bytes that are read.
+        error: what is raised.
+
+    Raises:
+        SlamError: of type `error`, where the file is missing, not a regular file, unreadable or too large.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | _not_blocking())
+    except OSError as fault:
+        raise error(f"{path}: {reason(fault)}") from fault
+    except ValueError as fault:  # a NUL or a lone surrogate in the name
+        raise error(f"{path}: no possible file name") from fault
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise error(f"{path}: not a regular file")
+        if status.st_size > limit:
+            raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
+        # No further than it says: what /proc holds has no size, may have no end, and may be waited for.
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            return file.read(status.st_size) or b""
+    except OSError as fault:
+        raise error(f"{path}: {reason(fault)}") from fault
+    finally:
+        os.close(descriptor)
+
+
+def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] = SequenceError) -> str:
+    """The text of a regular file in UTF-8, a byte order mark left out, other bytes replaced; raises as `read_bytes`."""
+    return read_bytes(path, limit, error).decode("utf-8-sig", errors="replace")
+
+
+def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
+    """Raise where a path, for a library that opens it by itself, is no regular file with something in it.
+
+    Raises:
+        SlamError: of type `error`.
+    """
+    try:
+        status = path.stat()
+    except OSError as fault:
+        raise error(f"{path}: {reason(fault)}") from fault
+    except ValueError as fault:
+        raise error(f"{path}: no possible file name") from fault
+    if not stat.S_ISREG(status.st_mode):
+        raise error(f"{path}: not a regular file")
+    if not status.st_size:
+        raise error(f"{path}: the file is empty")
+
+
+def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:
+    """A path as the user gave it, with ``~`` expanded.
+
+    Raises:
+        SlamError: of type `error`, where there is no such home, or the text can be no path.
+    """
+    if "\0" in str(text):
+        raise error(f"{text}: no possible file name")
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        raise error(f"{text}: there is no such home folder") from None
+
+
+def reason(fault: OSError) -> str:
+    """What the system says of a failure, without its number."""
+    return fault.strerror or str(fault)
+
+
+def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
+    """Raise where a file could not be written for certain, before work is done for it.
+
+    Raises:
+        SlamError: of type `error`, where there is no folder for it, or something at its place that is not a regular
+            file: a device or a pipe is never replaced.
+    """
+    if "\0" in str(path):
+        raise error(f"{path}: no possible file name")
+    try:
+        if not path.parent.is_dir():
+            raise error(f"{path}: cannot be written: there is no folder {path.parent}")
+        if path.exists() and not path.is_file():
+            raise error(f"{path}: cannot be written: there is something that is not a regular file")
+    except OSError as fault:
+        raise error(f"{path}: cannot be written: {reason(fault)}") from fault
+
+
+@contextmanager
+def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator[BinaryIO]:
+    """A file to write to, that takes its place only when it is complete and on the disk; until then the old one stays.
+
+    Raises:
+        SlamError: of type `error`, where it cannot be written; nothing is left of it then.
+    """
+    place = Path(path)
+    require_target(place, error)
+    temporary = None
+    try:
+        place = place.resolve()  # a link stays a link
+        beside = place.with_name(f".{secrets.token_hex(8)}.part")
+        with beside.open("xb") as file:
+            temporary = beside
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if place.exists():
+            temporary.chmod(stat.S_IMODE(place.stat().st_mode))
+        temporary.replace(place)
+        temporary = None
+    except OSError as fault:
+        raise error(f"{path}: cannot be written: {reason(fault)}") from fault
+    finally:
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text in UTF-8 at once or not at all.
+
+    Raises:
+        SlamError: it cannot be written.
+    """
+    with whole_file(path) as file:
+        file.write(text.encode("utf-8", "backslashreplace"))
+
+
+class RowFile:
+    """A text file that grows by whole rows: what fails to be written whole is taken away again.
+
+    Rows are with the system as soon as `write` returns, so that a kill loses none.
+
+    Args:
+        path: made, or emptied.
+
+    Raises:
+        OSError: it cannot be opened, or what is there is not a regular file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if path.exists() and not path.is_file():
+            raise OSError(f"{path.name} is there already and not a regular file")
+        self._file = path.open("wb", buffering=0)
+        self._length = 0
+
+    def write(self, text: str) -> None:
+        """Append rows.
+
+        Raises:
+            OSError: they cannot be written; the rows before stay.
+        """
+        rest = memoryview(text.encode("utf-8", "backslashreplace"))
+        length = self._length + len(rest)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with suppress(OSError):
+                self._file.seek(self._length)
+                self._file.truncate(self._length)
+            raise
+        self._length = length
+
+    def close(self) -> None:
+        """Close the file; everything was written before."""
+        self._file.close()
+
+
+def lock_folder(folder: Path) -> int | None:
+    """Keep other runs out of a folder until the returned descriptor is closed, or the process ends.
+
+    The folder itself is locked, so that nothing is left behind. None where the system has no such locks.
+
+    Raises:
+        SlamError: another run has it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise SlamError(f"{folder}: another run is writing to this folder") from None
+    except OSError:  # a file system without locks
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _not_blocking() -> int:
+    """Flags with which opening a pipe does not wait for its writer."""
+    return getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

@@ -1,0 +1,161 @@
+"""What a class of inputs is, and the run of one case under limits of time and memory."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.errors import SlamError
+
+SECONDS = 10.0  # of processor time for any case
+BLOCKED = 30.0  # of wall time, after which a case waits for something
+GIGABYTES = 3  # that a case may ask for, besides what the process has
+LONGEST_LINE = 700
+
+Case = Callable[[np.random.Generator, Path], None]
+
+
+class Broken(AssertionError):  # noqa: N818 it says what it is
+    """A promise that a case found broken."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A class of inputs.
+
+    Attributes:
+        name: for the command line and the table.
+        inputs: what is made, in a line.
+        promise: what is promised of it, in a line.
+        case: makes one of a random generator, in an empty folder, and gives it to the program.
+        quiet: whether Python's warnings count as broken promises.
+        short: number of cases in the tests.
+        open: what is still to be mended, where the promise is not kept yet; the tests expect failures then.
+    """
+
+    name: str
+    inputs: str
+    promise: str
+    case: Case
+    quiet: bool = True
+    short: int = 60
+    open: str = ""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A case that failed: its number, and where and how in one line; `detail` is the traceback."""
+
+    number: int
+    signature: str
+    detail: str
+
+
+def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
+    """One case; None where what is promised was kept."""
+    rng = np.random.default_rng([seed, zlib.crc32(subject.name.encode()), number])
+    folder = Path(tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+    started = time.process_time()
+    try:
+        with limits(), nothing_printed(), warnings.catch_warnings():
+            warnings.simplefilter("error" if subject.quiet else "ignore")
+            try:
+                subject.case(rng, folder)
+            except SlamError as error:
+                require_line(error)
+        if time.process_time() - started > SECONDS:
+            raise Broken(f"took more than {SECONDS:g} s")
+    except (Exception, TimedOut) as error:  # noqa: BLE001 every kind is counted
+        return Failure(number, _signature(error), "".join(traceback.format_exception(error)))
+    finally:
+        _remove(folder)
+    return None
+
+
+def require_line(error: SlamError) -> None:
+    """Raise where the message of an error is not one line."""
+    text = str(error)
+    if not text or "\n" in text or "\r" in text or len(text) > LONGEST_LINE:
+        raise Broken(f"{type(error).__name__} is no line of bounded length: {text[:80]!r}")
+
+
+class TimedOut(BaseException):
+    """Out of time; no handler of errors catches it."""
+
+
+@contextmanager
+def limits() -> Iterator[None]:
+    """Stop what takes too long or waits for ever, and refuse memory beyond a bound."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() if _LINUX else 0
+    handlers = {n: signal.signal(n, _out_of_time) for n in (signal.SIGALRM, signal.SIGPROF)}
+    if used:
+        resource.setrlimit(resource.RLIMIT_AS, (used + GIGABYTES * 2**30, hard))
+    # To this very thread: a signal that another thread takes would not end a call that waits.
+    clock = threading.Timer(BLOCKED, signal.pthread_kill, (threading.get_ident(), signal.SIGALRM))
+    clock.daemon = True
+    clock.start()
+    signal.setitimer(signal.ITIMER_PROF, 1.2 * SECONDS)
+    try:
+        yield
+    finally:
+        clock.cancel()
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        for n, handler in handlers.items():
+            signal.signal(n, handler)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+_LINUX = Path("/proc/self/statm").exists()
+
+
+def _out_of_time(number: int, frame: object) -> None:
+    raise TimedOut("waits for ever" if number == signal.SIGALRM else f"took more than {SECONDS:g} s")
+
+
+@contextmanager
+def nothing_printed() -> Iterator[None]:
+    """Raise where anything was written to descriptor 2, by whatever library."""
+    with tempfile.TemporaryFile() as aside:
+        kept = os.dup(2)
+        os.dup2(aside.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        aside.seek(0)
+        printed = aside.read(200)
+    if printed:
+        raise Broken(f"printed on standard error: {printed!r}")
+
+
+def _signature(error: BaseException) -> str:
+    """Type and place of an error, the same for the same fault."""
+    where = ""
+    for place in traceback.extract_tb(error.__traceback__):
+        if any(f"/{part}/" in place.filename for part in ("slam", "backends", "frontends")) and "site-packages" not in (
+            place.filename
+        ):
+            where = f" at {Path(place.filename).parent.name}/{Path(place.filename).name}:{place.name}"
+    text = str(error).split(":")[0][:70]
+    return f"{type(error).__name__}: {text}{where}"
+
+
+def _remove(folder: Path) -> None:
+    """Remove a case's folder, whatever is in it."""
+    shutil.rmtree(folder, ignore_errors=True)

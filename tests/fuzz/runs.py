@@ -1,0 +1,179 @@
+"""Runs whose files cannot all be written: full disks, devices, folders in use, and frames that cannot be had."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import resource
+import signal
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from slam.config import SystemConfig
+from slam.errors import SequenceError, SlamError
+from slam.files import lock_folder
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.map_io import load_map
+from slam.run.outputs import FRAME_COLUMNS
+from slam.run.recording import load_recording
+from slam.run.runner import RunOptions, run
+from slam.sequences.base import Sequence
+from tests.fuzz.harness import Broken, Subject, require_line
+from tests.fuzz.hostile import choose
+from tests.fuzz.settings import scene
+
+FRAMES = 5
+
+
+class Scripted:
+    """A sequence of features without images, that may end in an error or an interrupt."""
+
+    name, format, kind = "scripted", "test", "handheld"
+    ground_truth = None
+
+    def __init__(self, error: BaseException | None, at: int) -> None:
+        self.rig, self.features = scene()
+        self.warnings: list[str] = []
+        self._error, self._at = error, at
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[_Numbered]:
+        for k in range(FRAMES):
+            if self._error is not None and k == self._at:
+                raise self._error
+            yield _Numbered(k, self.features[k])
+
+
+class _Numbered:
+    """A frame that holds its features already."""
+
+    def __init__(self, index: int, features: object) -> None:
+        self.index, self.features = index, features
+
+
+class _Frontend:
+    """Gives the features of a frame."""
+
+    def extract(self, frame: _Numbered) -> object:
+        return frame.features
+
+
+class Interrupted(BaseException):
+    """As Ctrl-C, but of ours."""
+
+
+def write_run(rng: np.random.Generator, folder: Path) -> None:
+    """A run that stops somewhere, on a disk that is full somewhere, or with something in its way."""
+    out = folder / "out"
+    record, known = folder / "a.npz", folder / "a.map"
+    if rng.random() < 0.3:
+        _obstruct(rng, out, record, known)
+    error = choose(rng, (None, None, None, SequenceError("a frame is missing"), Interrupted()))
+    size = int(choose(rng, (0, 1, 100, 1000, 2000, 4000, 8000, 30_000, 10**6))) if rng.random() < 0.6 else None
+    before = {p: _kind(p) for p in (record, known)}
+    sequence: Sequence = Scripted(error, int(rng.integers(FRAMES + 1)))  # type: ignore[assignment]
+    backend = choose(rng, ("ekf", "smoother"))
+    options = RunOptions(backend, "none", SystemConfig(), out, record=record, save_map=known)
+    lock = None
+    if rng.random() < 0.1 and (out.is_dir() or _kind(out) is None):
+        out.mkdir(exist_ok=True)
+        lock = lock_folder(out)
+    raised: BaseException | None = None
+    try:
+        with disk_of(size):
+            run(sequence, options, frontend=_Frontend())  # type: ignore[arg-type]
+    except (SlamError, Interrupted) as caught:
+        raised = caught
+    finally:
+        if lock is not None:
+            os.close(lock)
+    if isinstance(raised, SlamError):
+        require_line(raised)
+    if lock is not None and not isinstance(raised, SlamError):
+        raise Broken("two runs write to one folder")
+    if raised is None and size is not None and not (out / "summary.json").exists():
+        raise Broken("a run without a summary ends well")
+    for path, kind in before.items():
+        if kind not in (None, stat.S_IFREG) and _kind(path) != kind:
+            raise Broken("a device or a pipe was replaced")
+    require_whole(folder, out)
+
+
+def _obstruct(rng: np.random.Generator, out: Path, record: Path, known: Path) -> None:
+    """Something where a file is to be written."""
+    path = choose(rng, (record, known, out, *(out / n for n in ("trajectory.txt", "summary.json", "landmarks.csv"))))
+    path.parent.mkdir(exist_ok=True)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        os.mkfifo(path)
+    elif kind == 1:
+        (path / "x").mkdir(parents=True)
+    elif kind == 2:
+        path.symlink_to("/dev/full")
+    else:
+        path.symlink_to("nowhere/at/all")
+
+
+def _kind(path: Path) -> int | None:
+    try:
+        return stat.S_IFMT(path.lstat().st_mode)
+    except OSError:
+        return None
+
+
+@contextmanager
+def disk_of(size: int | None) -> Iterator[None]:
+    """Files can grow to `size` bytes: as on a full disk, writes fail, or are cut short."""
+    if size is None:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def require_whole(folder: Path, out: Path) -> None:
+    """Raise where a file is there in part, or something temporary is left."""
+    if any(p.name.endswith(".part") for p in folder.rglob("*")):
+        raise Broken("a temporary file is left")
+    readers = {
+        out / "summary.json": _json,
+        out / "config.json": _json,
+        folder / "a.npz": load_recording,
+        folder / "a.map": load_map,
+    }
+    for path, read in readers.items():
+        if path.is_file():
+            read(path)
+    for name in ("trajectory.txt", "trajectory_final.txt"):
+        if (out / name).is_file() and (out / name).stat().st_size:
+            Trajectory.read_tum(out / name)
+    frames = out / "frames.csv"
+    if frames.is_file() and frames.stat().st_size:
+        with frames.open(newline="") as file:
+            if any(len(row) != len(FRAME_COLUMNS) for row in csv.reader(file)):
+                raise Broken("a row is there in part")
+
+
+def _json(path: Path) -> object:
+    return json.loads(path.read_text())
+
+
+SUBJECTS = (
+    Subject(
+        "files of a run", "full disks, devices and folders in the way, folders in use, runs that stop",
+        "whole files, every one that can be written; one line", write_run, quiet=False, short=40,
+    ),
+)  # fmt: skip

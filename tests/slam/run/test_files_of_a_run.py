@@ -1,0 +1,245 @@
+"""Files of a run where they cannot all be written, and runs that end badly."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from slam.config import SystemConfig
+from slam.errors import SlamError
+from slam.files import RowFile, lock_folder, read_bytes, require_target, whole_file
+from slam.mapping.map_io import load_map
+from slam.run import runner
+from slam.run.outputs import RunFiles
+from slam.run.recording import load_recording
+from slam.run.runner import RunOptions
+from tests.fuzz.runs import Scripted, _Frontend, disk_of, require_whole
+
+LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
+
+
+def run(tmp_path, backend="ekf", error=None, at=0, **more):
+    options = RunOptions(backend, "none", SystemConfig(), tmp_path / "out", **more)
+    return runner.run(Scripted(error, at), options, frontend=_Frontend())
+
+
+# --- single files ---
+
+
+def test_a_file_is_whole_or_as_it_was(tmp_path):
+    path = tmp_path / "a"
+    path.write_text("before")
+    path.chmod(0o640)
+    with pytest.raises(ZeroDivisionError), whole_file(path) as file:
+        file.write(b"half")
+        raise ZeroDivisionError
+    with pytest.raises(SlamError, match="cannot be written: File too large"), disk_of(10), whole_file(path) as file:
+        file.write(bytes(10_000))
+    assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
+    with whole_file(path) as file:
+        file.write(b"after")
+    assert path.read_text() == "after" and stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "real").write_text("x")
+    (tmp_path / "link").symlink_to("real")
+    with whole_file(tmp_path / "link") as file:
+        file.write(b"y")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_text() == "y"
+
+
+@pytest.mark.parametrize("place", ["pipe", "folder", "full", "x" * 300, "no/folder", "a\0b"])
+def test_what_cannot_be_a_file_is_not_written(tmp_path, place):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "full").symlink_to("/dev/full")
+    with pytest.raises(SlamError) as caught:
+        require_target(tmp_path / place)
+        with whole_file(tmp_path / place):
+            pass
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "full").is_symlink()
+
+
+def test_rows_are_whole_on_a_full_disk(tmp_path):
+    file = RowFile(tmp_path / "rows")
+    file.write("first\n")
+    with pytest.raises(OSError), disk_of(9):
+        file.write("second\n")
+    file.write("third\n")
+    file.close()
+    assert (tmp_path / "rows").read_text() == "first\nthird\n"
+
+
+def test_no_more_is_read_than_allowed(tmp_path):
+    (tmp_path / "a").write_bytes(bytes(11))
+    assert len(read_bytes(tmp_path / "a", 11)) == 11
+    with pytest.raises(SlamError, match="larger than"):
+        read_bytes(tmp_path / "a", 10)
+    for device in ("/dev/zero", "/dev/full"):
+        with pytest.raises(SlamError):
+            read_bytes(device, 10)
+    assert read_bytes("/proc/self/stat", 100_000) == b""  # whatever it holds, it says no size
+
+
+def test_nothing_stays_open(tmp_path):
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for path in (tmp_path, "/dev/zero", "/dev/full", tmp_path / "nothing"):
+        for _ in range(5):
+            with pytest.raises(SlamError):
+                read_bytes(path, 10)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+# --- a folder ---
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path):
+    with RunFiles(tmp_path / "out"), pytest.raises(SlamError, match="another run is writing to this folder"):
+        RunFiles(tmp_path / "out")
+    with RunFiles(tmp_path / "out"):
+        pass
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.txt", "frames.csv", "objects.csv"}
+
+
+def test_two_commands_do_not_share_a_folder(tmp_path):
+    lock = lock_folder(tmp_path)
+    command = [sys.executable, "-m", "slam", "run", "synthetic:desk?frames=2", "--out", str(tmp_path), "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    os.close(lock)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "another run" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["trajectory.txt", "frames.csv", "objects.csv"])
+def test_a_pipe_in_place_of_rows_is_not_waited_for(tmp_path, name):
+    (tmp_path / "out").mkdir()
+    os.mkfifo(tmp_path / "out" / name)
+    with pytest.raises(SlamError, match="not a regular file"):
+        run(tmp_path)
+
+
+@pytest.mark.parametrize("bytes_", [0, 50, 700, 3500, 4300])
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_a_full_disk_is_one_line_and_what_is_there_is_whole(tmp_path, bytes_, backend):
+    with pytest.raises(SlamError, match=r"cannot .*writ.*File too large") as caught, disk_of(bytes_):
+        run(tmp_path, backend, record=tmp_path / "a.npz", save_map=tmp_path / "a.map")
+    assert "\n" not in str(caught.value)
+    require_whole(tmp_path, tmp_path / "out")
+
+
+def test_a_disk_that_fills_up_half_way(tmp_path):
+    """Rows before are there, the small last files too, and what failed stands in one line."""
+    out = tmp_path / "out"
+
+    def fill(frame, result, system):
+        if frame.index == 3:  # frames.csv can grow no more
+            hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+            resource.setrlimit(resource.RLIMIT_FSIZE, ((out / "frames.csv").stat().st_size + 10, hard))
+
+    options = RunOptions("ekf", "none", SystemConfig(), out)
+    words = r"out: File too large; .*summary\.json: cannot be written: File too large$"
+    with pytest.raises(SlamError, match=words) as caught, disk_of(10**6):
+        runner.run(Scripted(None, 0), options, frontend=_Frontend(), watches=[fill])
+    assert "\n" not in str(caught.value)
+    assert (out / "trajectory.txt").read_text().count("\n") == 4
+    assert (out / "frames.csv").read_text().count("\n") == 5
+    assert (out / "landmarks.csv").read_text().count("\n") > 1
+    assert not (out / "summary.json").exists()
+
+
+@pytest.mark.parametrize("bad", [*LAST, "a.npz", "a.map"])
+def test_one_last_file_that_fails_loses_no_other(tmp_path, bad):
+    record, save_map = tmp_path / "a.npz", tmp_path / "a.map"
+    place = tmp_path / "out" / bad if bad in LAST else tmp_path / bad
+
+    class Late(Scripted):
+        def frames(self, start=0, stop=None):
+            yield from super().frames()
+            place.mkdir()  # in its place, when the run has begun
+
+    options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", record=record, save_map=save_map)
+    with pytest.raises(SlamError, match=bad) as caught:
+        runner.run(Late(None, 0), options, frontend=_Frontend())
+    assert str(caught.value).count("cannot be written") <= 2
+    others = [p for p in (*(tmp_path / "out" / n for n in LAST), record, save_map) if p.name != bad]
+    assert all(p.is_file() and p.stat().st_size for p in others)
+    if bad != "summary.json":
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["ended"] == "completed" and bad in summary["failures"][0]
+    if bad != "a.npz":
+        assert len(load_recording(record)) == 5
+    if bad != "a.map":
+        assert len(load_map(save_map))
+
+
+def test_an_estimator_that_fails_in_the_end_loses_no_summary(tmp_path, monkeypatch):
+    monkeypatch.setattr("slam.system.StereoSlam.estimate", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(tmp_path)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["frames"] == 5 and "division by zero" in summary["failures"][0]
+    assert (tmp_path / "out" / "trajectory_final.txt").read_text().count("\n") == 5
+
+
+def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
+    class Stop(BaseException):
+        pass
+
+    with pytest.raises(Stop), disk_of(3500):
+        run(tmp_path, error=Stop("stop"), at=2, record=tmp_path / "a.npz")
+    assert any("cannot be written" in line for line in caplog.messages)
+
+
+@pytest.mark.parametrize("option", ["--record", "--save-map"])
+def test_devices_are_not_replaced(tmp_path, option):
+    (tmp_path / "device").symlink_to("/dev/full")
+    command = [
+        sys.executable,
+        "-m",
+        "slam",
+        "run",
+        "synthetic:desk?frames=2",
+        "--out",
+        str(tmp_path / "out"),
+        "--quiet",
+    ]
+    done = subprocess.run([*command, option, str(tmp_path / "device")], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "not a regular file" in done.stderr
+    assert (tmp_path / "device").is_symlink() and not (tmp_path / "out").exists()
+
+
+# --- signals ---
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_closed_terminal_leaves_a_summary(tmp_path, ignored):
+    """And where it is to be ignored, as `nohup` has it, the run goes on."""
+    frames = 12 if ignored else 2000
+    command = [sys.executable, "-m", "slam", "run", f"synthetic:desk?frames={frames}&width=128&height=96"]
+    before = (lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)) if ignored else None
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path), "--quiet"], stderr=subprocess.PIPE, text=True, preexec_fn=before
+    )
+    path = tmp_path / "trajectory.txt"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and (not path.exists() or path.read_text().count("\n") < 3):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGHUP)
+    _, errors = process.communicate(timeout=120)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    if ignored:
+        assert process.returncode == 0 and summary["frames"] == frames
+    else:
+        assert process.returncode == 129 and "stopped by SIGHUP" in errors
+        assert summary["ended"] == "stopped: SIGHUP" and 3 <= summary["frames"] < frames
