@@ -28,7 +28,8 @@ from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
 TABLES = {"landmarks.csv", "objects.csv", "frames.csv"}
-FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json"} | TABLES
+FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json", "schema.json"} | TABLES
+WITH_TRUTH = FILES | {"truth.txt"}
 
 
 def options(out, backend="ekf", **more):
@@ -59,7 +60,7 @@ class Broken:
 def test_a_run_leaves_its_files(tmp_path, backend):
     seen = []
     summary = run(open_sequence(WORLD), options(tmp_path, backend), seen.append)
-    assert {p.name for p in tmp_path.iterdir()} == FILES
+    assert {p.name for p in tmp_path.iterdir()} == WITH_TRUTH
     assert len(seen) == 12
     online = Trajectory.read_tum(tmp_path / "trajectory.txt")
     assert len(online) == len(Trajectory.read_tum(tmp_path / "trajectory_final.txt")) == 12
@@ -139,7 +140,7 @@ def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_pat
     monkeypatch.setattr("slam.run.runner.save_map", lambda *_: 1 / 0)
     with pytest.raises(MeasurementError, match="frame 4"):
         run(open_sequence(WORLD), options(tmp_path, record=tmp_path / "tape.npz", save_map=tmp_path / "map"))
-    assert {p.name for p in tmp_path.iterdir()} == FILES | {"tape.npz"}
+    assert {p.name for p in tmp_path.iterdir()} == WITH_TRUTH | {"tape.npz"}
     assert len(load_recording(tmp_path / "tape.npz")) == 4
     assert "frame 4" in json.loads((tmp_path / "summary.json").read_text())["ended"]
 
