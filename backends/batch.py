@@ -6,6 +6,7 @@ Every landmark is a variable and every accepted measurement a factor of its own;
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backends.smoother import SmootherBackend
+from backends.smoother.config import SmootherConfig
 from backends.smoother.measurement_log import IndexArray
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
 from backends.smoother.solver import FAILURES, Change
@@ -27,6 +29,19 @@ from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 
 _ITERATIONS = 100
+
+
+@dataclass(frozen=True)
+class BatchConfig(SmootherConfig):
+    """Options of `BatchBackend`: those of the smoother that runs along, and its own.
+
+    Attributes:
+        online: whether the pose alone is the solved one as well, and not the smoother's.
+        lag: no option here: all poses stay variables.
+    """
+
+    online: bool = False
+    lag: None = None
 
 
 class BatchBackend:
@@ -62,6 +77,7 @@ class BatchBackend:
         if "lag" in options:
             raise ConfigurationError("batch: lag is an option of the smoother; nothing is left out here")
         self._smoother = SmootherBackend(rig, models, lag=None, **options)
+        self.config = BatchConfig(**asdict(self._smoother.config), online=online)
         self._solution: _Solution | None = None
 
     def predict(self, stamp: float) -> Prediction:

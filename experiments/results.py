@@ -28,7 +28,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from slam.compare.revision import made_with
-from slam.run.runner import versions
+from slam.run.repeat import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.checks import FARTHEST_PIXEL
 from slam.errors import MeasurementError
 from slam.geometry.arrays import Array
 from slam.geometry.arrays import BoolArray as BoolArray
@@ -66,6 +67,10 @@ class StereoFeatures:
     threshold: float = float("nan")
 
     def __post_init__(self) -> None:
+        for name in ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
+            if np.ndim(getattr(self, name)) == 0:
+                kind = type(getattr(self, name)).__name__
+                raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
         n = len(self.uv_left)
         for name in ("uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
             if len(getattr(self, name)) != n:
@@ -99,7 +104,8 @@ class Observations:
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, a left pixel is not finite, or a right one is infinite.
+        MeasurementError: shapes differ, an id stands twice, a left pixel is not finite, a right one is infinite, or one
+            lies in no image.
     """
 
     ids: IdArray
@@ -118,6 +124,8 @@ class Observations:
             raise MeasurementError("observations: a left pixel is not finite")
         if np.isinf(self.uv_right).any():
             raise MeasurementError("observations: a right pixel is infinite; NaN says that there is none")
+        if n and max(np.abs(self.uv_left).max(), np.abs(np.nan_to_num(self.uv_right)).max()) > FARTHEST_PIXEL:
+            raise MeasurementError(f"observations: a pixel lies more than {FARTHEST_PIXEL:g} px off: in no image")
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -11,6 +11,7 @@ from slam.bounds import require_not_negative as require_not_negative
 from slam.bounds import require_positive
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
+from slam.naming import unknown
 from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
@@ -73,9 +74,11 @@ class EstimatorModels:
         motion: the motion model.
         pixel_sigma: standard deviation of uL, vL and uR [px].
         gate_probability: an observation is rejected where its innovation lies outside this quantile of χ².
-        initial_position_sigma, initial_rotation_sigma: of the first pose [m], [rad]; tiny where it defines the world.
-        initial_velocity_sigma, initial_angular_velocity_sigma: of the first velocities [m/s], [rad/s].
-        T_world_left: first pose (4, 4); None for the identity.
+        initial_position_sigma, initial_rotation_sigma: standard deviations of the first pose [m], [rad]; tiny where it
+            defines the world.
+        initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of the first velocities [m/s],
+            [rad/s].
+        T_world_left: first pose (4, 4) of the left camera; null (in Python None) for the identity.
         objects: how moving bodies move.
     """
 
@@ -139,4 +142,4 @@ def models_for(kind: str) -> EstimatorModels:
     try:
         return KINDS[kind]
     except KeyError:
-        raise ConfigurationError(f"unknown kind of motion {kind!r}; known: {', '.join(KINDS)}") from None
+        raise ConfigurationError(unknown("kind of motion", kind, KINDS)) from None

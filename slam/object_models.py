@@ -28,7 +28,8 @@ class ObjectModels:
     Attributes:
         acceleration: density of the noise of the origin's velocity [m/s / √s].
         angular_acceleration: density of the noise of the angular velocity [rad/s / √s].
-        initial_velocity_sigma, initial_angular_velocity_sigma: of a new body's velocities [m/s], [rad/s], mean zero.
+        initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of a new body's velocities [m/s],
+            [rad/s], whose mean is zero.
         points: so many points of a body are estimated at most; those unseen for longest make room for new ones.
 
     Raises:

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from slam.errors import ConfigurationError
+from slam.naming import unknown
 
 _C = TypeVar("_C")
 
@@ -25,5 +26,5 @@ def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
     known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
     for key in options:
         if key not in known:
-            raise ConfigurationError(f"{owner}: unknown option {key!r}; known: {', '.join(known)}")
+            raise ConfigurationError(f"{owner}: {unknown('option', key, known)}")
     return kind(**options)

@@ -14,6 +14,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from slam.errors import UnknownNameError
+from slam.naming import unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
 BUILT_IN = {
@@ -47,9 +48,7 @@ def resolve(role: str, name: str) -> Any:
     try:
         module, _, attribute = _table(role)[name].partition(":")
     except KeyError:
-        raise UnknownNameError(
-            f"unknown {role[:-1].replace('end', ' end')} {name!r}; known: {', '.join(names(role))}"
-        ) from None
+        raise UnknownNameError(unknown(role[:-1].replace("end", " end"), name, names(role))) from None
     try:
         return getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from slam.errors import ConfigurationError
+from slam.naming import unknown
 
 _FREE = ("frontend", "backend")  # their options are checked by the front end or back end itself
 
@@ -48,11 +49,28 @@ def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> Non
     node = tree
     for key in path[:-1]:
         if not isinstance(node.get(key), dict):
-            raise ConfigurationError(f"setting {setting!r}: unknown section {key!r}; known: {', '.join(node)}")
+            raise ConfigurationError(f"setting {setting!r}: {_unknown('section', key, node, tree, path)}")
         node = node[key]
     leaf = path[-1]
     if isinstance(node.get(leaf), dict):
         raise ConfigurationError(f"setting {setting!r}: {leaf!r} is a section; set {'.'.join(path)}.KEY=VALUE")
     if len(path) < 2 or (path[0] not in _FREE and leaf not in node):
-        raise ConfigurationError(f"setting {setting!r}: unknown key {leaf!r}; known: {', '.join(node)}")
+        raise ConfigurationError(f"setting {setting!r}: {_unknown('key', leaf, node, tree, path)}")
     node[leaf] = value
+
+
+def _unknown(what: str, name: str, known: dict[str, Any], tree: dict[str, Any], path: list[str]) -> str:
+    """The line for an unknown name; a key that another section has is suggested with its section."""
+    elsewhere = [dotted for dotted in leaves(tree) if dotted.rpartition(".")[2] == path[-1]]
+    if not elsewhere:
+        return unknown(what, name, known)
+    return f"unknown {what} {name!r} (did you mean {' or '.join(map(repr, elsewhere))}?); known: {', '.join(known)}"
+
+
+def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Dotted names of all settings in a configuration's tree, such as ``"map.grid"``."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"

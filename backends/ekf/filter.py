@@ -18,6 +18,7 @@ from backends.ekf.objects import ObjectFilter
 from backends.ekf.objects_body import CameraBelief
 from backends.ekf.recovery import Agreement, agreement, landmarks_pose
 from backends.ekf.solve import Problem, Solution, UnsolvableError
+from slam.checks import require_guess, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
@@ -94,9 +95,7 @@ class EkfBackend:
     @all_or_nothing
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        if not np.isfinite(stamp) or (self._stamps and stamp <= self._stamps[-1]):
-            last = f" after {self._stamps[-1]}" if self._stamps else ""
-            raise MeasurementError(f"ekf: stamp {stamp}{last}: time must be finite and increase")
+        require_stamp("ekf", stamp, self._stamps[-1] if self._stamps else None)
         if self._stamps:
             self._advance(stamp - self._stamps[-1])
         self._stamps.append(float(stamp))
@@ -108,6 +107,7 @@ class EkfBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
+        require_guess("ekf", guess)
         slots = self._landmarks.slots(observations.ids)
         if not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")

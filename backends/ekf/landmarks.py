@@ -42,6 +42,10 @@ class Coordinates(Protocol):
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
         ...
 
+    def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
+        """Derivatives (M, 3, 3) of the coordinates by the positions."""
+        ...
+
     def proper(self, c: Array) -> Array:
         """The nearest coordinates to c (M, 3) that are those of points."""
         ...
@@ -65,6 +69,8 @@ class Euclidean:
     def jacobian(self, anchors: Array, c: Array) -> Array:
         """See `Coordinates.jacobian`."""
         return np.tile(np.eye(3), (len(c), 1, 1))
+
+    inverse_jacobian = jacobian
 
     def proper(self, c: Array) -> Array:
         """See `Coordinates.proper`."""
@@ -97,6 +103,15 @@ class InverseDepth:
         D[:, :2, 2] = -c[:, :2] * (depth * depth)[:, None]
         D[:, 2, 2] = -depth * depth
         return np.asarray(anchors[:, :, :3] @ D)
+
+    def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
+        """See `Coordinates.inverse_jacobian`."""
+        w = 1 / _depth(c)
+        D = np.zeros((len(c), 3, 3))
+        D[:, 0, 0] = D[:, 1, 1] = w
+        D[:, :2, 2] = -c[:, :2] * w[:, None]
+        D[:, 2, 2] = -w * w
+        return np.asarray(D @ np.swapaxes(anchors[:, :, :3], 1, 2))
 
     def proper(self, c: Array) -> Array:
         """See `Coordinates.proper`."""
@@ -210,7 +225,7 @@ class Landmarks:
 
     def _derivatives(self, anchors: Array, c: Array, points: Array) -> tuple[Array, Array]:
         """Derivatives of coordinates c by the positions (M, 3, 3), and by a displacement of the world (M, 3, 6)."""
-        inverse = np.linalg.inv(self.coordinates.jacobian(anchors, c))
+        inverse = self.coordinates.inverse_jacobian(anchors, c)
         return inverse, np.concatenate([inverse, -inverse @ hat(points)], axis=2)
 
     def jacobian(self, slots: SlotArray) -> Array:

@@ -27,6 +27,7 @@ from backends.smoother.prediction import (
 )
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
+from slam.checks import require_guess, require_stamp
 from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
@@ -94,9 +95,7 @@ class SmootherBackend:
         self._graph.mend()
         self._commit()
         stamps = self.measurement_log.path.stamps
-        if not np.isfinite(stamp) or (len(stamps) and stamp <= stamps[-1]):
-            last = f" after {stamps[-1]}" if len(stamps) else ""
-            raise MeasurementError(f"smoother: stamp {stamp}{last}: time must be finite and increase")
+        require_stamp("smoother", stamp, float(stamps[-1]) if len(stamps) else None)
         if not len(stamps) and len(self.measurement_log.landmarks):
             self._predicted = first_pose(self.models, float(stamp))
             return self._in_view(self._predicted)
@@ -113,18 +112,25 @@ class SmootherBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
+        require_guess("smoother", guess)
         slots = self.measurement_log.landmarks.slots(observations.ids)
         predicted = self._predicted
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         z = self._stereo.measure(observations)
         points = self._points(predicted, slots)
-        T, used = self._solve_pose(predicted, points, slots, z, guess)
+        try:
+            T, used = self._solve_pose(predicted, points, slots, z, guess)
+        except np.linalg.LinAlgError as error:
+            return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: the pose cannot be solved for: {error}")
         if not used.any():
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
         solved = self._points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
-        nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
+        try:
+            nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
+        except np.linalg.LinAlgError:  # covariances that differ by more than their digits
+            nis, dof = float("nan"), 0
         with self._whole():
             failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
             self._predicted = None

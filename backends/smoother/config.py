@@ -25,7 +25,7 @@ class SmootherConfig:
             every tenth frame; ten times as much in the others, next to nothing when the whole path or map is asked for.
         window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
         lag: poses that stay variables, at least; what is older is marginalised, so that neither time nor memory grows
-            with the run. None keeps all of them and revises the whole path.
+            with the run. Null (in Python None) keeps all of them and revises the whole path.
 
     Raises:
         ConfigurationError: a value is out of its range.

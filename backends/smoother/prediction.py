@@ -36,7 +36,8 @@ class PredictedPose:
     @property
     def covariance(self) -> Array:
         """Covariance (6, 6)."""
-        return self.by_window @ self.window.covariance @ self.by_window.T + self.noise
+        P = self.by_window @ self.window.covariance @ self.by_window.T + self.noise
+        return np.asarray(0.5 * (P + P.T))
 
     def covariance_to(self, place: int) -> Array:
         """Covariance (6, 6) where one pose of the window is known: what all have in common moves the landmarks too."""

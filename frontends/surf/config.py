@@ -19,11 +19,11 @@ class SurfConfig:
         features: number of features aimed at in the left image.
         threshold: D_threshold at the start (paper A, III.A), on OpenCV's scale for 8-bit images.
         adaptive: adapt D_threshold from frame to frame to keep the number of features.
-        min_threshold, max_threshold: limits of the adaptation.
-        octaves: 1 to 4 (paper A: 2).
-        layers: 2 or 3 layers searched in each octave.
-        descriptor: 16 (paper A, III.B) or 64 dimensions.
-        upright: no orientation.
+        min_threshold, max_threshold: limits of D_threshold in the adaptation.
+        octaves: number of octaves, 1 to 4 (paper A: 2).
+        layers: number of layers searched in each octave, 2 or 3.
+        descriptor: dimensions of the descriptors, 16 (paper A, III.B) or 64.
+        upright: features have no orientation; for cameras that do not roll.
         localise: find position and size in a continuous scale space: features stay in place when the image moves
             or grows, at some cost in time.
         grid: columns and rows of the grid over which features are spread; each cell has an equal share.

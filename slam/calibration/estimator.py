@@ -23,6 +23,8 @@ _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: times over which errors
 _SPACING = 0.5  # a view waits from when the last one has lost this part of what it loses until it is compared
 _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
 _MOST_ROWS = 250  # of a frame: more say little more
+_MOST_FEATURES = 400  # of a view, the strongest ones: more cost time and say little more
+_RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
 
 
 class SelfCalibration:
@@ -99,8 +101,10 @@ class SelfCalibration:
         """
         if not self.config.enabled:
             return
-        view = View.of(self.model, features, T_world_left)
         self._seen += 1
+        if self._seen % (1 + self.pairs // _RARER):
+            return
+        view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
         if len(view) < self.config.minimum_common:
             return
         some = np.linspace(0, len(view) - 1, min(len(view), _MOST_ROWS)).astype(int)

@@ -42,10 +42,12 @@ class View:
         return len(self.points)
 
     @classmethod
-    def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array) -> View:
-        """Of features as measured, at a pose (4, 4) of the left camera."""
+    def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
+        """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
         rectified_rig = model.rig.rectified
         rows = np.flatnonzero(features.has_stereo)
+        if len(rows) > most:
+            rows = np.sort(rows[np.argsort(-features.response[rows], kind="stable")[:most]])
         left, right = (
             rectified_rig.rectify_left(features.uv_left[rows]),
             rectified_rig.rectify_right(features.uv_right[rows]),

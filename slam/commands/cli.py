@@ -14,27 +14,38 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slam.errors import ConfigurationError, SlamError, one_line
+from slam.commands import completion
+from slam.commands.options import (
+    BackendOption,
+    ConfigOption,
+    FormatOption,
+    FramesOption,
+    FrontendOption,
+    KindOption,
+    OptionalSequence,
+    OutOption,
+    OverwriteOption,
+    PictureOption,
+    QuietOption,
+    RunOutOption,
+    SequenceArgument,
+    SetOption,
+)
+from slam.errors import SlamError, one_line
 from slam.files import reason
 
 if TYPE_CHECKING:
     from slam.data import FrameResult
+    from slam.run.replay import Recording
     from slam.sequences import Sequence
 
 app = typer.Typer(
     help="Stereo SLAM with modified SURF features and interchangeable back ends.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # boxes clip what does not fit
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-SequenceArgument = Annotated[
-    str, typer.Argument(metavar="SEQUENCE", help="A folder, or synthetic:NAME?key=value.", show_default=False)
-]
-OutOption = Annotated[Path, typer.Option("--out", help="Folder for the files of the run.")]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting, e.g. map.max_landmarks=300.")
-]
 
 
 #: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
@@ -57,7 +68,7 @@ def main() -> None:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
             signal.signal(number, _stop)
     try:
-        app()
+        app(prog_name="slam")
     except SlamError as error:
         _end(f"slam: {error}", 2)
     except BrokenPipeError:  # whoever read the output has gone
@@ -79,6 +90,15 @@ def _end(line: str, status: int) -> None:
         else:
             sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 Python flushes it at the end
     sys.exit(status)
+
+
+def _print_version(wanted: bool) -> None:
+    """What ``--version`` prints."""
+    if wanted:
+        from slam.run.repeat import versions
+
+        print(f"surf-stereo-slam {versions()['surf-stereo-slam']}")
+        raise typer.Exit
 
 
 _pending: list[int] = []  # a signal that waits for the end of a frame
@@ -109,16 +129,26 @@ def _whole_frames(after_frame: Callable[[FrameResult], None]) -> Iterator[Callab
         _in_frames = False
 
 
-@app.command("run")
+@app.callback()
+def common_options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Options of the command itself."""
+
+
+@app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
-    sequence: SequenceArgument,
-    out: OutOption,
-    backend: Annotated[str, typer.Option(help="Back end by name, see `slam list`.")] = "ekf",
-    frontend: Annotated[str, typer.Option(help="Front end by name, see `slam list`.")] = "surf",
+    sequence: OptionalSequence = None,
+    out: RunOutOption = None,
+    config: ConfigOption = None,
+    backend: BackendOption = None,
+    frontend: FrontendOption = None,
     settings: SetOption = None,
-    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
-    kind: Annotated[str | None, typer.Option(help="handheld or driving; default: the sequence's own.")] = None,
-    format: Annotated[str | None, typer.Option(help="Format; default: found out from the folder.")] = None,
+    frames: FramesOption = None,
+    kind: KindOption = None,
+    format: FormatOption = None,
     record: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
     ] = None,
@@ -136,24 +166,23 @@ def run_command(
     overlap: Annotated[
         bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
     ] = True,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    picture: PictureOption = True,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.display import Progress, print_summary
-    from slam.config import SystemConfig
-    from slam.run.runner import RunOptions, parse_frames, run
-    from slam.sequences import open_sequence
+    from slam.commands.folders import run_folder
+    from slam.commands.run import Wanted, prepare
+    from slam.run.runner import run
 
-    opened = open_sequence(sequence, format=format)
-    start, stop = parse_frames(frames)
-    mono_settings = ["map.monocular=true"] if mono else []
-    default = SystemConfig.for_kind(kind or opened.kind, frontend, backend)
-    config = default.with_settings([*mono_settings, *(settings or [])])
-    if mono and known_map is None:
-        raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
-    options = RunOptions(backend, frontend, config, out, start, stop, record, known_map, save_map, mono, overlap)
-    progress = Progress(_frame_count(opened, start, stop), f"{opened.name} · {backend}", quiet)
+    wanted = Wanted(sequence, config, backend, frontend, settings or (), frames, kind, format, known_map, mono)
+    opened, options, origin = prepare(wanted)
+    progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
+        folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
+        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap)
+        options = replace(options, origin=origin.to_json(folder))
         watches = []
         if viewer is not None:
             from slam.run.viewer import Viewer
@@ -165,53 +194,113 @@ def run_command(
             watches.append(stack.enter_context(FramePictures(draw)).show)
         end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame))
         summary = run(opened, options, end_of_frame, watches=watches)
+    _leave_picture(folder, picture)
     if not quiet:
-        print_summary([summary], out)
+        print_summary([summary], folder)
 
 
-@app.command("replay")
+@app.command("replay", short_help="Feed a back end recorded measurements.")
 def replay_command(
     recording: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Made by `slam run --record`.")],
-    out: OutOption,
-    backend: Annotated[str, typer.Option(help="Back end by name, see `slam list`.")] = "ekf",
+    out: RunOutOption = None,
+    backend: BackendOption = None,
     settings: SetOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    picture: PictureOption = True,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
     from slam.commands.display import Progress, print_summary
+    from slam.commands.folders import run_folder
+    from slam.commands.run import command_line
     from slam.config import SystemConfig
     from slam.run.recording import load_recording
     from slam.run.runner import RunOptions, run_recording
 
-    loaded = load_recording(recording)
-    default = SystemConfig.for_kind(loaded.kind, None, backend)
+    loaded, name = load_recording(recording), backend or "ekf"
+    default = SystemConfig.for_kind(loaded.kind, None, name)
     config = replace(default, models=loaded.models).with_settings(settings or [])
-    progress = Progress(len(loaded), f"{loaded.name} · {backend}", quiet)
-    with progress, _whole_frames(progress.frame) as end_of_frame:
-        summary = run_recording(loaded, RunOptions(backend, "recording", config, out), end_of_frame)
+    progress = Progress(len(loaded), _title(loaded, name), quiet)
+    with run_folder(out, loaded.name, name, overwrite) as folder:
+        options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
+        with progress, _whole_frames(progress.frame) as end_of_frame:
+            summary = run_recording(loaded, options, end_of_frame)
+    _leave_picture(folder, picture)
     if not quiet:
-        print_summary([summary], out)
+        print_summary([summary], folder)
 
 
-@app.command("compare")
+@app.command("plot", short_help="Draw finished runs.")
+def plot_command(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="PNG, PDF or SVG; default: a PNG in the first folder."),
+    ] = None,
+    figure: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="summary, path, map, errors or time.", autocompletion=completion.figures),
+    ] = "summary",
+) -> None:
+    """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
+    from slam.commands.plot import plot_runs
+
+    for file in plot_runs(folders, out, figure):
+        print(file)
+
+
+@app.command("settings", short_help="List all settings.")
+def settings_command(
+    section: Annotated[
+        str | None, typer.Argument(metavar="SECTION", help="A section, a setting, or a front end or back end.")
+    ] = None,
+) -> None:
+    """List all settings with default per kind of motion, unit, range and meaning."""
+    from slam.commands.settings import print_settings
+
+    print_settings(section)
+
+
+@app.command("compare", short_help="Compare back ends on the same recordings.")
 def compare_command(
     sequences: Annotated[
-        list[str], typer.Argument(metavar="SEQUENCE…", help="Folders, or synthetic:NAME?key=value.", show_default=False)
+        list[str],
+        typer.Argument(
+            metavar="SEQUENCE",
+            help="Folders, or synthetic:NAME?key=value.",
+            show_default=False,
+            autocompletion=completion.sequences,
+        ),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder; a comparison that was stopped in it goes on.")],
-    backends: Annotated[str, typer.Option(help="Names with commas; the first is the reference.")] = "ekf,smoother",
-    frontends: Annotated[str, typer.Option(help="Names; simulated: a world's own features, no images.")] = "",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder; a comparison that was stopped in it goes on.")
+    ],
+    backends: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,...", help="Back ends; the first is the reference.", autocompletion=completion.backends
+        ),
+    ] = "ekf,smoother",
+    frontends: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,...",
+            help="Front ends; simulated: a world's own features, no images.",
+            autocompletion=completion.frontends,
+        ),
+    ] = "",
     variant: Annotated[
-        list[str] | None, typer.Option(metavar="NAME:FRONTEND:KEY=VALUE:…", help="A front end with settings.")
+        list[str] | None,
+        typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:..."),
     ] = None,
     settings: SetOption = None,
-    trials: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, … of every synthetic world.")] = 1,
-    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
+    trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 1,
+    frames: FramesOption = None,
     replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
-    workers: Annotated[int | None, typer.Option(help="Processes; default: the number of cores.")] = None,
+    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no conclusions.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no conclusions.")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
     from slam.commands import compare as command
@@ -224,13 +313,13 @@ def compare_command(
     command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
 
 
-@app.command("render")
+@app.command("render", short_help="Write a built-in sequence as a folder.")
 def render_command(
     sequence: SequenceArgument,
     out: OutOption,
-    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames.")] = None,
+    frames: FramesOption = None,
     truth_images: Annotated[bool, typer.Option(help="Depth and object images as well.")] = True,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
     from slam.commands.display import counting
@@ -246,7 +335,7 @@ def render_command(
         print(f"Files: {root}")
 
 
-@app.command("view")
+@app.command("view", short_help="Show a finished run in Rerun.")
 def view_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
     target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
@@ -257,7 +346,7 @@ def view_command(
     view_run(folder, target)
 
 
-@app.command("list")
+@app.command("list", short_help="List back ends, sequences and formats.")
 def list_command() -> None:
     """List back ends, front ends, built-in sequences and formats."""
     from slam.commands.display import print_listing
@@ -265,16 +354,29 @@ def list_command() -> None:
     print_listing()
 
 
-@app.command("demo")
+@app.command("demo", short_help="Try both back ends on a built-in scene.")
 def demo_command(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("slam_demo"),
-    frames: Annotated[int, typer.Option(min=10, help="Number of frames.")] = 150,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    out: OutOption = Path("slam_demo"),
+    frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
+    quiet: QuietOption = False,
 ) -> None:
     """Run both back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo
 
     demo(out, frames, quiet)
+
+
+def _title(sequence: Sequence | Recording, backend: str) -> str:
+    """A short name for a progress bar: of a world its name alone."""
+    name = sequence.name.partition("?")[0]
+    return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
+
+
+def _leave_picture(folder: Path, wanted: bool) -> None:
+    if wanted:
+        from slam.commands.plot import leave_picture
+
+        leave_picture(folder)
 
 
 def _frame_count(sequence: Sequence, start: int, stop: int | None) -> int:

@@ -35,7 +35,7 @@ class Progress:
     def __init__(self, total: int, title: str, quiet: bool = False) -> None:
         self._bar = RichProgress(
             TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=10),  # all fits into 80 columns
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]} {task.fields[status]}"),
             TimeRemainingColumn(),
@@ -59,7 +59,7 @@ class Progress:
         self._bar.start()
         task = self._bar.tasks[0]
         rate = f"{task.speed:.1f} Hz" if task.speed else ""
-        status = f"{result.status.value}, {len(result.report.used)} of {result.map_size} landmarks"
+        status = f"{result.status.value} {len(result.report.used)}/{result.map_size}"  # landmarks used, known
         self._bar.update(self._task, advance=1, rate=rate, status=status)
 
 

@@ -170,4 +170,9 @@ def parse_variant(text: str, common: tuple[str, ...] = ()) -> Variant:
     frontend = parts.pop(0) if parts and "=" not in parts[0] else "surf"
     if not name or any("=" not in part for part in parts):
         raise ConfigurationError(f"variant {text!r} is not of the form NAME:FRONTEND:KEY=VALUE:…")
+    if not rest.strip(":"):
+        raise ConfigurationError(
+            f"variant {text!r} names no front end and no setting: write NAME:FRONTEND:KEY=VALUE:…, "
+            f"such as {name}:surf:frontend.descriptor=16"
+        )
     return Variant(name, frontend, (*common, *parts))

@@ -8,7 +8,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from slam.run.runner import versions
+from slam.run.repeat import versions
 
 _PACKAGES = ("slam", "frontends", "backends")
 

@@ -42,6 +42,12 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     return figures
 
 
+def true_path(estimate: Trajectory, sequence: WithTruth) -> Trajectory | None:
+    """The true path at the stamps of an estimated one, in its own world; None where fewer than 3 poses have any."""
+    pairs = _common(estimate, sequence.ground_truth)
+    return None if pairs is None else pairs[1]
+
+
 def _common(estimate: Trajectory, truth: Trajectory | None) -> tuple[Trajectory, Trajectory] | None:
     """Both paths at common stamps; None where fewer than 3 poses have truth."""
     if truth is None or not len(estimate):

@@ -17,10 +17,10 @@ class MapConfig:
         grid: cells (columns, rows) over the image; new landmarks go first where the cell has fewest.
         separation: least distance of a new landmark from the landmarks in view [px].
         max_depth_error: largest relative standard deviation of a new landmark's depth.
-        erase_missed: a landmark is erased after so many frames in view without being measured ("not continuously
-            detected"), and
-        erase_share: where it was measured in less than this share of the frames in view (judged from
-            `erase_missed` frames on). Frames in which it may be hidden, or lies near the image's border, do not count.
+        erase_missed: a landmark is erased after so many successive frames in view without being measured ("not
+            continuously detected"). Frames in which it may be hidden, or lies near the image's border, do not count.
+        erase_share: a landmark is erased where it was measured in less than this share of the frames in view, judged
+            from `erase_missed` frames on.
         confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
         spacing: of landmarks out of view (or hidden, or seen from elsewhere) that lie nearer to each other than this
             share of the distance that they were first seen from, the one measured in most frames stays; 0 for all: a
@@ -30,8 +30,9 @@ class MapConfig:
         view_margin: distance from the border [px] within which a landmark is not sure to be detected.
         occlusion_radius: a landmark is taken to be hidden where most features so near to it [px] are nearer to the
             camera; 0 for never.
-        same_distance: landmarks so near to each other [m], or nearer than stereo can tell apart,
-        same_descriptor: with descriptors so near, are one and the same.
+        same_distance: landmarks so near to each other [m], or nearer than stereo can tell apart, are one and the same
+            where their descriptors are alike.
+        same_descriptor: largest descriptor distance of two landmarks that are one and the same.
         descriptor_update: weight of a landmark's newest descriptor against the one kept; 1 keeps the last, 0 the first.
         lost_after: where no landmark was recognised for so many frames and the prediction is vague, the camera is lost.
         restart_after: where nothing was recognised in so many frames that showed enough features for it, the place is

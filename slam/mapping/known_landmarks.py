@@ -8,6 +8,7 @@ from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
+_FARTHEST = 1e9  # position [m]: beyond, pixels have no digits left
 _LARGEST = 1e18  # variance [m²]; those of a landmark that is hardly known at all are far smaller
 _SYMMETRIC = 1e-6  # largest share by which a covariance may differ from its transpose
 
@@ -22,8 +23,8 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         covariances: (N, 3, 3) [m²].
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, a position is not finite, or a covariance is not symmetric
-            and positive definite.
+        MeasurementError: shapes differ, an id stands twice, a position is not finite or absurdly far, or a covariance
+            is not symmetric and positive definite.
     """
     n = len(ids)
     if positions.shape != (n, 3) or covariances.shape != (n, 3, 3):
@@ -34,6 +35,9 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
     bad = ~np.isfinite(positions).all(axis=1)
     if bad.any():
         raise MeasurementError(f"{backend}: the position of landmark {ids[bad][0]} is not finite")
+    bad = (np.abs(positions) > _FARTHEST).any(axis=1)
+    if bad.any():
+        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} lies more than {_FARTHEST:g} m off")
     bad = ~_positive_definite(covariances)
     if bad.any():
         raise MeasurementError(

@@ -23,22 +23,24 @@ class ObjectsConfig:
         max_speed: no point of a body is faster [m/s]; bounds the search for features that are not where a still point
             would be.
         min_speed: no body is taken for moving that is slower [m/s].
-        search_radius: half size of the search windows of tracks, at least [px]; and
-        search_limit: at most.
-        d_match: largest descriptor distance in the search windows; ratio: of the best to the second best.
-        wide_d_match, wide_ratio: the same for features far from where a still point would be.
+        search_radius, search_limit: least and largest half size of the search windows of tracks [px].
+        d_match: largest descriptor distance in the search windows.
+        ratio: largest ratio of the best to the second best descriptor distance.
+        wide_d_match, wide_ratio: as `d_match` and `ratio`, for features far from where a still point would be.
         min_frames: a feature is judged from so many measurements on.
         doubtful: χ²(3) of a track's displacement from which it becomes no landmark.
         suspect: χ²(6) of a large cluster's motion against the rest of the scene's from which its landmarks measure the
-            camera no more, and
-        group_test: from which it moves; of small clusters more is asked for.
-        min_support: features that must move alike before a body is made of them, and
-        confirm: for so many frames, less those in which they did not; one of them may be newer.
+            camera no more.
+        group_test: the same χ²(6) from which a large cluster moves; of small clusters more is asked for.
+        min_support: features that must move alike before a body is made of them.
+        confirm: frames for which they must move alike, less those in which they did not; one feature may be newer.
         max_points: most points kept of a body.
         forget_after: a body not seen for so long is forgotten [s].
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
-        least_side, least_sine: of the triangle of features in ``"procedure1"``: sides [m], and sines of its angles.
+        least_side: of the triangle of features in ``"procedure1"``, its shortest side [m].
+        least_sine: of the triangle of features in ``"procedure1"``, the least sine of its angles.
         margin: how far from a body's extent its further features may lie, as a share of the extent's diagonal, or of
+            `size` where that is more.
         size: what bodies measure across at least, seen in part or whole [m].
     """
 

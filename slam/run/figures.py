@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from slam.evaluation.metrics import align, associate
 from slam.files import read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
+from slam.run.schema import STAGES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,8 +36,13 @@ class RunData:
         positions: landmarks (N, 3) [m].
         covariances: (N, 3, 3) [m²].
         seen_last: which landmarks were measured in the last frame (N,).
-        deviations: of the online position in world axes (F, 3) [m].
-        status: of each frame (F,).
+        deviations: of the online position in world axes (F, 3) [m], a row for each pose of `online`.
+        status: of each frame.
+        milliseconds: by stage, of each frame [ms].
+        truth: true path, in its own world; None where it is not known.
+        sequence, backend: names.
+        folder: where it was read from.
+        truth_is_exact: whether the truth has no errors of its own: that of a world.
     """
 
     name: str
@@ -46,6 +53,12 @@ class RunData:
     seen_last: np.ndarray
     deviations: Array
     status: list[str]
+    milliseconds: dict[str, Array]
+    truth: Trajectory | None = None
+    sequence: str = ""
+    backend: str = ""
+    folder: Path = Path()
+    truth_is_exact: bool = True
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
@@ -54,6 +67,8 @@ class RunData:
         Raises:
             SlamError: the folder does not hold a finished run.
         """
+        if not (folder / "landmarks.csv").exists():
+            raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
         try:
             return cls._read(folder, name)
         except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:
@@ -64,6 +79,8 @@ class RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
+        truth = folder / "truth.txt"
+        config = json.loads(read_text(folder / "config.json"))
         return cls(
             name,
             Trajectory.read_tum(folder / "trajectory.txt"),
@@ -71,8 +88,14 @@ class RunData:
             _numbers(landmarks, ("x", "y", "z")),
             upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             last_seen == int(frames[-1]["frame"]),
-            _numbers(frames, ("sd_x", "sd_y", "sd_z")),
+            _numbers([row for row in frames if row["sd_x"]], ("sd_x", "sd_y", "sd_z")),  # empty: no pose
             [row["status"] for row in frames],
+            {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
+            Trajectory.read_tum(truth) if truth.exists() else None,
+            str(config["sequence"]),
+            str(config["backend"]),
+            folder,
+            config["format"] == "synthetic",
         )
 
 
@@ -94,34 +117,40 @@ def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
 
 
 def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
-    """Columns of a table as numbers (N, C)."""
-    return np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, len(columns))
+    """Columns of a table as numbers (N, C); NaN for an empty cell."""
+    return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
 
 
 def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
     """Top view (right, forward) of each run: landmarks red if seen in the last frame, else green (paper A, Fig. 6)."""
-    from matplotlib.collections import EllipseCollection
-
     figure, axes = _figure(len(runs), (6.4, 6.0))
     for axis, run in zip(axes, runs):
-        plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
-        values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
-        width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
-        angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-        for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
-            ellipses = EllipseCollection(
-                width[rows, 1], width[rows, 0], angle[rows], units="xy", offsets=run.positions[rows][:, [0, 2]],
-                offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
-            )  # fmt: skip
-            axis.add_collection(ellipses)
-            axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
-        axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
-        _draw_truth(axis, run.online, truth, (0, 2))
-        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", aspect="equal")
-        _limit_to_most(axis, run)
+        draw_map(axis, run, truth)
+        axis.set(title=run.name)
         _draw_end(axis, run.online, truth)
     axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
     _save(figure, path)
+
+
+def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
+    """The map from above with the 2σ ellipses of its landmarks, and the path."""
+    from matplotlib.collections import EllipseCollection
+
+    plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
+    values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
+        ellipses = EllipseCollection(
+            width[rows, 1], width[rows, 0], angle[rows], units="xy", offsets=run.positions[rows][:, [0, 2]],
+            offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
+        )  # fmt: skip
+        axis.add_collection(ellipses)
+        axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
+    axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
+    _draw_truth(axis, run.online, truth, (0, 2))
+    axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
+    _limit_to_most(axis, run)
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
@@ -154,14 +183,9 @@ def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
     """Position error over time of each run, component by component, inside the ±3σ that the run claims."""
     figure, axes = _figure(3, (9.0, 2.3), rows=True)
     for colour, run in zip(_COLOURS, runs):
-        own, true = associate(run.online, truth, 0.02, interpolated=True)
-        start = own.poses[0] @ np.linalg.inv(true.poses[0])
-        expected = true.positions @ start[:3, :3].T + start[:3, 3]
-        error = 100 * (own.positions - expected)
-        rows = np.searchsorted(run.online.stamps, own.stamps)
-        band = 300 * run.deviations[rows]
+        t, error, sigma = position_errors(run, truth)
+        error, band = 100 * error, 300 * sigma
         for axis, component, label in zip(axes, range(3), ("right", "down", "forward")):
-            t = own.stamps - own.stamps[0]
             axis.fill_between(t, -band[:, component], band[:, component], color=colour, alpha=0.15, lw=0)
             axis.plot(t, error[:, component], color=colour, lw=1.2, label=run.name)
             axis.set_ylabel(f"{label} [cm]")
@@ -170,6 +194,20 @@ def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
     axes[0].legend(loc="upper left", fontsize=8, frameon=False)
     axes[-1].set_xlabel("time [s]")
     _save(figure, path)
+
+
+def position_errors(run: RunData, truth: Trajectory) -> tuple[Array, Array, Array]:
+    """Time since the start (N,) [s], error of the online position and its claimed standard deviation, (N, 3) [m] each.
+
+    Both are along the axes of the run's world, in which the truth begins at the estimated position. It is turned by the
+    first pose where the truth is exact. A recorded one is turned so that the whole paths fit: an error of its first
+    orientation by some tenths of a degree would look like an error of the path that grows with the distance.
+    """
+    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    R = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
+    expected = (true.positions - true.positions[0]) @ R.T + own.positions[0]
+    rows = np.searchsorted(run.online.stamps, own.stamps)
+    return own.stamps - own.stamps[0], own.positions - expected, run.deviations[rows]
 
 
 def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:

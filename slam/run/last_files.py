@@ -44,7 +44,7 @@ class LastFiles:
                 logger.warning("%s", line)
             return
         for error in self.failures:
-            if not isinstance(error, SlamError):
+            if stopped_by is None and not isinstance(error, SlamError):
                 raise error
         first = [] if stopped_by is None else [str(stopped_by)]
         kind = SlamError if stopped_by is None else type(stopped_by)

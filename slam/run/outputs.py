@@ -22,24 +22,9 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.landmarks import LandmarkRows
 from slam.object_data import MovingObject
+from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
 
-#: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
-STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage")
-
-FRAME_COLUMNS = (
-    "frame", "stamp", "status", "reason", "features", "stereo", "predicted", "matched", "used", "rejected",
-    "added", "erased", "map_size", "D_threshold", "nis", "nis_dof",
-    "sd_x", "sd_y", "sd_z", "sd_rotation", *(f"ms_{stage}" for stage in STAGES),
-)  # fmt: skip
-
-LANDMARK_COLUMNS = ("id", "x", "y", "z", "cxx", "cxy", "cxz", "cyy", "cyz", "czz", "seen", "last_seen")
-
-#: One row per frame and moving object.
-OBJECT_COLUMNS = (
-    "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
-    "motion_x", "motion_y", "motion_z", "motion_roll", "motion_pitch", "motion_yaw",
-    *(f"c{i}{j}" for i in range(6) for j in range(i, 6)),
-)  # fmt: skip
+FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 
 
 class RunFiles:
@@ -61,7 +46,7 @@ class RunFiles:
             lock = lock_folder(folder)
             if lock is not None:
                 stack.callback(os.close, lock)
-            for stale in ("trajectory_final.txt", "landmarks.csv", "summary.json"):
+            for stale in ("trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png"):
                 (folder / stale).unlink(missing_ok=True)
             self._trajectory, self._frames, self._objects = (
                 stack.enter_context(closing(RowFile(folder / name)))
@@ -95,7 +80,7 @@ class RunFiles:
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         line = tum_line(e.stamp, e.T_world_left) if result.located else ""
-        things = _rows(_object_row(thing) for thing in result.objects)
+        things = _rows(_object_row(number, thing) for thing in result.objects)
         with naming_folder(self.folder):
             self._frames.write(_rows([row]))
             self._objects.write(things)
@@ -103,13 +88,16 @@ class RunFiles:
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
         """Write trajectory_final.txt; raises SlamError where it cannot be written, and nothing is left of it."""
-        lines = "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
-        write_text(self.folder / "trajectory_final.txt", lines)
+        write_text(self.folder / "trajectory_final.txt", _tum(trajectory))
 
     def write_landmarks(self, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]) -> None:
         """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
         rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
         write_text(self.folder / "landmarks.csv", _rows([LANDMARK_COLUMNS, *rows]))
+
+    def write_truth(self, trajectory: Trajectory) -> None:
+        """Write truth.txt, the true path at the frames' stamps; raises as `write_trajectory`."""
+        write_text(self.folder / "truth.txt", _tum(trajectory))
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all; raises as `write_trajectory`."""
@@ -147,6 +135,11 @@ def _rows(rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
+def _tum(trajectory: Trajectory) -> str:
+    """All lines of a TUM file."""
+    return "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
+
+
 def _landmark_rows(estimate: Estimate, landmarks: LandmarkRows, numbers: list[int]) -> Iterator[list[Any]]:
     """A row of landmarks.csv for each landmark."""
     upper = np.triu_indices(3)
@@ -158,11 +151,13 @@ def _landmark_rows(estimate: Estimate, landmarks: LandmarkRows, numbers: list[in
         yield [int(i), *values, int(landmarks.seen[at]), last]
 
 
-def _object_row(thing: MovingObject) -> list[Any]:
-    """Pose, motion since the previous frame in world coordinates, and the pose covariance's upper triangle."""
+def _object_row(number: int, thing: MovingObject) -> list[Any]:
+    """A row of `slam.run.schema.OBJECT_TABLE` for a body in frame `number`."""
     e = thing.estimate
-    numbers = [*_pose_numbers(e.T_world_object), *_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
-    return [f"{e.stamp:.9f}", thing.id, *(f"{x:.9g}" for x in numbers)]
+    numbers = [*_pose_numbers(e.T_world_object), *e.velocity[3:], *e.velocity[:3]]
+    numbers += [*_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
+    flags = [int(thing.moving), int(e.measured)]
+    return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
 
 
 def _pose_numbers(T: Array) -> list[float]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.model import RigModel
+from slam.checks import LATEST_STAMP
 from slam.data import (
     FrameResult,
     FrameStatus,
@@ -37,7 +38,6 @@ from slam.tracking.association import AssociationConfig
 
 _FARTHEST = 1e7  # pixel
 _MOST_ID = 2**53
-_LATEST = 1e12  # stamp [s], either side of zero
 _TRACKED = 3  # stereo points that fix a pose
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
@@ -154,8 +154,8 @@ class Recording:
         count = len(self.stamps)
         if self.numbers.shape != (count,) or not np.isfinite(self.stamps).all() or (np.diff(self.stamps) <= 0).any():
             raise MeasurementError("recording: stamps must be finite and increase, with a number each")
-        if count and np.abs(self.stamps).max() > _LATEST:
-            raise MeasurementError(f"recording: a stamp is beyond {_LATEST:g} s")
+        if count and np.abs(self.stamps).max() > LATEST_STAMP:
+            raise MeasurementError(f"recording: a stamp is beyond {LATEST_STAMP:g} s")
         if self.corrections is not None:
             shape = count, len(RigModel(self.rig).names)
             if self.corrections.shape != shape or not np.isfinite(self.corrections).all():

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 import time
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from slam import registry
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFrame
 from slam.errors import SlamError, one_line
-from slam.evaluation.summary import consistency, evaluate
+from slam.evaluation.summary import consistency, evaluate, true_path
 from slam.files import require_target
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -25,13 +23,14 @@ from slam.landmarks import LandmarkRows
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.last_files import LastFiles
-from slam.run.outputs import STAGES, RunFiles
+from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
+from slam.run.repeat import portable, versions
 from slam.run.replay import RecordedFrame, Recording, replay
+from slam.run.schema import STAGES, schema
+from slam.run.settings_reference import in_force
 from slam.sequences import Sequence
 from slam.system import StereoSlam
-
-_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 #: Frames whose pose was measured; accuracy is that of these alone.
 _MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
@@ -56,6 +55,7 @@ class RunOptions:
         save_map: file for the map at the end; None for none.
         mono: use the left images alone.
         overlap: read and extract the next frame while the present one is estimated; the results are the same.
+        origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
     """
 
     backend: str
@@ -69,6 +69,7 @@ class RunOptions:
     save_map: Path | None = None
     mono: bool = False
     overlap: bool = True
+    origin: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -195,6 +196,8 @@ def _drive(
     ended, stopped_by = "completed", None
     with RunFiles(options.out) as files:
         files.write_json("config.json", _config_tree(sequence, options, system))
+        with last.each():
+            files.write_json("schema.json", schema(options.config, getattr(system, "frontend", None), system.backend))
         try:
             for number, result in results:
                 record.add(number, result)
@@ -331,6 +334,10 @@ def _finish(
             final = system.trajectory()
             files.write_trajectory(final)
         with last.each():
+            truth = true_path(record.trajectory, sequence)
+            if truth is not None:
+                files.write_truth(truth)
+        with last.each():
             files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
         with last.each():
             summary.update(_results(sequence, system, record, final, score))
@@ -388,28 +395,18 @@ def _timings(record: RunRecord) -> dict[str, Any]:
 
 def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed) -> dict[str, Any]:
     """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-    parts = {"frontend": getattr(system, "frontend", None), "backend": system.backend}
-    in_force = {name: getattr(part, "config", None) for name, part in parts.items()}
+    parts = {"frontend": in_force(getattr(system, "frontend", None)), "backend": in_force(system.backend)}
     return {
+        **options.origin,
         "sequence": sequence.name,
         "format": sequence.format,
         "frontend": options.frontend,
         "backend": options.backend,
         "frames": [options.start, options.stop],
-        "settings": options.config.to_json(),
-        "in_force": {name: asdict(c) for name, c in in_force.items() if is_dataclass(c) and not isinstance(c, type)},
+        "settings": portable(options.config.to_json()),
+        "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
+        "versions": versions(),
     }
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that shape a result."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:

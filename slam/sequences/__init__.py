@@ -15,6 +15,7 @@ from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, reason
+from slam.naming import suggestion, unknown
 from slam.sequences.base import RecordedSequence, Sequence
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "open_sequence"]
@@ -70,7 +71,7 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 def _open_folder(text: str, format: str | None) -> RecordedSequence:
     """A sequence on disk."""
     folder, options = _split(text)
-    _require_folder(folder)
+    _require_folder(folder, text)
     name = _detect(folder, options) if format is None else _known(format)
     module = import_module(_FORMATS[name][0])
     _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
@@ -108,13 +109,22 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _require_folder(folder: Path) -> None:
+def _require_folder(folder: Path, text: str) -> None:
+    """Refuse what is no folder with something in it; `text` is what was asked for."""
     if not folder.exists():
-        raise SequenceError(f"{folder}: there is no such folder")
+        raise SequenceError(f"{folder}: there is no such folder{_world_meant(text)}")
     if not folder.is_dir():
         raise SequenceError(f"{folder}: a file where the sequence's folder should be")
     if not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
+
+
+def _world_meant(text: str) -> str:
+    """A suggestion where the text names a synthetic world, ``synthetic:`` left out; else empty."""
+    from slam import worlds
+
+    name, mark, query = text.partition("?")
+    return f" (did you mean {_SYNTHETIC}{name}{mark}{query}?)" if name in worlds.names() else ""
 
 
 def _detect(folder: Path, options: dict[str, str]) -> str:
@@ -148,15 +158,16 @@ def _format_of(folder: Path) -> str | None:
 
 def _known(format: str) -> str:
     if format not in _FORMATS:
-        raise UnknownNameError(f"unknown format {format!r}; known: {', '.join(formats())}")
+        raise UnknownNameError(unknown("format", format, formats()))
     return format
 
 
 def _check_options(name: str, options: dict[str, str], own: frozenset[str]) -> None:
     """Refuse unknown options, and kinds of motion that do not exist."""
     known = own | _COMMON_OPTIONS
-    unknown = sorted(set(options) - known)
-    if unknown:
-        raise ConfigurationError(f"unknown option {unknown[0]!r} of format {name}; known: {', '.join(sorted(known))}")
+    strange = sorted(set(options) - known)
+    if strange:
+        hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"
+        raise ConfigurationError(f"unknown option {strange[0]!r} of format {name}{hint}")
     if options.get("kind", _KINDS[0]) not in _KINDS:
-        raise ConfigurationError(f"unknown kind of motion {options['kind']!r}; known: {', '.join(_KINDS)}")
+        raise ConfigurationError(unknown("kind of motion", options["kind"], _KINDS))

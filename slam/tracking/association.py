@@ -47,7 +47,7 @@ class AssociationConfig:
         window_sizes: half sizes of fixed windows, smallest first [px].
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
-        wide_d_match, wide_ratio: the same for matching against the whole map without windows.
+        wide_d_match, wide_ratio: as `d_match` and `ratio`, for matching against the whole map without windows.
         wide_share: where nothing was recognised in the last frame, a pose found by matching against the whole map must
             show again at least this share of the landmarks (or of the features, if fewer) in view from there.
         minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
@@ -59,14 +59,15 @@ class AssociationConfig:
         max_jump, lost_jump: landmarks that agree on a pose further than this from the prediction, in its standard
             deviations, are not believed at once: while landmarks are recognised in every frame, and after frames in
             which none was. The prediction allows for what the motion model knows; what is further off was carried.
-        kidnapped_after: where such poses agree with each other in so many successive frames, the camera was kidnapped
-            (moved while it saw nothing), and a new back end starts at that place in the map.
-        view_angle, view_ratio: landmarks are looked for where the line of sight has turned by no more than this since
-            they were first seen [degrees], and where the distance has not changed by more than this factor: beyond,
-            what is found is not the same point any more. 180 and a large factor for never mind.
-        rematch_after: those that were outside of the image for so many frames are looked for from wherever: what they
-            tell about the drift meanwhile is worth more than what the point may have slid. Found, they count as first
-            seen from there.
+        kidnapped_after: where poses beyond `max_jump` or `lost_jump` agree with each other in so many successive
+            frames, the camera was kidnapped (moved while it saw nothing), and a new back end starts at that place in
+            the map.
+        view_angle: landmarks are looked for where the line of sight has turned by no more than this since they were
+            first seen [degrees]: beyond, what is found is not the same point any more. 180 for any angle.
+        view_ratio: the same for the distance, which may have changed by no more than this factor.
+        rematch_after: landmarks that were outside of the image for so many frames are looked for from any view angle
+            and ratio: what they tell about the drift meanwhile is worth more than what the point may have slid. Found,
+            they count as first seen from there.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
     """
 

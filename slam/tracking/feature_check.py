@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.checks import LATEST_STAMP
 from slam.data import StereoFeatures
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
@@ -42,8 +43,8 @@ def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, aft
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
     stamp = _number("stamp", features.stamp)
-    if not np.isfinite(stamp):
-        raise MeasurementError(f"features: the stamp must be finite, got {stamp}")
+    if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP:
+        raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
     if stamp <= after:
         raise MeasurementError(
             f"features: the stamp {stamp} s is not later than {after} s, the last frame's (a frame whose step was "

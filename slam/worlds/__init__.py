@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from slam.errors import UnknownNameError
+from slam.naming import unknown
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
 from slam.worlds.sequence import WorldSequence
 from slam.worlds.world import World
@@ -68,7 +69,7 @@ def describe(name: str) -> str:
 def _scene(name: str) -> ModuleType:
     """The module of a world."""
     if name not in _NAMES:
-        raise UnknownNameError(f"unknown world {name!r}; known: {', '.join(_NAMES)}")
+        raise UnknownNameError(unknown("world", name, _NAMES))
     return import_module(f"slam.worlds.scenes.{name}")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from slam.errors import ConfigurationError
+from slam.naming import suggestion
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def parse_query(world: str, query: str, table: Mapping[str, Option]) -> dict[str
         key, _, text = part.partition("=")
         key, text = unquote(key), unquote(text)
         if key not in table:
-            raise ConfigurationError(f"world {world!r} has no option {key!r}; known: {', '.join(sorted(table))}")
+            known = f"{suggestion(key, table)}; known: {', '.join(sorted(table))}"
+            raise ConfigurationError(f"world {world!r} has no option {key!r}{known}")
         if key in given:
             raise ConfigurationError(f"world {world!r}: option {key!r} is given twice")
         given.add(key)

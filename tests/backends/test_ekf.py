@@ -66,7 +66,10 @@ def drive() -> Scene:
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"iteration": 3}, "unknown option 'iteration'; known: measurement, iterations, landmarks, consistent"),
+        (
+            {"iteration": 3},
+            r"unknown option 'iteration' \(did you mean 'iterations'\?\); known: measurement, iterations",
+        ),
         ({"measurement": "mono"}, "measurement"),
         ({"landmarks": "polar"}, "landmarks"),
         ({"iterations": 0}, "iterations"),

@@ -70,7 +70,7 @@ def _temporary() -> str:
 
 @lru_cache(maxsize=1)
 def _map() -> SavedMap:
-    return SavedMap.of(_run()[0])
+    return _run()[0].snapshot()
 
 
 def read_map(rng: np.random.Generator, folder: Path) -> None:
@@ -94,7 +94,7 @@ def read_map(rng: np.random.Generator, folder: Path) -> None:
     system = StereoSlam(rig, None, choose(rng, _BACKENDS), known_map=decode(signed, "a.map"))
     for features in frames[:3]:
         system.process_features(features)
-    SavedMap.of(system)
+    system.snapshot()
 
 
 def large_map(rng: np.random.Generator, folder: Path) -> None:

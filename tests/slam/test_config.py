@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
@@ -34,7 +35,7 @@ def test_json_and_back(kind):
     ("setting", "message"),
     [
         ("map.max=3", "unknown key 'max'; known: target_in_view"),
-        ("maps.max_landmarks=3", "unknown section 'maps'; known: models"),
+        ("maps.max_landmarks=3", "unknown section 'maps' (did you mean 'map.max_landmarks'?); known: models"),
         ("max_landmarks=3", "unknown key"),
         ("map.max_landmarks", "not of the form"),
         ("models.pixel_sigma=abc", "models.pixel_sigma"),
@@ -49,7 +50,7 @@ def test_json_and_back(kind):
     ],
 )
 def test_bad_settings(setting, message):
-    with pytest.raises(ConfigurationError, match=message.replace("[", r"\[")):
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
         SystemConfig.for_kind("handheld").with_settings([setting])
 
 

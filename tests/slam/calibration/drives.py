@@ -56,7 +56,8 @@ class Street:
         left[wrong] += rng.normal(0, 5, (wrong.sum(), 2))
         ones = np.ones(n)
         return StereoFeatures(
-            stamp, rectified_rig.unrectify_left(left), rectified_rig.unrectify_right(right), ones, ones, ones, np.ones(n, np.int8),
+            stamp, rectified_rig.unrectify_left(left), rectified_rig.unrectify_right(right), ones, ones, ones,
+            np.ones(n, np.int8),
             self.descriptors[ids],
         )  # fmt: skip
 

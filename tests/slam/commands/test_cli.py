@@ -122,6 +122,10 @@ def test_unknown_world(slam_command, tmp_path):
     fails_with_one_line(slam_command("run", "synthetic:moon", "--out", tmp_path / "out"), "moon", "aisle")
 
 
+def test_a_world_without_its_mark(slam_command, tmp_path):
+    fails_with_one_line(slam_command("run", "aisle", "--out", tmp_path / "out"), "did you mean synthetic:aisle?")
+
+
 def test_a_format_of_folders_does_not_go_with_a_world(slam_command, tmp_path):
     done = slam_command("run", "synthetic:desk?frames=2", "--format", "kitti", "--out", tmp_path / "out")
     fails_with_one_line(done, "synthetic:desk?frames=2", "'kitti'")

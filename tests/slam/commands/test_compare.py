@@ -28,6 +28,7 @@ def test_the_command_leaves_report_and_tables_and_says_what_follows(slam_command
         (["synthetic:aisle", "--backends", "ekf,nothing"], "nothing"),
         (["synthetic:aisle?seed=1"], "seed"),
         (["synthetic:aisle", "--variant", "a:surf:b"], "form"),
+        (["synthetic:aisle", "--variant", "x"], "variant 'x' names no front end and no setting"),
     ],
 )
 def test_bad_input_is_one_line(slam_command, tmp_path, arguments, word):

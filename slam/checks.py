@@ -1,0 +1,44 @@
+"""Checks of what callers give to a back end, the same for all: times, poses, pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.errors import MeasurementError
+from slam.geometry.arrays import Array
+
+#: Farthest pixel from the origin [px] and latest stamp from zero [s] that are taken for a measurement.
+FARTHEST_PIXEL, LATEST_STAMP = 1e6, 1e12
+
+
+def require_stamp(owner: str, stamp: float, last: float | None) -> None:
+    """Check the time to which a back end is to be advanced.
+
+    Args:
+        owner: the back end's name, for the message.
+        stamp: the new time [s].
+        last: the time before it [s]; None for the first.
+
+    Raises:
+        MeasurementError: it is not finite, not later than the last one, or beyond `LATEST_STAMP`.
+    """
+    if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP or (last is not None and stamp <= last):
+        after = "" if last is None else f" after {last}"
+        raise MeasurementError(
+            f"{owner}: stamp {stamp}{after}: time must be finite, increase, and lie within {LATEST_STAMP:g} s"
+        )
+
+
+def require_guess(owner: str, guess: Array | None) -> None:
+    """Check a guess of the camera's pose.
+
+    Raises:
+        MeasurementError: it is no rigid motion (4, 4).
+    """
+    if guess is None:
+        return
+    if np.shape(guess) != (4, 4) or not np.isfinite(guess).all():
+        raise MeasurementError(f"{owner}: the guess must be a finite pose (4, 4), got an array of {np.shape(guess)}")
+    R = guess[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise MeasurementError(f"{owner}: the guess must be a pose: its rotation is none")

@@ -1,0 +1,75 @@
+"""Arguments and options of the command line that several commands share, or that are long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slam.commands import completion
+
+SequenceArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SEQUENCE",
+        help="A folder, or synthetic:NAME?key=value.",
+        show_default=False,
+        autocompletion=completion.sequences,
+    ),
+]
+OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the files.")]
+RunOutOption = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", metavar="DIR", help="Folder for the files; default: results/SEQUENCE-BACKEND-N."),
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the files of a run in the folder.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.",
+        autocompletion=completion.settings,
+    ),
+]
+BackendOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf.", autocompletion=completion.backends),
+]
+FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames, B left out.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")]
+PictureOption = Annotated[bool, typer.Option("--picture/--no-picture", help="Leave a picture of the run.")]
+
+
+OptionalSequence = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="SEQUENCE",
+        help="A folder, or synthetic:NAME?key=value; with --config the earlier one.",
+        show_default=False,
+        autocompletion=completion.sequences,
+    ),
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="config.json of an earlier run, to repeat it; other options change it."),
+]
+FrontendOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME", help="Front end, see `slam list`; default: surf.", autocompletion=completion.frontends
+    ),
+]
+KindOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND", help="handheld or driving; default: the sequence's own.", autocompletion=completion.kinds
+    ),
+]
+FormatOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FORMAT", help="Format; default: found out from the folder.", autocompletion=completion.formats
+    ),
+]

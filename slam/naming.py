@@ -1,0 +1,31 @@
+"""Names that are not known: the nearest known ones, for error messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+_LIKE = 0.6  # least similarity of a suggestion, from 0 to 1
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The most similar known name as `` (did you mean 'x'?)``; empty where none is similar.
+
+    >>> suggestion("smother", ["batch", "ekf", "smoother"])
+    " (did you mean 'smoother'?)"
+    >>> suggestion("kalman", ["batch", "ekf", "smoother"])
+    ''
+    """
+    by_case = {other.lower(): other for other in known}
+    near = get_close_matches(name.lower(), by_case, 1, _LIKE)
+    return f" (did you mean {by_case[near[0]]!r}?)" if near else ""
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> str:
+    """The line for a name that is not known: the nearest known name, and all of them.
+
+    >>> unknown("back end", "efk", ["ekf", "smoother"])
+    "unknown back end 'efk' (did you mean 'ekf'?); known: ekf, smoother"
+    """
+    names = list(known)
+    return f"unknown {what} {name!r}{suggestion(name, names)}; known: {', '.join(names)}"

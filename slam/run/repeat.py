@@ -1,0 +1,179 @@
+"""What it takes to repeat a run: written into its ``config.json``, and read from it by ``slam run --config``."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from slam.config import SystemConfig
+from slam.errors import SlamError
+
+CONFIG = "config.json"
+_SYNTHETIC = "synthetic:"
+_PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a command line says of a run besides names and settings.
+
+    Attributes:
+        command: the command line.
+        sequence: as `slam.open_sequence` takes it.
+        format: of the sequence; None for found out.
+        kind: kind of motion that the defaults are for.
+        known_map: file of the map that it starts in; None for none.
+        mono: whether the left images are used alone.
+    """
+
+    command: str
+    sequence: str
+    format: str | None
+    kind: str
+    known_map: Path | None = None
+    mono: bool = False
+
+    def to_json(self, folder: Path) -> dict[str, Any]:
+        """The tree for the ``config.json`` of a run in `folder`: files by absolute and by relative path."""
+        return {
+            "command": self.command,
+            "source": {"format": self.format, **_places(self.sequence, folder, self.format == "synthetic")},
+            "kind": self.kind,
+            "mono": self.mono,
+            "known_map": None if self.known_map is None else _places(str(self.known_map), folder),
+        }
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """A run as its ``config.json`` describes it.
+
+    Attributes:
+        origin: the sequence is where it is found now; empty where it is not known.
+        frontend, backend: names.
+        config: all settings.
+        start, stop: range of frames.
+        versions: of the packages that it was made with.
+    """
+
+    origin: Origin
+    frontend: str
+    backend: str
+    config: SystemConfig
+    start: int
+    stop: int | None
+    versions: Mapping[str, str]
+
+
+def load(path: Path, sequence: str | None = None, known_map: Path | None = None) -> Repeat:
+    """Read the ``config.json`` of a run.
+
+    Args:
+        path: the file, or the run's folder.
+        sequence: taken in place of the run's own.
+        known_map: taken in place of the run's own.
+
+    Raises:
+        SlamError: it cannot be read, is none of a run of a sequence, or its sequence or map is not found any more.
+        ConfigurationError: its settings are not those of this version.
+    """
+    file = path / CONFIG if path.is_dir() else path
+    try:
+        tree = _restored(json.loads(file.read_text(encoding="utf-8")))
+        if str(tree.get("command", "")).startswith("slam replay"):
+            raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
+        source, known = tree.get("source") or {}, tree.get("known_map")
+        start, stop = tree["frames"]
+        origin = Origin(
+            str(tree.get("command", "")),
+            sequence or (_found(source, file) if source else ""),
+            source.get("format"),
+            str(tree.get("kind", "handheld")),
+            known_map or (Path(_found(known, file)) if known else None),
+            bool(tree.get("mono", False)),
+        )
+        config = SystemConfig.from_json(tree["settings"])
+        names = str(tree["frontend"]), str(tree["backend"])
+        return Repeat(origin, *names, config, int(start), stop, dict(tree.get("versions", {})))
+    except OSError as error:
+        raise SlamError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that shape a result."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def changed_versions(then: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """What differs between two sets of versions, in words; empty where nothing does."""
+    differing = [f"{name} {old}, now {now.get(name)}" for name, old in then.items() if now.get(name) != old]
+    return "; ".join(differing)
+
+
+def portable(tree: Any) -> Any:
+    """The tree with infinite numbers, which JSON does not have, as ``"Infinity"`` and ``"-Infinity"``."""
+    if isinstance(tree, Mapping):
+        return {key: portable(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [portable(value) for value in tree]
+    if isinstance(tree, float) and math.isinf(tree):
+        return "Infinity" if tree > 0 else "-Infinity"
+    return tree
+
+
+def _restored(tree: Any) -> Any:
+    """The inverse of `portable`."""
+    if isinstance(tree, dict):
+        return {key: _restored(value) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [_restored(value) for value in tree]
+    return float(tree) if tree in ("Infinity", "-Infinity") else tree
+
+
+def _places(text: str, folder: Path, synthetic: bool = False) -> dict[str, str]:
+    """Where a file is, options behind it included: as it was given, absolute, and as seen from `folder`."""
+    if synthetic or text.startswith(_SYNTHETIC):
+        return {"given": text}
+    name, mark, query = text.rpartition("?")
+    if not mark or Path(text).expanduser().exists():
+        name, mark, query = text, "", ""
+    absolute = Path(os.path.abspath(Path(name).expanduser()))  # noqa: PTH100 without following links
+    found = {"given": text, "absolute": f"{absolute}{mark}{query}"}
+    try:
+        relative = os.path.relpath(absolute, os.path.abspath(folder))  # noqa: PTH100
+    except ValueError:  # another drive
+        return found
+    return {**found, "relative": f"{Path(relative).as_posix()}{mark}{query}"}
+
+
+def _found(places: Mapping[str, str], file: Path) -> str:
+    """The first place of a file that exists: the absolute one, then the one relative to ``config.json``.
+
+    Raises:
+        SlamError: it is at neither.
+    """
+    if "absolute" not in places:
+        return str(places["given"])
+    candidates = [places["absolute"]]
+    if "relative" in places:
+        candidates.append(os.path.normpath(file.parent.absolute() / places["relative"]))
+    for text in candidates:
+        if Path(text).exists() or ("?" in text and Path(text.rpartition("?")[0]).exists()):
+            return text
+    where = " nor ".join(dict.fromkeys(candidates))
+    raise SlamError(f"{file}: {places['given']} is no longer at {where}: give its new place beside --config")

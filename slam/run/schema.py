@@ -1,0 +1,168 @@
+"""What the files of a run hold: every column with its unit, frame and meaning. Headers are taken from here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from slam.config import SystemConfig
+from slam.run.settings_reference import descriptions
+
+#: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
+STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage")
+
+#: Frames of coordinates.
+FRAMES = {
+    "world": "the left camera's axes in the first frame, x right, y down, z forward; in a known map, the map's world",
+    "body": "fixed to a moving body; when it is found the axes are the world's, the origin is the mean of its points",
+}
+
+#: Components of a covariance of six, in their order.
+TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of one kind.
+
+    Attributes:
+        names: in their order.
+        unit: of all of them; empty for counts, words and ratios.
+        text: what they hold, in which frame.
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    text: str
+
+
+def _upper(prefix: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of a symmetric matrix's upper triangle, row by row."""
+    return tuple(f"{prefix}{a}{b}" for i, a in enumerate(names) for b in names[i:])
+
+
+_SIX = tuple("012345")
+
+_POSE = (
+    Columns(("stamp",), "s", "time of the frame"),
+    Columns(("x", "y", "z"), "m", "position of the left camera in the world"),
+    Columns(("qx", "qy", "qz", "qw"), "", "unit quaternion that turns camera coordinates to world coordinates"),
+)
+
+FRAME_TABLE = (
+    Columns(("frame",), "", "number of the frame in the sequence"),
+    Columns(("stamp",), "s", "time of the frame"),
+    Columns(("status", "reason"), "", "started, tracked, predicted, lost or failed; and why, where it is not tracked"),
+    Columns(("features", "stereo"), "", "number of features in the left image; of those matched in the right image"),
+    Columns(("predicted", "matched"), "", "number of landmarks predicted to be in view; of those matched to a feature"),
+    Columns(("used", "rejected"), "", "number of matches that the back end used; that it rejected"),
+    Columns(("added", "erased", "map_size"), "", "number of landmarks added; erased; in the map after the frame"),
+    Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
+    Columns(
+        ("nis", "nis_dof"), "", "normalised innovation squared of the measurements used, and its degrees of freedom"
+    ),
+    Columns(("sd_x", "sd_y", "sd_z"), "m", "standard deviations of the position, along the axes of the world"),
+    Columns(("sd_rotation",), "rad", "standard deviation of the orientation, all three axes together"),
+    Columns(tuple(f"ms_{stage}" for stage in STAGES), "ms", "wall time of each stage"),
+)
+
+LANDMARK_TABLE = (
+    Columns(("id",), "", "of the landmark"),
+    Columns(("x", "y", "z"), "m", "position in the world"),
+    Columns(_upper("c", ("x", "y", "z")), "m²", "covariance of the position, upper triangle row by row"),
+    Columns(("seen", "last_seen"), "", "number of frames it was measured in; the last of them, empty for none"),
+)
+
+OBJECT_TABLE = (
+    Columns(("frame",), "", "number of the frame in the sequence"),
+    Columns(("stamp",), "s", "time of the frame"),
+    Columns(("id",), "", "of the body; it keeps it through stops and occlusions"),
+    Columns(
+        ("moving", "measured"), "", "1 where the body moves now, else 0; 1 where it was measured in this frame, else 0"
+    ),
+    Columns(("x", "y", "z"), "m", "position of the body's origin in the world"),
+    Columns(("roll", "pitch", "yaw"), "rad", "orientation, from body to world axes: R = Rz(yaw) Ry(pitch) Rx(roll)"),
+    Columns(("vx", "vy", "vz"), "m/s", "velocity of the body's origin, along the axes of the world"),
+    Columns(("wx", "wy", "wz"), "rad/s", "angular velocity, along the axes of the world"),
+    Columns(
+        ("motion_x", "motion_y", "motion_z"),
+        "m",
+        "motion since the frame before: a point of the body went from p to R p + t in the world; this is t",
+    ),
+    Columns(("motion_roll", "motion_pitch", "motion_yaw"), "rad", "R of that motion"),
+    Columns(
+        _upper("c", _SIX),
+        "rad², rad·m, m²",
+        "covariance of the pose, upper triangle row by row: 0 to 2 rotation about x, y, z, 3 to 5 translation along "
+        "x, y, z, both in body axes, perturbing the pose on the right",
+    ),
+)
+
+#: Files that are tables, with their columns.
+TABLES: dict[str, tuple[Columns, ...]] = {
+    "trajectory.txt": _POSE,
+    "trajectory_final.txt": _POSE,
+    "truth.txt": _POSE,
+    "frames.csv": FRAME_TABLE,
+    "landmarks.csv": LANDMARK_TABLE,
+    "objects.csv": OBJECT_TABLE,
+}
+
+#: Files of a run, with what each is for.
+FILES = {
+    "trajectory.txt": "the online path, as estimated frame by frame; columns apart by spaces (TUM)",
+    "trajectory_final.txt": "the path as the back end sees it at the end: a smoother revises the past, a filter not",
+    "truth.txt": "the true path at the same stamps, in its own world, where the sequence has one",
+    "frames.csv": "a row per frame",
+    "landmarks.csv": "a row per landmark of the map at the end",
+    "objects.csv": "a row per frame and moving body",
+    "summary.json": "counts, accuracy and consistency where the truth is known, timings; written last",
+    "config.json": "what was run, with all settings; `slam run --config` repeats it",
+    "schema.json": "columns and settings with units and meanings",
+    "summary.png": "a picture of the run",
+}
+
+
+def header(table: tuple[Columns, ...]) -> tuple[str, ...]:
+    """Names of all columns of a table."""
+    return tuple(name for columns in table for name in columns.names)
+
+
+def schema(config: SystemConfig, frontend: object, backend: object) -> dict[str, Any]:
+    """The contents of ``schema.json`` for a run with these settings, front end and back end."""
+    settings = descriptions(config, "")
+    for section, part in (("frontend", frontend), ("backend", backend)):
+        settings |= descriptions(getattr(part, "config", None), section)
+    files = {name: {"meaning": text} | _columns(name) for name, text in FILES.items()}
+    return {"files": files, "frames": FRAMES, "settings": settings}
+
+
+def _columns(name: str) -> dict[str, Any]:
+    """The columns of a table, one by one; nothing for other files."""
+    if name not in TABLES:
+        return {}
+    every = [(column, columns) for columns in TABLES[name] for column in columns.names]
+    return {"columns": [{"name": column, **_described(column, columns)} for column, columns in every]}
+
+
+def _described(name: str, columns: Columns) -> dict[str, str]:
+    """Unit and meaning of one column; of a covariance of a body's pose, its very components."""
+    if name[0] == "c" and name[1:].isdigit():
+        row, column = (int(digit) for digit in name[1:])
+        unit = ("rad²", "rad·m", "m²")[(row > 2) + (column > 2)]
+        text = f"covariance of {TWIST[row]} and {TWIST[column]} of the pose, r rotation and t translation, body axes"
+        return {"unit": unit, "meaning": text}
+    return {"unit": columns.unit, "meaning": columns.text}
+
+
+def markdown(table: tuple[Columns, ...]) -> list[str]:
+    """The rows of a table in Markdown, for ``docs/files.md``."""
+    rows = [f"| {_spelled(c.names)} | {c.unit or '–'} | {c.text} |" for c in table]
+    return ["| column | unit | holds |", "| --- | --- | --- |", *rows]
+
+
+def _spelled(names: tuple[str, ...]) -> str:
+    """Names of columns; of many the first and the last."""
+    return (
+        ", ".join(f"`{name}`" for name in names) if len(names) <= 8 else f"`{names[0]}`, `{names[1]}` … `{names[-1]}`"
+    )

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from typer.testing import CliRunner
+
+from slam.commands.cli import app
+from slam.errors import SlamError
+from slam.run.repeat import changed_versions, load, portable
+
+WORLD = "synthetic:aisle?frames=6&width=160&height=120"
+SAME = ("trajectory.txt", "trajectory_final.txt", "landmarks.csv", "objects.csv", "truth.txt", "schema.json")
+
+
+def slam(*words):
+    """The command in this process; an error of its own is raised."""
+    done = CliRunner().invoke(app, [*map(str, words)])
+    if isinstance(done.exception, SlamError):
+        raise done.exception
+    assert done.exit_code == 0, (done.output, done.exception)
+    return done.output
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A tiny recording on disk."""
+    folder = tmp_path_factory.mktemp("recordings")
+    slam("render", WORLD, "--out", folder / "rendered", "--no-truth-images", "-q")
+    return folder / "rendered"
+
+
+def test_a_run_is_repeated_byte_for_byte(here):
+    settings = ["--set", "map.max_landmarks=300", "--set", "frontend.max_depth=Infinity"]
+    slam("run", WORLD, "--frames", "1:5", *settings, "--out", "first", "-q", "--no-picture")
+    slam("run", "--config", "first/config.json", "--out", "again", "-q", "--no-picture")
+    for name in SAME:
+        assert (here / "first" / name).read_bytes() == (here / "again" / name).read_bytes(), name
+    one, other = (json.loads((here / folder / "config.json").read_text()) for folder in ("first", "again"))
+    assert one["command"].startswith("slam")
+    assert {**one, "command": ""} == {**other, "command": ""}
+    assert one["settings"]["frontend"]["max_depth"] == "Infinity"  # JSON has no number for it
+
+
+def test_what_is_said_beside_the_config_holds(here):
+    slam("run", WORLD, "--frames", "0:3", "--set", "map.max_landmarks=301", "--out", "first", "-q", "--no-picture")
+    words = ["--backend", "smoother", "--frames", "1:3", "--set", "map.confirmed=4"]
+    slam("run", "--config", "first", *words, "--out", "other", "-q", "--no-picture")
+    tree = json.loads((here / "other" / "config.json").read_text())
+    assert (tree["backend"], tree["frames"]) == ("smoother", [1, 3])
+    assert (tree["settings"]["map"]["max_landmarks"], tree["settings"]["map"]["confirmed"]) == (301, 4)
+    assert tree["settings"]["backend"] == {}
+
+
+def test_a_recording_is_found_by_its_absolute_and_by_its_relative_path(here, recording):
+    shutil.copytree(recording, here / "data")
+    slam("run", "data?kind=driving", "--frames", "0:2", "--out", "out/run", "-q", "--no-picture")
+    source = json.loads((here / "out/run/config.json").read_text())["source"]
+    assert source["relative"] == "../../data?kind=driving"
+    assert source["absolute"] == f"{here / 'data'}?kind=driving"
+    assert load(here / "out/run/config.json").origin.sequence == f"{here / 'data'}?kind=driving"
+    (here / "moved").mkdir()
+    for name in ("data", "out"):
+        (here / name).rename(here / "moved" / name)
+    found = load(here / "moved/out/run")
+    assert found.origin.sequence == f"{here / 'moved/data'}?kind=driving"
+    assert found.origin.kind == "driving"
+    (here / "moved/data").rename(here / "elsewhere")
+    with pytest.raises(SlamError, match=r"data\?kind=driving is no longer at .*data.* nor .*moved/data"):
+        slam("run", "--config", "moved/out/run")
+    slam("run", "elsewhere", "--config", "moved/out/run", "--out", "third", "-q", "--no-picture")
+    assert load(here / "third").config == found.config
+
+
+def test_a_known_map_is_found_again(here):
+    slam("run", WORLD, "--save-map", "desk.map", "--out", "first", "-q", "--no-picture")
+    slam("run", WORLD, "--map", "desk.map", "--mono", "--frames", "0:3", "--out", "second", "-q", "--no-picture")
+    before = load(here / "second")
+    assert before.origin.mono
+    assert before.origin.known_map == here / "desk.map"
+    assert before.config.map.monocular
+    slam("run", "--config", "second", "--out", "third", "-q", "--no-picture")
+    assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "not the config.json"),
+        ("{}", "not the config.json"),
+        ("[]", "not the config.json"),
+        ('{"frames": [0, null], "settings": {"colour": 1}, "frontend": "surf", "backend": "ekf"}', "colour"),
+        ('{"command": "slam replay a.npz"}', "that of a replay; repeat it with: slam replay a.npz"),
+    ],
+)
+def test_a_bad_config_is_one_line(tmp_path, text, words):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(SlamError, match=words):
+        load(tmp_path)
+
+
+def test_no_config_and_no_sequence(tmp_path):
+    with pytest.raises(SlamError, match="cannot be read: No such file"):
+        load(tmp_path)
+    with pytest.raises(SlamError, match="name a sequence"):
+        slam("run")
+    with pytest.raises(SlamError, match="--kind does not go with --config"):
+        tree = {"frames": [0, None], "settings": {}, "frontend": "surf", "backend": "ekf"}
+        (tmp_path / "config.json").write_text(json.dumps(tree))
+        slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
+
+
+def test_other_versions_are_said():
+    assert changed_versions({"numpy": "1", "numba": "2"}, {"numpy": "1", "numba": "2"}) == ""
+    assert changed_versions({"numpy": "1", "numba": "2"}, {"numpy": "3", "numba": "2"}) == "numpy 1, now 3"
+
+
+def test_infinity_goes_through_json():
+    assert json.loads(json.dumps(portable({"a": (float("inf"), -float("inf"), 1.5)}))) == {
+        "a": ["Infinity", "-Infinity", 1.5]
+    }
+
+
+def test_runs_have_folders_of_their_own(here):
+    for _ in range(2):
+        slam("run", WORLD, "--frames", "0:2", "-q", "--no-picture")
+    assert {path.name for path in (here / "results").iterdir()} == {"aisle-ekf-1", "aisle-ekf-2"}
+    with pytest.raises(SlamError, match="70:80"):
+        slam("run", WORLD, "--frames", "70:80", "-q")
+    assert len(list((here / "results").iterdir())) == 2  # what was not begun leaves no folder
+
+
+def test_another_run_is_not_overwritten_without_being_told(here):
+    slam("run", WORLD, "--frames", "0:2", "--out", "mine", "-q", "--no-picture")
+    before = (here / "mine/config.json").read_bytes()
+    for words in (["run", WORLD, "--frames", "0:3"], ["run", "--config", "mine"]):
+        with pytest.raises(SlamError, match="mine: holds a run already; give another --out, or --overwrite"):
+            slam(*words, "--out", "mine", "-q")
+    assert (here / "mine/config.json").read_bytes() == before
+    slam("run", WORLD, "--frames", "0:3", "-o", "mine", "--overwrite", "-q", "--no-picture")
+    assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 3]
+
+
+def test_a_file_where_results_go(here):
+    (here / "results").write_text("")
+    with pytest.raises(SlamError, match="give --out"):
+        slam("run", WORLD, "-q")
+
+
+def test_a_replay_has_a_folder_of_its_own_and_says_how_to_repeat_it(here):
+    slam("run", WORLD, "--frames", "0:3", "--record", "tape.npz", "--out", "first", "-q", "--no-picture")
+    slam("replay", "tape.npz", "-q", "--no-picture")
+    (folder,) = (here / "results").iterdir()
+    assert folder.name == "aisle-ekf-1"
+    assert json.loads((folder / "schema.json").read_text())["settings"]["backend.iterations"]["meaning"]

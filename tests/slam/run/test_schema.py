@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.commands.cli import app
+from slam.config import SystemConfig
+from slam.geometry.euler import rotation
+from slam.geometry.se3 import pose
+from slam.object_data import MovingObject, ObjectEstimate
+from slam.run.outputs import RunFiles
+from slam.run.repeat import Origin
+from slam.run.runner import RunOptions, run
+from slam.run.schema import FILES, TABLES, TWIST, header, markdown
+from slam.sequences import open_sequence
+
+PAGE = Path(__file__).parents[3] / "docs" / "files.md"
+WORLD = "synthetic:aisle?frames=4&width=160&height=120"
+
+
+def body(id, seed):
+    """A moving body with a full covariance, all of its numbers different."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(6, 12))
+    T = pose(rotation(rng.normal(size=3) / 3), rng.normal(size=3))
+    none = np.zeros(0, np.int64)
+    e = ObjectEstimate(id, 0.1 * seed, T, A @ A.T, rng.normal(size=6), A @ A.T, bool(seed % 2), none, none)
+    return MovingObject(id, none, e, pose(rotation(rng.normal(size=3) / 9), rng.normal(size=3)), T, A[:2, :3], id == 1)
+
+
+BODIES = {2: (body(1, 1),), 3: (body(1, 2), body(4, 3))}
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The folder of a short run that is told of moving bodies, and its summary."""
+    out = tmp_path_factory.mktemp("run")
+    write = RunFiles.write_frame
+
+    def write_frame(files, number, result):
+        write(files, number, replace(result, objects=BODIES.get(number, ())))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFiles, "write_frame", write_frame)
+        origin = Origin("slam run", WORLD, None, "handheld").to_json(out)
+        options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), out, origin=origin)
+        return out, run(open_sequence(WORLD), options)
+
+
+def rows_of(path):
+    """A table's rows by column; the trajectories' columns stand in the schema alone."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".txt":
+        names = header(TABLES[path.name])
+        return [dict(zip(names, line.split(), strict=True)) for line in text.splitlines()]
+    return list(csv.DictReader(text.splitlines()))
+
+
+def test_the_schema_has_every_file_and_every_column(done):
+    out, _ = done
+    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))
+    assert set(schema["files"]) == set(FILES)
+    assert {path.name for path in out.iterdir()} == set(FILES) - {"summary.png"}  # that one is the command's
+    for name in TABLES:
+        columns = schema["files"][name]["columns"]
+        rows = rows_of(out / name)
+        assert rows, name
+        assert [column["name"] for column in columns] == list(rows[0])
+        assert all(column["meaning"] for column in columns)
+
+
+def test_the_schema_has_every_setting(done):
+    out, _ = done
+    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))["settings"]
+    config = json.loads((out / "config.json").read_text(encoding="utf-8"))
+
+    def leaves(tree, prefix):
+        for key, value in tree.items():
+            yield from leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+
+    assert set(leaves(config["settings"], "")) | set(leaves(config["in_force"], "")) == set(schema)
+    assert all(setting["meaning"] for setting in schema.values())
+    assert schema["map.separation"]["unit"] == "px"
+    assert schema["models.motion.acceleration"]["unit"] == "m/s / √s"
+
+
+def test_rows_of_objects_are_what_the_system_said(done):
+    out, _ = done
+    rows = [{name: float(value) for name, value in row.items()} for row in rows_of(out / "objects.csv")]
+    expected = [(number, thing) for number, things in BODIES.items() for thing in things]
+    assert len(rows) == len(expected)
+    for row, (number, thing) in zip(rows, expected):
+        e = thing.estimate
+        assert (row["frame"], row["id"], row["stamp"]) == (number, thing.id, pytest.approx(e.stamp))
+        assert (row["moving"], row["measured"]) == (thing.moving, e.measured)
+        assert [row[c] for c in ("wx", "wy", "wz", "vx", "vy", "vz")] == pytest.approx(list(e.velocity), rel=1e-6)
+        for T, names in (
+            (e.T_world_object, ("x", "y", "z", "roll", "pitch", "yaw")),
+            (thing.motion, tuple(f"motion_{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw"))),
+        ):
+            numbers = np.array([row[name] for name in names])
+            np.testing.assert_allclose(numbers[:3], T[:3, 3], rtol=1e-6)
+            np.testing.assert_allclose(rotation(numbers[3:]), T[:3, :3], atol=1e-7)
+        upper = [row[f"c{i}{j}"] for i in range(6) for j in range(i, 6)]
+        np.testing.assert_allclose(upper, e.covariance[np.triu_indices(6)], rtol=1e-6)
+
+
+def test_units_of_a_covariance_are_those_of_its_components(done):
+    out, _ = done
+    files = json.loads((out / "schema.json").read_text(encoding="utf-8"))["files"]
+    columns = {column["name"]: column for column in files["objects.csv"]["columns"]}
+    assert columns["c00"]["unit"] == columns["c12"]["unit"] == "rad²"
+    assert columns["c03"]["unit"] == "rad·m"
+    assert columns["c45"]["unit"] == "m²"
+    assert "rz and tx" in columns["c23"]["meaning"]
+    assert len(TWIST) == 6
+
+
+def test_the_page_has_the_columns_as_they_are():
+    text = PAGE.read_text(encoding="utf-8")
+    for name, table in TABLES.items():
+        assert f"`{name}`" in text
+        assert "\n".join(markdown(table)) in text, (
+            f"docs/files.md: the columns of {name} are not those of slam.run.schema"
+        )
+
+
+def test_the_page_has_every_file_and_every_key(done):
+    out, summary = done
+    text = PAGE.read_text(encoding="utf-8")
+    for name in FILES:
+        assert f"`{name}`" in text
+    config = json.loads((out / "config.json").read_text(encoding="utf-8"))
+    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))
+    for key in {*config, *summary, *schema}:
+        assert f"`{key}`" in text, f"docs/files.md does not name {key}"
+
+
+def test_the_page_names_commands_that_exist():
+    names = {command.name for command in app.registered_commands}
+    assert {"run", "plot", "settings"} <= names

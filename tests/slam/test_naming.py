@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import pytest
+
+from slam import registry
+from slam.commands.compare import variants_of
+from slam.config import SystemConfig
+from slam.errors import SlamError
+from slam.naming import suggestion
+from slam.sequences import open_sequence
+
+
+def test_only_a_similar_name_is_suggested():
+    assert suggestion("Smother", ["batch", "smoother"]) == " (did you mean 'smoother'?)"
+    assert suggestion("kalman", ["batch", "ekf", "smoother"]) == ""
+    assert suggestion("x", []) == ""
+
+
+@pytest.mark.parametrize(
+    ("sequence", "meant"),
+    [
+        ("synthetic:asle", "'aisle'"),
+        ("synthetic:aisle?frmes=3", "'frames'"),
+        ("aisle", "synthetic:aisle?"),
+        ("aisle?frames=3", "synthetic:aisle?frames=3?"),
+    ],
+)
+def test_a_world_is_suggested(sequence, meant):
+    with pytest.raises(SlamError, match=r"did you mean") as raised:
+        open_sequence(sequence)
+    assert f"did you mean {meant}" in str(raised.value)
+
+
+def test_a_missing_folder_is_no_world():
+    with pytest.raises(SlamError) as raised:
+        open_sequence("ailse")
+    assert "did you mean" not in str(raised.value)
+
+
+def test_a_format_is_suggested(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SlamError, match="did you mean 'euroc'"):
+        open_sequence(tmp_path, format="eurok")
+
+
+def test_a_back_end_is_suggested():
+    with pytest.raises(SlamError, match=r"unknown back end 'smother' \(did you mean 'smoother'\?\); known: batch"):
+        registry.resolve("backends", "smother")
+
+
+@pytest.mark.parametrize(
+    ("setting", "meant"),
+    [
+        ("map.max_landmark=3", "'max_landmarks'"),
+        ("mpa.grid=3", "'map.grid'"),
+        ("mapp.gird=3", "'map'"),
+        ("max_landmarks=3", "'map.max_landmarks'"),
+        ("map.pixel_sigma=3", "'models.pixel_sigma' or 'self_calibration.pixel_sigma'"),
+    ],
+)
+def test_a_setting_is_suggested(setting, meant):
+    with pytest.raises(SlamError) as raised:
+        SystemConfig().with_settings([setting])
+    assert f"did you mean {meant}?" in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["x", "x:", "surf"])
+def test_a_variant_that_varies_nothing_is_refused(text):
+    with pytest.raises(SlamError, match=f"variant '{text}' names no front end and no setting"):
+        variants_of([], [text], [])
