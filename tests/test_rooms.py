@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},
     "system": {"objects", "mapping", "tracking", "calibration", "data", "geometry", "runtime"},
-    "run": {"system", "objects", "mapping", "tracking", "sequences", "worlds", "evaluation", "data", "geometry"},
+    "run": {"system", "calibration", "objects", "mapping", "tracking", "sequences", "worlds", "evaluation", "data", "geometry"},
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
     "testing": {"system", "worlds", "data", "geometry"},
     "commands": {"compare", "run", "system", "sequences", "worlds", "evaluation", "data", "geometry"},
