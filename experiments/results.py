@@ -5,8 +5,9 @@
 
 Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of the
 page, and the pictures that it leaves are copied beside the page. A script that fails is said on the page, and the exit
-status is 1; the others run all the same. ``--processes 2`` runs two at once, which spoils their times; ``--resume``
-takes from its folder what ran to its end in an earlier call with the same code and versions, and runs the rest. The
+status is 1; the others run all the same. ``--processes 2`` runs two at once, which spoils their times. ``--only``
+replaces the sections of some scripts and leaves the others of the page as they are. ``--resume`` takes from its folder
+what ran to its end in an earlier call with the same code and versions, and runs the rest. The
 pictures make up the gallery, ``gallery.md`` beside the page.
 """
 
@@ -172,6 +173,19 @@ def section(experiment: Experiment, printed: str, failure: str, pictures: Sequen
     return "\n".join(lines)
 
 
+def with_sections(page: str, chosen: Sequence[Experiment], sections: Sequence[str]) -> str:
+    """A page with the sections of some experiments replaced, or added at its end; the others stay as they are."""
+    parts = page.split("\n## ")
+    for experiment, text in zip(chosen, sections):
+        new = text.removeprefix("## ").rstrip("\n") + "\n"
+        at = next((i for i, part in enumerate(parts) if part.split("\n")[0] == experiment.title), None)
+        if at is None:
+            parts.append(new)
+        else:
+            parts[at] = new
+    return "\n## ".join(parts)
+
+
 def gallery(pictures: Sequence[tuple[Experiment, Sequence[str]]]) -> str:
     """The page of pictures; of the worlds and the demo they are there already."""
     lines = [
@@ -215,8 +229,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
     parser.add_argument("--resume", action="store_true", help="take what the same code has left in --out")
     given = parser.parse_args(arguments)
-    if given.only and given.page == parser.get_default("page"):
-        parser.error("--only would leave the other sections out of the page: name another --page")
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
     with ThreadPoolExecutor(given.processes) as pool:
         outcomes = list(pool.map(lambda e: printed_by(e, given.out, given.quick, given.resume), chosen))
@@ -224,7 +236,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sections = [section(e, *outcome, shown, given.quick) for (e, shown), outcome in zip(pictures, outcomes)]
     failed = [e.name for e, (_, failure) in zip(chosen, outcomes) if failure]
     given.page.parent.mkdir(parents=True, exist_ok=True)
-    given.page.write_text("\n".join([head(given.quick), *sections]), encoding="utf-8")
+    if given.only and given.page.exists():
+        page = with_sections(given.page.read_text(encoding="utf-8"), chosen, sections)
+    else:
+        page = "\n".join([head(given.quick), *sections])
+    given.page.write_text(page, encoding="utf-8")
     if not given.only:  # a part of the pictures would be no gallery
         given.page.with_name("gallery.md").write_text(gallery(pictures), encoding="utf-8")
     print(f"{len(sections)} experiments, {len(failed)} failed. Page: {given.page}", file=sys.stderr)

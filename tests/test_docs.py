@@ -113,7 +113,7 @@ def test_the_figures_in_the_readme_are_those_of_the_results_page():
     measured = {(row[0], row[1]): row[2:6] for row in table_rows(section, 8)}
     readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
     shown = [row for row in table_rows(readme, 6) if row[1] in ("ekf", "smoother")]
-    assert len(shown) == 6
+    assert len(shown) == 8
     for name, backend, *cells in shown:
         own = next(values for (short, other), values in measured.items() if name.startswith(short) and other == backend)
         for cell, value in zip(cells, own):

@@ -67,6 +67,17 @@ def test_one_alone(results, scripts, capsys):
     assert not page.with_name("gallery.md").exists()
 
 
+def test_the_sections_of_others_stay_where_one_is_made_anew(results, scripts):
+    page = scripts / "page.md"
+    page.write_text("# Results\n\nWritten before.\n\n## Good\n\nold\n\n## Other\n\nkept\n")
+    results.main(["--only", "good", "--out", str(scripts / "out"), "--page", str(page)])
+    text = page.read_text()
+    assert text.count("## Good") == 1
+    assert "\nold\n" not in text
+    assert "| 1 | False" in text
+    assert text.index("## Good") < text.index("## Other\n\nkept")
+
+
 def test_only_what_the_same_code_has_left_is_taken_again(results, scripts, capsys):
     def run(*more):
         results.main(["--only", "good", "--out", str(scripts / "out"), "--page", str(scripts / "page.md"), *more])
