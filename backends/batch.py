@@ -28,7 +28,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 
-_ITERATIONS = 100
+_ITERATIONS = 100  # of Levenberg-Marquardt at most
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from slam import registry
 from slam.calibration import Revision, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
-from slam.errors import ConfigurationError, MeasurementError, SlamError
+from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, RevisingBackend
@@ -144,8 +144,6 @@ class StereoSlam:
         """A frame, its features, and how long these took [ms]."""
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
-        if not isinstance(frame, StereoFrame):
-            raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with stages.stage("extract"):
             features = self.frontend.extract(frame)

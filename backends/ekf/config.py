@@ -9,7 +9,7 @@ from slam.errors import ConfigurationError
 MEASUREMENTS = ("stereo", "left")
 LANDMARKS = ("inverse_depth", "euclidean")
 
-_MOST_ITERATIONS = 1000
+_MOST_ITERATIONS = 1000  # bound of a setting
 
 
 @dataclass(frozen=True)

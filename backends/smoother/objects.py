@@ -31,7 +31,7 @@ from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_
 
 _LAG = 4  # frames of a window at least
 _BATCH = 2  # so many frames leave it together: that costs hardly more than for one
-_ITERATIONS = 2
+_ITERATIONS = 2  # linearisations of a body's window in a frame
 _ENOUGH = 4  # points that show a shape
 _FAILURES = 3  # so many rejections running, and a point starts anew
 # Keeps poses of the camera apart that are taken to move together: of each variance, and at least [rad², m²].

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_FRAME = 12
+_FRAME = 12  # numbers of a frame's state: pose and velocity
 _NEAREST = 1e-6  # no depth below this [m] is projected
 _SMALL = 1e-6  # sine of an angle below which series are exact
 

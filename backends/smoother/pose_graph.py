@@ -43,7 +43,7 @@ _REFINED = 3
 
 #: The last word on all poses and landmarks is linearised to within so much [px].
 _LAST = 1e-4
-_ROUNDS = 6
+_ROUNDS = 6  # of relinearising everything at most
 
 
 class PoseGraph:

@@ -17,7 +17,7 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, inverse
 from slam.tracking.gating import chi_square_gate
 
-_STEPS = 12
+_STEPS = 12  # of Gauss-Newton at most
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # of solving and gating
 _CONVERGED = 1e-5  # [rad, m]; the steps shrink quadratically, so what is left is far smaller

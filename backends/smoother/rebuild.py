@@ -11,7 +11,7 @@ from backends.smoother.solver import FAILURES, Change, SolverError
 from backends.smoother.variables import pose_key
 from slam.geometry.se3 import Array, inverse
 
-_ITERATIONS = 30
+_ITERATIONS = 30  # of Levenberg-Marquardt at most
 
 
 def whole_problem(make: FactorMaker, measurement_log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:

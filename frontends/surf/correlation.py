@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.runtime.compilation import kernel, vector_helper
 
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
-_ITERATIONS = 12
+_ITERATIONS = 12  # of the alignment at most
 _CONVERGED = 0.01  # px
 
 

@@ -60,6 +60,8 @@ class SurfFrontend:
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
+        if not isinstance(frame, StereoFrame):
+            raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         pair = [frame.left] if frame.right is None else [frame.left, frame.right]
         images = self._surf.workers.run([partial(self._image, frame, image, k) for k, image in enumerate(pair)])
         left = images[0]

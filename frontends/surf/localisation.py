@@ -14,7 +14,7 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
 _SIZE_STEP = 0.3  # of those in size
-_ITERATIONS = 10
+_ITERATIONS = 10  # of the search for the continuous maximum at most
 _FOLLOWERS = 10  # features that repeated ones may lie apart, when sorted by x
 _CONVERGED = 0.05  # in units of the steps
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-
-import numpy as np
+from dataclasses import dataclass
 
 from slam.errors import ConfigurationError
-from slam.models import FORBID_UNKNOWN
+from slam.models import FORBID_UNKNOWN, require_positive
+
+_SIGMAS = (1e-4, 1e4)  # [px]
+_RANGES = {
+    "prior_scale": (1e-3, 1e3),
+    "pixel_sigma": _SIGMAS,
+    "disparity_sigma": _SIGMAS,
+    "systematic": _SIGMAS,
+    "minimum_parallax": _SIGMAS,
+    "inflation": (1e-3, 1e3),
+}
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,7 @@ class SelfCalibrationConfig:
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if not isinstance(value, bool) and not (np.isfinite(value) and value > 0):
-                raise ConfigurationError(f"self_calibration: {f.name} must be positive and finite, got {value}")
+        require_positive(self, _RANGES, "self_calibration")
         if self.kept_share > 1:
             raise ConfigurationError(f"self_calibration: kept_share must lie in (0, 1], got {self.kept_share}")
         if self.minimum_common < 10:

@@ -149,8 +149,8 @@ class RigUncertainty:
         factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
         J = adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose @ factor
         positions = estimate.covariances
-        if len(estimate.ids):
-            rows = np.searchsorted(self._landmarks.ids, estimate.ids).clip(0, max(len(self._landmarks.ids) - 1, 0))
+        if len(estimate.ids) and len(self._landmarks.ids):
+            rows = np.searchsorted(self._landmarks.ids, estimate.ids).clip(0, len(self._landmarks.ids) - 1)
             known = self._landmarks.ids[rows] == estimate.ids
             L = self._landmarks.by_rig[rows[known]] @ factor
             positions = positions.copy()

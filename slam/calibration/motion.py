@@ -14,7 +14,7 @@ from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
 from slam.geometry.se3 import Array, hat, so3_exp
 
-_ITERATIONS = 20
+_ITERATIONS = 20  # of Gauss-Newton at most
 _CONVERGED = 0.02  # largest last change of a predicted point [px]
 _DEGREES = 4.0  # of Student's t, the weight of a point's residual
 _MEDIAN = 2.366  # of χ² with three degrees of freedom

@@ -16,7 +16,7 @@ from slam.geometry.se3 import Array
 #: Scales of the prior that are weighed against each other, from a calibration without errors to one as bad as the
 #: prior allows, and the same for an offset of the disparity alone; all equally probable beforehand.
 _SCALES = (0.02, 0.1, 0.3, 1.0)
-_OFFSETS = (0.03, 0.3, 1.0)
+_OFFSETS = (0.03, 0.3, 1.0)  # scales of the prior of a disparity offset that are weighed against each other [px]
 
 
 @dataclass(frozen=True)

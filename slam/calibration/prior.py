@@ -34,7 +34,7 @@ OFFSET = 7e-4
 #: errors would show it. Root mean square over the image of what disparities and rows of far points are off by [focal
 #: lengths]; smooth as they are, such fields have some ten values that are independent of each other.
 FIELD = 1.4e-3
-_FREEDOM = 10
+_FREEDOM = 10  # independent values of such a field
 
 _NEAR = 0.05  # disparity [focal lengths] of points that are near
 

@@ -17,7 +17,7 @@ _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _LOOSE = np.array([1.0, 1.0, 2.0])  # of uR, predicted from the first view's disparity, more is allowed
-_HYPOTHESES = 100
+_HYPOTHESES = 100  # poses tried in the geometric check of a pair of views
 
 
 @dataclass(frozen=True)

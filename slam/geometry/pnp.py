@@ -19,10 +19,10 @@ MINIMAL_POINTS = 3
 
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
-_POLISHING_ROUNDS = 5
+_POLISHING_ROUNDS = 5  # of least squares on what agrees, at most
 _STEPS = 10  # of Gauss-Newton at most
 _BATCH = 50  # hypotheses tried at once
-_APPROACHES = 3
+_APPROACHES = 3  # steps towards the better half of the matches, from a guess that is far off
 _ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
 _CONVERGED = 1e-4  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
 

@@ -35,7 +35,7 @@ class HasMap(Protocol):
 
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 2
+_VERSION = 2  # of the file's form
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.

@@ -34,7 +34,7 @@ _RADIUS = 20.0  # a feature moves no further between two frames than that, besid
 _D_MATCH, _RATIO = 0.5, 0.7  # descriptor distance; ratio of the nearest two (paper B, 2.2)
 _KEPT = 45  # frames in which a view is kept at most
 _MISFIT = 6.6  # of the two views with one point: 99 % of χ² with one degree of freedom
-_STEPS = 4
+_STEPS = 4  # of Gauss-Newton on a point's depth
 _VIEWS = 400  # views kept at most
 _CLAIM = 12.0  # a landmark claims features so near to where it is expected [px]
 

@@ -17,8 +17,8 @@ from slam.objects.pixel_kernels import pixel_deviations
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import Tracks
 
-_SIGMAS = 3.0
-_RIGHT_SIGMAS = 4.0
+_SIGMAS = 3.0  # standard deviations of the predicted pixel: half size of the window
+_RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 _LEAST = 1e-6  # information on a member's point that has none yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import lru_cache, wraps
 from threading import Lock
@@ -12,10 +13,17 @@ from threadpoolctl import LibController, ThreadpoolController
 _F = TypeVar("_F", bound=Callable[..., Any])
 _Changed = list[tuple[LibController, int]]
 
+_BRING_BLAS = ("numpy.linalg", "scipy.linalg", "cv2", "gtsam")  # packages with a BLAS library of their own, or none
 
-@lru_cache(maxsize=1)
+
 def _libraries() -> tuple[list[LibController], list[LibController]]:
-    """The BLAS libraries that are loaded, looked up once: with one number for the process, and with one per thread."""
+    """The BLAS libraries that are loaded: with one number of threads for the process, and with one per thread."""
+    return _found(tuple(name in sys.modules for name in _BRING_BLAS))
+
+
+@lru_cache(maxsize=2 ** len(_BRING_BLAS))
+def _found(loaded: tuple[bool, ...]) -> tuple[list[LibController], list[LibController]]:
+    """Looked up once for each set of packages that have been `loaded`."""
     found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
     own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
     return [library for library in found if library not in own], own

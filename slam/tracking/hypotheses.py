@@ -9,7 +9,7 @@ import numpy as np
 from slam.geometry.se3 import Array, inverse, log
 from slam.models import EstimatorModels
 
-_SIGMAS = 3.0
+_SIGMAS = 3.0  # standard deviations of a velocity within which two poses agree
 _SLACK = 0.05  # between two poses found one by one [m], [rad]
 
 

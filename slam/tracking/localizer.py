@@ -21,7 +21,7 @@ from slam.tracking.hypotheses import PoseHypotheses
 from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
 
-_TINY = 1e-12
+_TINY = 1e-12  # variance [rad², m²] that keeps a covariance invertible
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.tracking.association import pairs_in_boxes
 
-_SIGMAS = 3.0
+_SIGMAS = 3.0  # standard deviations of depth by which one point is nearer than another for certain
 _NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
 
 

@@ -414,11 +414,11 @@ def test_no_pixel_of_a_camera(drive, pixel):
     backend, seen = predicted(drive, 5)
     uv = seen.uv_left.copy()
     uv[3, 0] = pixel
+    with pytest.raises(MeasurementError, match="pixel"):
+        backend.update(Observations(seen.ids, uv, seen.uv_right))
+    uv[3, 0] = 0.9e6  # no camera has it, but a number that can be worked with
     report = backend.update(Observations(seen.ids, uv, seen.uv_right))
     np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
-    right = uv[3:4] - [5.0, 0]
-    with pytest.raises(MeasurementError, match="pixel"):
-        backend.add(Observations(np.array([12345]), uv[3:4], right * 0.9))
 
 
 # --- consistency ---

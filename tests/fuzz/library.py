@@ -257,15 +257,14 @@ def smoother_calls(rng: np.random.Generator, folder: Path) -> None:
     calls(rng, folder, "smoother")
 
 
-_OPEN = "checks of features and of what back ends are given"
 _SOUND = "a status or one line; poses finite, covariances symmetric and positive definite after every call"
 
 SUBJECTS = (
     Subject("features", "hostile features between good ones, both back ends", "a sound result or one line",
-            hostile_features, quiet=False, short=40, open=_OPEN),
+            hostile_features, quiet=False, short=40),
     Subject("images", "hostile images, stamps and indices", "a result or one line", hostile_images, quiet=False,
-            short=15, open=_OPEN),
+            short=15),
     Subject("calls of ekf", "sequences of calls with hostile stamps, pixels, guesses and covariances", _SOUND,
-            ekf_calls, quiet=False, short=30, open=_OPEN),
-    Subject("calls of smoother", "the same", _SOUND, smoother_calls, quiet=False, short=20, open=_OPEN),
+            ekf_calls, quiet=False, short=30),
+    Subject("calls of smoother", "the same", _SOUND, smoother_calls, quiet=False, short=20),
 )  # fmt: skip

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -149,7 +150,9 @@ def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_pat
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
     command = [sys.executable, "-m", "slam", "run", "synthetic:aisle?frames=1000", "--out", str(tmp_path), "--quiet"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # A shell that starts the tests in the background has them ignore SIGINT, and what they start would too.
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     deadline = time.time() + 600  # where nothing is compiled yet and other processes run
     path = tmp_path / "trajectory.txt"
     while time.time() < deadline and (not path.exists() or path.read_text().count("\n") < 5):
