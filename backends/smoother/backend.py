@@ -98,16 +98,18 @@ class SmootherBackend:
             last = f" after {stamps[-1]}" if len(stamps) else ""
             raise MeasurementError(f"smoother: stamp {stamp}{last}: time must be finite and increase")
         if not len(stamps) and len(self.measurement_log.landmarks):
-            self._predicted = first_pose(self.models, float(stamp))
-            return self._in_view(self._predicted)
-        if not len(stamps):
+            predicted = first_pose(self.models, float(stamp))
+        elif not len(stamps):
+            T, none = self.models.initial_pose, np.zeros((0, 2))
             with self._whole():
-                self._graph.append_pose(stamp, self.models.initial_pose)
-            P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
-            T = self.models.initial_pose
-            return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
-        self._predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
-        return self._in_view(self._predicted)
+                self._graph.append_pose(stamp, T)
+                P = self._graph.window().covariance.copy()
+                return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
+        else:
+            predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
+        in_view = self._in_view(predicted)
+        self._predicted = predicted  # last: an interrupted call has predicted nothing
+        return in_view
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -128,9 +130,9 @@ class SmootherBackend:
         with self._whole():
             failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
             self._predicted = None
-        if failure:
-            return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
-        return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
+            if failure:
+                return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
+            return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
 
     @one_blas_thread
     def add(self, observations: Observations) -> None:

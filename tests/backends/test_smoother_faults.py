@@ -289,6 +289,34 @@ def test_a_call_that_is_interrupted_did_not_happen(lag):
     near_the_truth(backend, data)
 
 
+@pytest.mark.parametrize("lag", [None, 12])
+def test_predictions_and_estimates_may_be_interrupted(lag):
+    """The same call again gives what it gives without the interruption."""
+    data, known = drive(20), set()
+    backends = [SmootherBackend(RIG, MODELS, lag=lag) for _ in range(2)]
+    rng, interrupted = np.random.default_rng(0), 0
+    for k, (stamp, _, seen) in enumerate(data):
+        old = np.isin(seen.ids, list(known))
+        found = []
+        for number, backend in enumerate(backends):
+            calls = (
+                lambda backend=backend: backend.predict(stamp).T_world_left,
+                lambda backend=backend: backend.estimate(landmarks=False).covariance,
+                lambda backend=backend: backend.update(seen.select(old)).used,
+                lambda backend=backend: backend.add(seen.select(~old)),
+                lambda backend=backend: backend.estimate().covariances,
+            )
+            for i, call in enumerate(calls):
+                if number and k and i in (0, 1, 4):
+                    interrupted += interrupt(call, int(rng.integers(1, 25)))
+                found.append(call())
+        for one, other in zip(found[: len(calls)], found[len(calls) :]):
+            np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-6) if one is not None else None
+        known.update(seen.ids.tolist())
+    assert interrupted > 20
+    near_the_truth(backends[1], data)
+
+
 def interrupt(call, number: int) -> bool:
     """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
     left = number
