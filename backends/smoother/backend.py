@@ -25,10 +25,12 @@ from backends.smoother.prediction import (
     predict_pose,
     residual_noise,
 )
+from backends.smoother.recovery import Agreement, agreement, landmarks_pose, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
-from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
@@ -121,14 +123,19 @@ class SmootherBackend:
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         z = self._stereo.measure(observations)
         points = self._points(predicted, slots)
-        T, used = self._solve_pose(predicted, points, slots, z, guess)
+        found = self._solve_pose(predicted, points, slots, observations, guess)
+        T, used = found.T, found.used
         if not used.any():
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
         solved = self._points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
         with self._whole():
-            failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
+            if found.jumped:
+                P = world_covariance(predicted.covariance)
+                failure = self._graph.start_anew(predicted.stamp, T, P, slots[used], z[used])
+            else:
+                failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
             self._predicted = None
             if failure:
                 return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
@@ -272,19 +279,23 @@ class SmootherBackend:
         return predict_points(predicted, marks.position[slots], marks.covariance[slots], by_window)
 
     def _solve_pose(
-        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, z: Array, guess: Array | None
-    ) -> tuple[Array, BoolArray]:
+        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, observations: Observations,
+        guess: Array | None,
+    ) -> Agreement:  # fmt: skip
         """First value of the newest pose, and which measurements agree with it."""
+        marks, z = self.measurement_log.landmarks, self._stereo.measure(observations)
         noise = residual_noise(self._stereo, self._make.sigma, points, z)
-        known = self.measurement_log.landmarks.prior[
-            slots
-        ].any()  # what is known in the world does not move with the poses
+        known = marks.prior[slots].any()  # what is known in the world does not move with the poses
         information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to(self._last_measured()))
         problem = pose_only.PoseProblem(
-            self._stereo, self.measurement_log.landmarks.position[slots], z, noise, predicted.T, information,
-            self.models.gate_probability,
-        )  # fmt: skip
-        return pose_only.solve(problem, predicted.T if guess is None else guess)
+            self._stereo, marks.position[slots], z, noise, predicted.T, information, self.models.gate_probability
+        )
+
+        def search() -> Array | None:
+            rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
+            return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
+
+        return agreement(problem, predicted.T if guess is None else guess, search)
 
     def _last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""

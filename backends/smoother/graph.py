@@ -68,11 +68,8 @@ class FactorMaker:
         noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.first_velocity_sigmas(self.models, dt))
         return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise)
 
-    def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float, scale: float) -> gtsam.NonlinearFactor:
-        """Between three successive poses: constant velocity but for an impulse (see `motion`).
-
-        `scale` multiplies the impulse's standard deviation.
-        """
+    def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float) -> gtsam.NonlinearFactor:
+        """Between three successive poses: constant velocity but for an impulse (see `motion`)."""
 
         def error(_this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
             poses = [values.atPose3(key) for key in keys]
@@ -84,7 +81,7 @@ class FactorMaker:
                     jacobians[i] = Ji
             return residual
 
-        noise = gtsam.noiseModel.Diagonal.Sigmas(scale * motion.motion_sigmas(self.models, dt12))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(motion.motion_sigmas(self.models, dt12))
         return gtsam.CustomFactor(noise, list(keys), error)
 
     def step(self, keys: tuple[int, int], relative: Array, dt: float) -> gtsam.NonlinearFactor:

@@ -12,7 +12,7 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
 from backends.smoother.lag import held_pose, overdue, without_old
-from backends.smoother.marginal import Held
+from backends.smoother.marginal import Held, reference_prior
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -96,13 +96,13 @@ class PoseGraph:
         """Add a frame without measurements."""
         self.measurement_log.path.append(stamp, T_world_left)
         try:
-            self._enter_pose(Change(), 1.0)
+            self._enter_pose(Change())
         except SolverError:
             self._recover()
         self._advance()
 
     def append_measured_pose(
-        self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array, impulse: float
+        self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array
     ) -> str:
         """Add a frame with measurements (M, 3) of landmarks.
 
@@ -111,7 +111,6 @@ class PoseGraph:
             T_world_left: first value of the pose (4, 4), near the solution.
             slots: landmarks (M,).
             z: their measurements (M, 3).
-            impulse: factor on the standard deviation of the motion's impulse.
 
         Returns:
             what failed, in one line; empty if nothing did. After a failure the frame stands without measurements.
@@ -123,7 +122,7 @@ class PoseGraph:
         grown = self._factor_builder.grow(change, slots, rows, z)
         try:
             try:
-                new = self._enter_pose(change, impulse)
+                new = self._enter_pose(change)
                 for track, place in grown:
                     track.factor = new[place]
             except SolverError:
@@ -143,6 +142,38 @@ class PoseGraph:
             self._recover()
         self._factor_builder.finish_tracks(slots)
         self._advance()
+        return ""
+
+    def start_anew(self, stamp: float, T_world_left: Array, covariance: Array, slots: IndexArray, z: Array) -> str:
+        """Add a frame whose pose follows from the landmarks and not from the poses before it.
+
+        Those stay as they are, and the landmarks stay where they are before the new pose.
+
+        Args:
+            stamp: time [s].
+            T_world_left: the pose (4, 4).
+            covariance: what is known of it in the world (6, 6).
+            slots: landmarks (M,) measured.
+            z: their measurements (M, 3).
+
+        Returns:
+            what failed, as in `append_measured_pose`.
+        """
+        log, frame = self.measurement_log, self.measurement_log.path.count
+        log.path.append(stamp, T_world_left)
+        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance))
+        self._window, self._carried, self._solved = None, None, False
+        rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
+        self._factor_builder.grow(Change(), slots, rows, z)
+        try:
+            self._rebuild()
+        except SolverError as error:
+            log.take_back(slots, rows)
+            self._recover()
+            return str(error)
+        log.landmarks.measured(slots, rows, frame)
+        log.path.note_measured()
+        self._place(slots)
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
@@ -313,15 +344,14 @@ class PoseGraph:
 
     # --- factors ---
 
-    def _enter_pose(self, change: Change, impulse: float) -> list[int]:
+    def _enter_pose(self, change: Change) -> list[int]:
         """Add the newest pose with its prior or motion to the change, and solve; returns the new factors' slots."""
         path = self.measurement_log.path
         i = path.count - 1
         if i >= 3:
             self._factor_builder.eliminate_late(change)
-        self.measurement_log.history.impulses.append(impulse)
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
-        change.factors.add(pose_factor(self._make, path, i, impulse))
+        change.factors.add(pose_factor(self._make, path, i))
         self._window, self._solved = None, False
         return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
 
@@ -361,7 +391,7 @@ class PoseGraph:
         makes the solver linearise anew.
         """
         path = self.measurement_log.path
-        first = max(0, path.count - self._config.window)
+        first = max(self.measurement_log.history.first, path.count - self._config.window)
         before = path.poses.copy()
         path.poses[first:] = self._solver.poses(pose_key(i) for i in range(first, path.count))
         self._moved += float(np.abs(path.poses[first] - before[first]).max())
