@@ -66,6 +66,7 @@ class SmootherBackend:
         self._make = FactorMaker(self._stereo, models)
         self._graph = PoseGraph(self._make, self.config)
         self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
+        self._contradicted = 0  # updates in succession that disagreed with the path
         self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
 
     @property
@@ -121,19 +122,21 @@ class SmootherBackend:
         predicted = self._predicted
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        z = self._stereo.measure(observations)
+        z, P = self._stereo.measure(observations), predicted.covariance
         points = self._points(predicted, slots)
         found = self._solve_pose(predicted, points, slots, observations, guess)
+        self._contradicted = found.contradicted
         T, used = found.T, found.used
         if not used.any():
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
+        if found.jump is not None:
+            predicted = replace(predicted, noise=predicted.noise + np.diag(found.jump))
         solved = self._points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
         with self._whole():
-            if found.jumped:
-                P = world_covariance(predicted.covariance)
-                failure = self._graph.start_anew(predicted.stamp, T, P, slots[used], z[used])
+            if found.jump is not None:
+                failure = self._graph.start_anew(predicted.stamp, T, world_covariance(P), slots[used], z[used])
             else:
                 failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
             self._predicted = None
@@ -295,7 +298,7 @@ class SmootherBackend:
             rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
             return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
 
-        return agreement(problem, predicted.T if guess is None else guess, search)
+        return agreement(problem, predicted.T if guess is None else guess, search, self._contradicted)
 
     def _last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""

@@ -380,17 +380,23 @@ class MeasurementLog:
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
-    def start_anew(self, prior: MarginalPrior) -> None:
-        """Begin with the newest pose, of which `prior` is known, and with the landmarks as they stand before it."""
+    def start_anew(self, prior: MarginalPrior, covariances: Array) -> None:
+        """Begin with the newest pose, of which `prior` is known, and with the landmarks as they stand before it.
+
+        `covariances` (M, 3, 3) of all landmarks, by slot, as seen from there, in world axes.
+        """
         path, history, marks, frame = self.path, self.history, self.landmarks, self.path.count - 1
         path.jumps.append(frame)
+        history.prior = None
         self.forget_measurements()
         history.first, history.prior, history.held, history.restarted = frame, prior, None, 0
         history.known = {serial: known for serial, known in history.known.items() if known.frame is None}
         slots, T = marks.used(), path.poses[-1]
         marks.recent[slots], marks.seen[slots], marks.information[slots], marks.older[slots] = -1, 0, 0, 0
         marks.last[slots] = frame
-        hanging = slots[~marks.prior[slots].any(axis=(1, 2))]  # others are known in the world
+        fixed = marks.prior[slots].any(axis=(1, 2))  # they are known in the world
+        marks.covariance[slots[~fixed]] = covariances[~fixed]
+        hanging = slots[~fixed]
         local = (marks.position[hanging] - T[:3, 3]) @ T[:3, :3]
         covariances = T[:3, :3].T @ marks.covariance[hanging] @ T[:3, :3]
         marks.older[hanging] = np.linalg.inv(marks.covariance[hanging])

@@ -160,8 +160,9 @@ class PoseGraph:
             what failed, as in `append_measured_pose`.
         """
         log, frame = self.measurement_log, self.measurement_log.path.count
+        covariances = self._covariances_from_newest(log.landmarks.used())
         log.path.append(stamp, T_world_left)
-        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance))
+        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
         self._window, self._carried, self._solved = None, None, False
         rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
         self._factor_builder.grow(Change(), slots, rows, z)
@@ -304,6 +305,13 @@ class PoseGraph:
             if key in exact:
                 P[row] = exact[key]
         return P
+
+    def _covariances_from_newest(self, slots: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmark positions as seen from the window's newest pose, in world axes."""
+        window, marks = self.window(), self.measurement_log.landmarks
+        J = self.landmarks_by_window(slots).copy()
+        J[:, :, -6:] -= uncertainty.carried(window.poses[-1], marks.position[slots])
+        return uncertainty.quadratic(J, window.covariance) + marks.covariance[slots]
 
     def converge(self) -> None:
         """Solve to the last: every variable is linearised anew where it stands until nothing moves any more."""

@@ -28,23 +28,33 @@ _HEEDED = 3  # one in so many observations is enough to agree with a prediction
 _FITTED = 2  # observations that a pose fits whatever they are
 _CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
+_LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """The newest pose (4, 4), which observations (M,) agree with it, and whether it does not follow from its past."""
+    """A solution.
+
+    Attributes:
+        T: the newest pose (4, 4).
+        used: which observations (M,) agree with it.
+        jump: variances (6,) of the prediction that are needed for it to have been expected; None where none are.
+        contradicted: updates in succession, with this one, in which most observations agreed on another pose than
+            was expected.
+    """
 
     T: Array
     used: BoolArray
-    jumped: bool = False
+    jump: Array | None = None
+    contradicted: int = 0
 
 
 #: The pose (4, 4) on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
 
 
-def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search) -> Agreement:
+def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int) -> Agreement:
     """The newest pose with which most observations agree.
 
     Less than a third of the observations is not heeded where as many wrong ones might agree by chance.
@@ -53,30 +63,32 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search) -> A
         problem: landmarks and measurements.
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
+        contradicted: updates just before this one in which most observations agreed on another pose.
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):
         return Agreement(T, used)
     there = search() if len(used) >= _CONFIRMED else None
     found = None if there is None else _seated(problem, there)
-    if found is not None:
+    contradicted = 0 if found is None else contradicted + 1
+    if found is not None and (found.jump is None or contradicted >= _LASTING):
         return found
     if len(used) >= _ENOUGH and _HEEDED * used.sum() < len(used) and _by_chance(problem, T, used):
-        return Agreement(T, np.zeros_like(used))
-    return Agreement(T, used)
+        used = np.zeros_like(used)
+    return Agreement(T, used, None, contradicted)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
     """At the pose on which landmarks agree; None where most do not agree with it after all."""
     x = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ there))
     limit = chi_square_limits(np.array([6]), problem.probability)[0]
-    jumped = bool(x @ problem.information @ x > limit)
-    if jumped:
-        size = np.repeat([float(np.linalg.norm(x[:3])), float(np.linalg.norm(x[3:]))], 3)
-        wide = np.linalg.inv(problem.information) + np.diag(size**2)
+    jump = None
+    if x @ problem.information @ x > limit:
+        jump = np.repeat([float(x[:3] @ x[:3]), float(x[3:] @ x[3:])], 3)
+        wide = np.linalg.inv(problem.information) + np.diag(jump)
         problem = replace(problem, information=np.linalg.inv(wide))
     T, used = pose_only.solve(problem, there)
-    return Agreement(T, used, jumped) if used.sum() >= max(_CONFIRMED, (len(used) + 1) // 2) else None
+    return Agreement(T, used, jump) if used.sum() >= max(_CONFIRMED, (len(used) + 1) // 2) else None
 
 
 def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:
