@@ -160,7 +160,7 @@ class PoseGraph:
             what failed, as in `append_measured_pose`.
         """
         log, frame = self.measurement_log, self.measurement_log.path.count
-        covariances = self._covariances_from_newest(log.landmarks.used())
+        covariances = self._covariances_from_measured(log.landmarks.used())
         log.path.append(stamp, T_world_left)
         log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
         self._window, self._carried, self._solved = None, None, False
@@ -306,12 +306,19 @@ class PoseGraph:
                 P[row] = exact[key]
         return P
 
-    def _covariances_from_newest(self, slots: IndexArray) -> Array:
-        """Covariances (M, 3, 3) of landmark positions as seen from the window's newest pose, in world axes."""
-        window, marks = self.window(), self.measurement_log.landmarks
+    def _covariances_from_measured(self, slots: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmark positions as seen from the newest pose that measured any, in world axes."""
+        window, marks, measured = self.window(), self.measurement_log.landmarks, self.measurement_log.path.measured
+        place = int(np.searchsorted(window.frames, measured[-1])) if measured else len(window) - 1
         J = self.landmarks_by_window(slots).copy()
-        J[:, :, -6:] -= uncertainty.carried(window.poses[-1], marks.position[slots])
+        J[:, :, 6 * place : 6 * place + 6] -= uncertainty.carried(window.poses[place], marks.position[slots])
         return uncertainty.quadratic(J, window.covariance) + marks.covariance[slots]
+
+    def begins(self) -> Array:
+        """Covariance (6, 6) of the oldest pose that is a variable, as it was known when it became the oldest."""
+        held, m = self.measurement_log.history.held, self._make.models
+        initial = np.diag(np.repeat([m.initial_rotation_sigma, m.initial_position_sigma], 3) ** 2)
+        return initial if held is None else held.covariance
 
     def converge(self) -> None:
         """Solve to the last: every variable is linearised anew where it stands until nothing moves any more."""

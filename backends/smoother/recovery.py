@@ -29,6 +29,7 @@ _FITTED = 2  # observations that a pose fits whatever they are
 _CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
+_RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
 _AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
 
 
@@ -39,7 +40,7 @@ class Agreement:
     Attributes:
         T: the newest pose (4, 4).
         used: which observations (M,) agree with it.
-        jump: variances (6,) of the prediction that are needed for it to have been expected; None where none are.
+        jump: where the problem shall start anew, variances (6,) that the prediction lacks; else None.
         contradicted: updates in succession, with this one, in which most observations agreed on another pose than
             was expected.
     """
@@ -54,7 +55,9 @@ class Agreement:
 Search = Callable[[], "Array | None"]
 
 
-def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int) -> Agreement:
+def agreement(
+    problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int, lost: bool
+) -> Agreement:
     """The newest pose with which most observations agree.
 
     Less than a third of the observations is not heeded where as many wrong ones might agree by chance.
@@ -64,10 +67,12 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
+        lost: whether the past says next to nothing of the pose (`lost`).
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):
-        return Agreement(T, used)
+        anew = lost and used.sum() >= _CONFIRMED
+        return Agreement(T, used, np.zeros(6) if anew else None)
     there = search() if len(used) >= _CONFIRMED else None
     found = None if there is None else _seated(problem, there)
     contradicted = 0 if found is None else contradicted + 1
@@ -76,6 +81,16 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
     if len(used) >= _ENOUGH and _HEEDED * used.sum() < len(used) and _by_chance(problem, T, used):
         used = np.zeros_like(used)
     return Agreement(T, used, None, contradicted)
+
+
+def lost(P: Array, begun: Array) -> bool:
+    """Whether no linearisation of the problem holds any more.
+
+    So it is where the pose is not known to a radian, by its predicted covariance P (6, 6), and was twice as well known
+    where the problem begins, by its covariance there, `begun` (6, 6).
+    """
+    now, then = (float(np.linalg.eigvalsh(C[:3, :3]).max()) for C in (P, begun))
+    return now > max(_RADIAN, 4 * then)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
@@ -132,4 +147,4 @@ def world_covariance(P: Array) -> Array:
     The landmarks are known as well in the world as the poses that saw them, which are known at least so well; no turn
     is less known than by a radian.
     """
-    return P / max(1.0, float(np.linalg.eigvalsh(P[:3, :3]).max()))
+    return P / max(_RADIAN, float(np.linalg.eigvalsh(P[:3, :3]).max()))
