@@ -163,7 +163,7 @@ class PoseGraph:
         covariances = self._covariances_from_measured(log.landmarks.used())
         log.path.append(stamp, T_world_left)
         log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
-        self._window, self._carried, self._solved = None, None, False
+        self._window, self._carried, self._solved, self._broken = None, None, False, True
         rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
         self._factor_builder.grow(Change(), slots, rows, z)
         try:
@@ -504,7 +504,8 @@ class PoseGraph:
             change.factors.add(held.factor())
         solver = self._new_solver()
         new = solver.update(change)
-        held = _informed(held, solver)
+        with suppress(SolverError):
+            held = _informed(held, solver)
         self._broken = True  # until all of the following has been done
         self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from backends.smoother import SmootherBackend, growth
+from backends.smoother import SmootherBackend, factor_builder
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
@@ -275,8 +275,8 @@ def test_mending_needs_nothing_to_mend():
 def test_no_two_landmarks_share_a_variable(monkeypatch):
     # A measurement that is taken back may take the landmark's variable with it; its name is not given out again.
     data, given = drive(30), []
-    original = growth.landmark_key
-    monkeypatch.setattr(growth, "landmark_key", lambda *a: given.append(original(*a)) or given[-1])
+    original = factor_builder.landmark_key
+    monkeypatch.setattr(factor_builder, "landmark_key", lambda *a: given.append(original(*a)) or given[-1])
     backend = SmootherBackend(RIG, MODELS, track=3, explicit=20)
     known: set[int] = set()
     for k, (stamp, _, seen) in enumerate(data):
