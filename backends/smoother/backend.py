@@ -25,7 +25,7 @@ from backends.smoother.prediction import (
     predict_pose,
     residual_noise,
 )
-from backends.smoother.recovery import Agreement, agreement, landmarks_pose, lost, world_covariance
+from backends.smoother.recovery import Agreement, agreement, landmarks_pose, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
@@ -298,8 +298,8 @@ class SmootherBackend:
             rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
             return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
 
-        start, unknown = predicted.T if guess is None else guess, lost(predicted.covariance, self._graph.begins())
-        return agreement(problem, start, search, self._contradicted, unknown)
+        start, lost = predicted.T if guess is None else guess, len(predicted.window) > 0 and self._graph.lost()
+        return agreement(problem, start, search, self._contradicted, lost)
 
     def _last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""

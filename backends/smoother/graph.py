@@ -29,6 +29,11 @@ def inverse_depth(local: Array) -> tuple[Array, Array]:
     return np.array([x * w, y * w, w]), w * np.array([[1, 0, -x * w], [0, 1, -y * w], [0, 0, -w]])
 
 
+def _as_it_is(local: Array) -> tuple[Array, Array]:
+    """A point (3,) and its derivatives (3, 3)."""
+    return local, np.eye(3)
+
+
 class FactorMaker:
     """Makes factors for one rig and one set of models.
 
@@ -102,12 +107,14 @@ class FactorMaker:
     def known(self, key: int, known: Known) -> gtsam.NonlinearFactor:
         """What was known of a landmark variable beforehand, in the world or before a camera.
 
-        Before a camera it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so than in metres.
+        Where a camera has measured it, it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so
+        than in metres.
         """
         if known.frame is None:
             noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
             return gtsam.PriorFactorPoint3(key, known.position, noise)
-        place, D = inverse_depth(known.position)
+        coordinates = inverse_depth if known.seen else _as_it_is
+        place, D = coordinates(known.position)
         noise = gtsam.noiseModel.Gaussian.Covariance(D @ known.covariance @ D.T)
 
         def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
@@ -115,7 +122,7 @@ class FactorMaker:
             T = values.atPose3(pose).matrix()
             R = T[:3, :3]
             local = R.T @ (values.atPoint3(landmark) - T[:3, 3])
-            now, D = inverse_depth(local)
+            now, D = coordinates(local)
             if jacobians is not None:
                 jacobians[0] = D @ np.concatenate([hat(local), -np.eye(3)], axis=1)
                 jacobians[1] = D @ R.T

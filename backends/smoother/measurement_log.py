@@ -188,11 +188,13 @@ class Known:
         position: in world coordinates, or in the camera's where `frame` is one (3,) [m].
         covariance: its covariance (3, 3) [m²].
         frame: frame of the camera in whose coordinates that is; None for the world's.
+        seen: whether it was measured from there: then it is its inverse depth that is Gaussian, nearly.
     """
 
     position: Array
     covariance: Array
     frame: int | None = None
+    seen: bool = True
 
     def hangs_before(self, first: int) -> bool:
         """Whether it hangs on a camera before frame `first`."""
@@ -401,7 +403,7 @@ class MeasurementLog:
         covariances = T[:3, :3].T @ marks.covariance[hanging] @ T[:3, :3]
         marks.older[hanging] = np.linalg.inv(marks.covariance[hanging])
         for serial, position, covariance in zip(marks.serial[hanging].tolist(), local, covariances):
-            history.known[serial] = Known(position, covariance, frame)
+            history.known[serial] = Known(position, covariance, frame, seen=False)
         self._forget_unused_measurements()
 
     def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held | None) -> None:

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from backends.smoother import uncertainty
+from backends.smoother import recovery, uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
@@ -314,11 +314,17 @@ class PoseGraph:
         J[:, :, 6 * place : 6 * place + 6] -= uncertainty.carried(window.poses[place], marks.position[slots])
         return uncertainty.quadratic(J, window.covariance) + marks.covariance[slots]
 
-    def begins(self) -> Array:
-        """Covariance (6, 6) of the oldest pose that is a variable, as it was known when it became the oldest."""
-        held, m = self.measurement_log.history.held, self._make.models
-        initial = np.diag(np.repeat([m.initial_rotation_sigma, m.initial_position_sigma], 3) ** 2)
-        return initial if held is None else held.covariance
+    def lost(self) -> bool:
+        """Whether what is in view hangs on a pose that is turned by an unknown angle: no linearisation holds there."""
+        window, path, enough = self.window(), self.measurement_log.path, recovery.CONFIRMED
+        if not path.measured or not recovery.unknown_turn(window.covariance[-6:, -6:]):
+            return False
+        newest = path.measured[-1]
+        if np.count_nonzero(self.measurement_log.measurements.frame == newest) < enough:
+            return False
+        with suppress(SolverError):  # the oldest pose, where it is held, may be turned in the world by any angle
+            return recovery.unknown_turn(self._solver.joint_covariance([pose_key(newest)]))
+        return False
 
     def converge(self) -> None:
         """Solve to the last: every variable is linearised anew where it stands until nothing moves any more."""

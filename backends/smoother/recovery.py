@@ -26,7 +26,7 @@ from slam.tracking.gating import chi_square_limits, squared_distances
 _ENOUGH = 6  # observations that can be judged to agree with each other
 _HEEDED = 3  # one in so many observations is enough to agree with a prediction
 _FITTED = 2  # observations that a pose fits whatever they are
-_CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
+CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
@@ -67,13 +67,13 @@ def agreement(
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the past says next to nothing of the pose (`lost`).
+        lost: whether the problem shall start anew in any case (`PoseGraph.lost`).
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):
-        anew = lost and used.sum() >= _CONFIRMED
+        anew = lost and used.sum() >= CONFIRMED
         return Agreement(T, used, np.zeros(6) if anew else None)
-    there = search() if len(used) >= _CONFIRMED else None
+    there = search() if len(used) >= CONFIRMED else None
     found = None if there is None else _seated(problem, there)
     contradicted = 0 if found is None else contradicted + 1
     if found is not None and (found.jump is None or contradicted >= _LASTING):
@@ -83,14 +83,9 @@ def agreement(
     return Agreement(T, used, None, contradicted)
 
 
-def lost(P: Array, begun: Array) -> bool:
-    """Whether no linearisation of the problem holds any more.
-
-    So it is where the pose is not known to a radian, by its predicted covariance P (6, 6), and was twice as well known
-    where the problem begins, by its covariance there, `begun` (6, 6).
-    """
-    now, then = (float(np.linalg.eigvalsh(C[:3, :3]).max()) for C in (P, begun))
-    return now > max(_RADIAN, 4 * then)
+def unknown_turn(P: Array) -> bool:
+    """Whether a pose with covariance P (6, 6) is turned by an angle that is not known to a radian."""
+    return bool(np.linalg.eigvalsh(P[:3, :3]).max() > _RADIAN)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
@@ -103,7 +98,7 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
         wide = np.linalg.inv(problem.information) + np.diag(jump)
         problem = replace(problem, information=np.linalg.inv(wide))
     T, used = pose_only.solve(problem, there)
-    return Agreement(T, used, jump) if used.sum() >= max(_CONFIRMED, (len(used) + 1) // 2) else None
+    return Agreement(T, used, jump) if used.sum() >= max(CONFIRMED, (len(used) + 1) // 2) else None
 
 
 def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:
@@ -137,7 +132,7 @@ def landmarks_pose(
     """
     threshold = models.pixel_sigma * np.sqrt(_AS_NEW * chi_square_limits(np.array([3]), models.gate_probability)[0])
     found = find_consensus(rig, points, z, T_world_left, float(threshold), _HYPOTHESES, seed)
-    enough = found.inliers.sum() >= max(_CONFIRMED, (len(z) + 1) // 2)
+    enough = found.inliers.sum() >= max(CONFIRMED, (len(z) + 1) // 2)
     return found.T_world_left if enough and np.isfinite(found.T_world_left).all() else None
 
 
