@@ -402,6 +402,9 @@ class MeasurementLog:
         local = (marks.position[hanging] - T[:3, 3]) @ T[:3, :3]
         covariances = T[:3, :3].T @ marks.covariance[hanging] @ T[:3, :3]
         marks.older[hanging] = np.linalg.inv(marks.covariance[hanging])
+        # What is not known by as much as its distance is measured anew, as if it were new.
+        known = np.trace(covariances, axis1=1, axis2=2) < (local**2).sum(axis=1)
+        hanging, local, covariances = hanging[known], local[known], covariances[known]
         for serial, position, covariance in zip(marks.serial[hanging].tolist(), local, covariances):
             history.known[serial] = Known(position, covariance, frame, seen=False)
         self._forget_unused_measurements()
