@@ -101,9 +101,7 @@ class PoseGraph:
             self._recover()
         self._advance()
 
-    def append_measured_pose(
-        self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array
-    ) -> str:
+    def append_measured_pose(self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array) -> str:
         """Add a frame with measurements (M, 3) of landmarks.
 
         Args:

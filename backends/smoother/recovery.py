@@ -55,9 +55,7 @@ class Agreement:
 Search = Callable[[], "Array | None"]
 
 
-def agreement(
-    problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int, lost: bool
-) -> Agreement:
+def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int, lost: bool) -> Agreement:
     """The newest pose with which most observations agree.
 
     Less than a third of the observations is not heeded where as many wrong ones might agree by chance.
