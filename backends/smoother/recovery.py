@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.special import bdtrc, gammainc, gammaincinv
+from scipy.special import bdtrc, comb, gammainc, gammaincinv
 
 from backends.smoother import pose_only
 from slam.data import BoolArray
@@ -25,7 +25,7 @@ from slam.tracking.gating import chi_square_limits, squared_distances
 
 _ENOUGH = 6  # observations that can be judged to agree with each other
 _HEEDED = 3  # one in so many observations is enough to agree with a prediction
-_FITTED = 2  # observations that a pose fits whatever they are
+_FITTED = 3  # observations that fix a pose: it fits them whatever they are
 CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
@@ -103,7 +103,9 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
     """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
 
     Wrong observations are taken to be spread about their predictions as those that are rejected: that says what share
-    of them passes the gate. Two agree with any pose that was made to fit them.
+    of them passes the gate. Three agree with the pose that was made to fit them, and it may have been made to fit any
+    three: the number of others that agree is judged for all triples together
+    (an a contrario test, as in Moisan & Stival, IJCV 2004).
     """
     distances = squared_distances(pose_only.residuals(problem, T)[0], problem.noise)
     rejected = distances[~used & np.isfinite(distances)]
@@ -111,8 +113,8 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
         return True
     spread = float(np.median(rejected)) / (2 * gammaincinv(1.5, 0.5))  # in units of the residuals' covariances
     share = gammainc(1.5, chi_square_limits(np.array([3]), problem.probability)[0] / spread / 2)
-    least, many = int(used.sum()) - _FITTED, len(used) - _FITTED
-    return bool(least < 1 or bdtrc(least - 1, many, share) > 1 - problem.probability)
+    others, many = int(used.sum()) - _FITTED, len(used) - _FITTED
+    return bool(others < 1 or comb(len(used), _FITTED) * bdtrc(others - 1, many, share) > 1 - problem.probability)
 
 
 def landmarks_pose(

@@ -28,18 +28,31 @@ def drive(backend, poses, points, sigma, unseen=(), seed=0):
     return np.array(errors), rejected
 
 
-@pytest.mark.parametrize("lag", [None, 50])
-def test_a_camera_that_was_moved_while_it_saw_nothing(lag):
-    """It looks round once, and is turned by 150 degrees within three blind frames."""
+def moved_in_the_dark(frames: int):
+    """A path (F, 4, 4) that looks round once and is turned by 150 degrees in frame 70, and points all around."""
     rng = np.random.default_rng(1)
-    poses = path(90, DT, np.array([0.1, 0.0, 0.1]), np.array([0.0, 1.0, 0.0]))
+    poses = path(frames, DT, np.array([0.1, 0.0, 0.1]), np.array([0.0, 1.0, 0.0]))
     directions = rng.standard_normal((400, 3)) * (1.0, 0.3, 1.0)
     points = directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(3.0, 8.0, (400, 1))
     poses[70:] = poses[70:] @ se3.exp(np.array([0.1, 2.6, -0.2, 0.5, 0.1, 0.0]))
-    errors, rejected = drive(SmootherBackend(RIG, MODELS, lag=lag), poses, points, 0.5, range(67, 70))
+    return poses, points
 
+
+@pytest.mark.parametrize("lag", [None, 50])
+def test_a_camera_that_was_moved_while_it_saw_nothing(lag):
+    """It sees nothing for three frames, and is elsewhere then."""
+    poses, points = moved_in_the_dark(90)
+    errors, rejected = drive(SmootherBackend(RIG, MODELS, lag=lag), poses, points, 0.5, range(67, 70))
     assert sum(rejected[70:73]) > 30 and sum(rejected[74:]) < 10
     assert np.abs(errors[74:]).max() < 0.03
+
+
+def test_what_is_known_of_the_pose_in_the_world_outlasts_the_lag():
+    poses, points = moved_in_the_dark(110)
+    backend = SmootherBackend(RIG, MODELS, lag=12)
+    drive(backend, poses, points, 0.5, range(67, 70))
+    assert backend.measurement_log.history.first > 80
+    assert np.sqrt(np.diag(backend.estimate(landmarks=False).covariance)).max() < 0.3
 
 
 @pytest.mark.parametrize("seed", range(3))
