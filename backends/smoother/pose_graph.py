@@ -372,13 +372,18 @@ class PoseGraph:
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
         change.factors.add(pose_factor(self._make, path, i))
         self._window, self._solved = None, False
-        return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
+        thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver linearises all anew
+        return self._solver.update(change, self._seldom if thorough else self._often)
 
     # --- the lag ---
 
+    def _overdue(self) -> int | None:
+        """Frame of the oldest pose that shall stay, where others leave in this frame."""
+        return None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+
     def _advance(self) -> None:
         """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
-        first = None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+        first = self._overdue()
         if first is None:
             return
         try:
