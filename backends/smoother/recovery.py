@@ -30,6 +30,7 @@ CONFIRMED = 5  # observations that agree on a pose by more than chance: three fi
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
+_ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
 _AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
 
 
@@ -139,7 +140,7 @@ def landmarks_pose(
 def world_covariance(P: Array) -> Array:
     """What is known in the world of a pose that is seated among the landmarks, of its predicted covariance P (6, 6).
 
-    The landmarks are known as well in the world as the poses that saw them, which are known at least so well; no turn
-    is less known than by a radian.
+    The landmarks are known as well in the world as the poses that saw them, which are known at least so well. No turn
+    is less known than one by any angle at all, equally probable: its variance is π²/3.
     """
-    return P / max(_RADIAN, float(np.linalg.eigvalsh(P[:3, :3]).max()))
+    return P / max(1.0, float(np.linalg.eigvalsh(P[:3, :3]).max()) / _ANY_TURN)
