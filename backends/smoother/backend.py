@@ -25,11 +25,13 @@ from backends.smoother.prediction import (
     predict_pose,
     residual_noise,
 )
+from backends.smoother.recovery import Agreement, agreement, landmarks_pose, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.checks import require_guess, require_stamp
-from slam.data import BoolArray, Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
+from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
@@ -65,6 +67,7 @@ class SmootherBackend:
         self._make = FactorMaker(self._stereo, models)
         self._graph = PoseGraph(self._make, self.config)
         self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
+        self._contradicted = 0  # updates in succession that disagreed with the path
         self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
 
     @property
@@ -97,16 +100,18 @@ class SmootherBackend:
         stamps = self.measurement_log.path.stamps
         require_stamp("smoother", stamp, float(stamps[-1]) if len(stamps) else None)
         if not len(stamps) and len(self.measurement_log.landmarks):
-            self._predicted = first_pose(self.models, float(stamp))
-            return self._in_view(self._predicted)
-        if not len(stamps):
+            predicted = first_pose(self.models, float(stamp))
+        elif not len(stamps):
+            T, none = self.models.initial_pose, np.zeros((0, 2))
             with self._whole():
-                self._graph.append_pose(stamp, self.models.initial_pose)
-            P, none = self._graph.window().covariance.copy(), np.zeros((0, 2))
-            T = self.models.initial_pose
-            return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
-        self._predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
-        return self._in_view(self._predicted)
+                self._graph.append_pose(stamp, T)
+                P = self._graph.window().covariance.copy()
+                return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
+        else:
+            predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
+        in_view = self._in_view(predicted)
+        self._predicted = predicted  # last: an interrupted call has predicted nothing
+        return in_view
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -117,14 +122,18 @@ class SmootherBackend:
         predicted = self._predicted
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        z = self._stereo.measure(observations)
+        z, P = self._stereo.measure(observations), predicted.covariance
         points = self._points(predicted, slots)
         try:
-            T, used = self._solve_pose(predicted, points, slots, z, guess)
+            found = self._solve_pose(predicted, points, slots, observations, guess)
         except np.linalg.LinAlgError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: the pose cannot be solved for: {error}")
+        self._contradicted = found.contradicted
+        T, used = found.T, found.used
         if not used.any():
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
+        if found.jump is not None:
+            predicted = replace(predicted, noise=predicted.noise + np.diag(found.jump))
         solved = self._points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         try:
@@ -132,11 +141,14 @@ class SmootherBackend:
         except np.linalg.LinAlgError:  # covariances that differ by more than their digits
             nis, dof = float("nan"), 0
         with self._whole():
-            failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used], 1.0)
+            if found.jump is not None:
+                failure = self._graph.start_anew(predicted.stamp, T, world_covariance(P), slots[used], z[used])
+            else:
+                failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
             self._predicted = None
-        if failure:
-            return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
-        return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
+            if failure:
+                return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
+            return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
 
     @one_blas_thread
     def add(self, observations: Observations) -> None:
@@ -276,19 +288,24 @@ class SmootherBackend:
         return predict_points(predicted, marks.position[slots], marks.covariance[slots], by_window)
 
     def _solve_pose(
-        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, z: Array, guess: Array | None
-    ) -> tuple[Array, BoolArray]:
+        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, observations: Observations,
+        guess: Array | None,
+    ) -> Agreement:  # fmt: skip
         """First value of the newest pose, and which measurements agree with it."""
+        marks, z = self.measurement_log.landmarks, self._stereo.measure(observations)
         noise = residual_noise(self._stereo, self._make.sigma, points, z)
-        known = self.measurement_log.landmarks.prior[
-            slots
-        ].any()  # what is known in the world does not move with the poses
+        known = marks.prior[slots].any()  # what is known in the world does not move with the poses
         information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to(self._last_measured()))
         problem = pose_only.PoseProblem(
-            self._stereo, self.measurement_log.landmarks.position[slots], z, noise, predicted.T, information,
-            self.models.gate_probability,
-        )  # fmt: skip
-        return pose_only.solve(problem, predicted.T if guess is None else guess)
+            self._stereo, marks.position[slots], z, noise, predicted.T, information, self.models.gate_probability
+        )
+
+        def search() -> Array | None:
+            rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
+            return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
+
+        start, lost = predicted.T if guess is None else guess, len(predicted.window) > 0 and self._graph.lost()
+        return agreement(problem, start, search, self._contradicted, lost)
 
     def _last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""

@@ -29,6 +29,11 @@ def inverse_depth(local: Array) -> tuple[Array, Array]:
     return np.array([x * w, y * w, w]), w * np.array([[1, 0, -x * w], [0, 1, -y * w], [0, 0, -w]])
 
 
+def _as_it_is(local: Array) -> tuple[Array, Array]:
+    """A point (3,) and its derivatives (3, 3)."""
+    return local, np.eye(3)
+
+
 class FactorMaker:
     """Makes factors for one rig and one set of models.
 
@@ -68,11 +73,8 @@ class FactorMaker:
         noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.first_velocity_sigmas(self.models, dt))
         return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise)
 
-    def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float, scale: float) -> gtsam.NonlinearFactor:
-        """Between three successive poses: constant velocity but for an impulse (see `motion`).
-
-        `scale` multiplies the impulse's standard deviation.
-        """
+    def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float) -> gtsam.NonlinearFactor:
+        """Between three successive poses: constant velocity but for an impulse (see `motion`)."""
 
         def error(_this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
             poses = [values.atPose3(key) for key in keys]
@@ -84,7 +86,7 @@ class FactorMaker:
                     jacobians[i] = Ji
             return residual
 
-        noise = gtsam.noiseModel.Diagonal.Sigmas(scale * motion.motion_sigmas(self.models, dt12))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(motion.motion_sigmas(self.models, dt12))
         return gtsam.CustomFactor(noise, list(keys), error)
 
     def step(self, keys: tuple[int, int], relative: Array, dt: float) -> gtsam.NonlinearFactor:
@@ -105,12 +107,14 @@ class FactorMaker:
     def known(self, key: int, known: Known) -> gtsam.NonlinearFactor:
         """What was known of a landmark variable beforehand, in the world or before a camera.
 
-        Before a camera it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so than in metres.
+        Where a camera has measured it, it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so
+        than in metres.
         """
         if known.frame is None:
             noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
             return gtsam.PriorFactorPoint3(key, known.position, noise)
-        place, D = inverse_depth(known.position)
+        coordinates = inverse_depth if known.seen else _as_it_is
+        place, D = coordinates(known.position)
         noise = gtsam.noiseModel.Gaussian.Covariance(D @ known.covariance @ D.T)
 
         def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
@@ -118,7 +122,7 @@ class FactorMaker:
             T = values.atPose3(pose).matrix()
             R = T[:3, :3]
             local = R.T @ (values.atPoint3(landmark) - T[:3, 3])
-            now, D = inverse_depth(local)
+            now, D = coordinates(local)
             if jacobians is not None:
                 jacobians[0] = D @ np.concatenate([hat(local), -np.eye(3)], axis=1)
                 jacobians[1] = D @ R.T

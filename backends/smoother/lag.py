@@ -63,8 +63,8 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
     touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
     for slot, factor in solver.factors():
         keys = factor.keys()
-        if history.held is not None and keys == [history.held.key]:
-            continue
+        if history.held is not None and keys == [history.held.key] and isinstance(factor, gtsam.PriorFactorPose3):
+            continue  # what holds it; a prior on that pose alone is a `CustomFactor`
         if leaving.isdisjoint(keys):
             slots[slot] = kept.factors.size()
             kept.factors.add(factor)

@@ -22,7 +22,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from backends.smoother.solver import FAILURES, SolverError
 from backends.smoother.variables import size_of
-from slam.geometry.se3 import Array, adjoint, hat, inverse
+from slam.geometry.se3 import Array, adjoint, hat, inverse, nearest_rotation
 
 #: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
 _JITTER = (1e-13, 1e-11, 1e-9)
@@ -155,6 +155,13 @@ class MarginalPrior:
         root = _root(H[::-1, ::-1])
         d = solve_triangular(root, b[::-1], trans="T")
         return MarginalPrior(self.poses[:1], (), self.T_reference, self.T_relative[:0], self.local[:0], root, d)
+
+
+def reference_prior(key: int, T: Array, covariance: Array) -> MarginalPrior:
+    """What is known of one pose alone: that it is T (4, 4) with a covariance (6, 6)."""
+    T = gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3]).matrix()
+    R = _root(np.linalg.inv(covariance))
+    return MarginalPrior((key,), (), T, np.zeros((0, 4, 4)), np.zeros((0, 3)), R, np.zeros(6))
 
 
 def marginal_prior(

@@ -38,11 +38,13 @@ class Path:
     Attributes:
         count: number of frames.
         measured: those in which landmarks were measured, ascending.
+        jumps: those whose poses do not follow from the ones before; the camera goes on from there at an unknown speed.
     """
 
     def __init__(self) -> None:
         self.count = 0
         self.measured: list[int] = []
+        self.jumps: list[int] = []
         self._stamps = np.zeros(64)
         self._poses = np.zeros((64, 4, 4))
 
@@ -69,6 +71,10 @@ class Path:
         """Note that landmarks were measured in the newest frame."""
         if not self.measured or self.measured[-1] < self.count - 1:
             self.measured.append(self.count - 1)
+
+    def jumped(self, frame: int) -> bool:
+        """Whether the pose of a frame does not follow from those before it."""
+        return frame in self.jumps
 
     def upto(self, count: int) -> Path:
         """The first `count` frames; they share their memory with this."""
@@ -182,11 +188,13 @@ class Known:
         position: in world coordinates, or in the camera's where `frame` is one (3,) [m].
         covariance: its covariance (3, 3) [m²].
         frame: frame of the camera in whose coordinates that is; None for the world's.
+        seen: whether it was measured from there: then it is its inverse depth that is Gaussian, nearly.
     """
 
     position: Array
     covariance: Array
     frame: int | None = None
+    seen: bool = True
 
     def hangs_before(self, first: int) -> bool:
         """Whether it hangs on a camera before frame `first`."""
@@ -206,7 +214,6 @@ class History:
         places: where each of those was believed to be at first.
         variables: number of landmark variables that were ever made, for their names.
         known: what was known of landmarks beforehand, by serial number.
-        impulses: factor on the impulse's standard deviation, by frame.
         restarted: the poses of so many frames from the first on hang on each other as they are, without measurements.
     """
 
@@ -219,7 +226,6 @@ class History:
         self.held: Held | None = None
         self.places: dict[int, Array] = {}
         self.known: dict[int, Known] = {}
-        self.impulses: list[float] = []
         self.restarted = 0
         self.variables = 0
 
@@ -382,6 +388,33 @@ class MeasurementLog:
             track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
+
+    def start_anew(self, prior: MarginalPrior, covariances: Array) -> None:
+        """Begin with the newest pose, of which `prior` is known, and with the landmarks as they stand before it.
+
+        `covariances` (M, 3, 3) of all landmarks, by slot, as seen from there, in world axes.
+        """
+        path, history, marks, frame = self.path, self.history, self.landmarks, self.path.count - 1
+        path.jumps.append(frame)
+        history.prior = None
+        self.forget_measurements()
+        history.first, history.prior, history.held, history.restarted = frame, prior, None, 0
+        history.known = {serial: known for serial, known in history.known.items() if known.frame is None}
+        slots, T = marks.used(), path.poses[-1]
+        marks.recent[slots], marks.seen[slots], marks.information[slots], marks.older[slots] = -1, 0, 0, 0
+        marks.last[slots] = frame
+        fixed = marks.prior[slots].any(axis=(1, 2))  # they are known in the world
+        marks.covariance[slots[~fixed]] = covariances[~fixed]
+        hanging = slots[~fixed]
+        local = (marks.position[hanging] - T[:3, 3]) @ T[:3, :3]
+        covariances = T[:3, :3].T @ marks.covariance[hanging] @ T[:3, :3]
+        marks.older[hanging] = np.linalg.inv(marks.covariance[hanging])
+        # What is not known by as much as its distance is measured anew, as if it were new.
+        known = np.trace(covariances, axis1=1, axis2=2) < (local**2).sum(axis=1)
+        hanging, local, covariances = hanging[known], local[known], covariances[known]
+        for serial, position, covariance in zip(marks.serial[hanging].tolist(), local, covariances):
+            history.known[serial] = Known(position, covariance, frame, seen=False)
+        self._forget_unused_measurements()
 
     def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held | None) -> None:
         """Let go of the poses before frame `first` and of the landmark variables `gone`: `prior` holds what they said.

@@ -8,12 +8,12 @@ from contextlib import suppress
 
 import numpy as np
 
-from backends.smoother import uncertainty
+from backends.smoother import recovery, uncertainty
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.graph import FactorMaker, to_pose3
 from backends.smoother.lag import held_pose, overdue, without_old
-from backends.smoother.marginal import Held
+from backends.smoother.marginal import Held, reference_prior
 from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog
 from backends.smoother.prediction import carried_covariance
 from backends.smoother.rebuild import optimise, pose_factor, whole_problem
@@ -97,14 +97,12 @@ class PoseGraph:
         """Add a frame without measurements."""
         self.measurement_log.path.append(stamp, T_world_left)
         try:
-            self._enter_pose(Change(), 1.0)
+            self._enter_pose(Change())
         except SolverError:
             self._recover()
         self._advance()
 
-    def append_measured_pose(
-        self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array, impulse: float
-    ) -> str:
+    def append_measured_pose(self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array) -> str:
         """Add a frame with measurements (M, 3) of landmarks.
 
         Args:
@@ -112,7 +110,6 @@ class PoseGraph:
             T_world_left: first value of the pose (4, 4), near the solution.
             slots: landmarks (M,).
             z: their measurements (M, 3).
-            impulse: factor on the standard deviation of the motion's impulse.
 
         Returns:
             what failed, in one line; empty if nothing did. After a failure the frame stands without measurements.
@@ -124,7 +121,7 @@ class PoseGraph:
         grown = self._factor_builder.grow(change, slots, rows, z)
         try:
             try:
-                new = self._enter_pose(change, impulse)
+                new = self._enter_pose(change)
                 for track, place in grown:
                     track.factor = new[place]
             except SolverError:
@@ -144,6 +141,39 @@ class PoseGraph:
             self._recover()
         self._factor_builder.finish_tracks(slots)
         self._advance()
+        return ""
+
+    def start_anew(self, stamp: float, T_world_left: Array, covariance: Array, slots: IndexArray, z: Array) -> str:
+        """Add a frame whose pose follows from the landmarks and not from the poses before it.
+
+        Those stay as they are, and the landmarks stay where they are before the new pose.
+
+        Args:
+            stamp: time [s].
+            T_world_left: the pose (4, 4).
+            covariance: what is known of it in the world (6, 6).
+            slots: landmarks (M,) measured.
+            z: their measurements (M, 3).
+
+        Returns:
+            what failed, as in `append_measured_pose`.
+        """
+        log, frame = self.measurement_log, self.measurement_log.path.count
+        covariances = self._covariances_from_measured(log.landmarks.used())
+        log.path.append(stamp, T_world_left)
+        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
+        self._window, self._carried, self._solved, self._broken = None, None, False, True
+        rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
+        self._factor_builder.grow(Change(), slots, rows, z)
+        try:
+            self._rebuild()
+        except SolverError as error:
+            log.take_back(slots, rows)
+            self._recover()
+            return str(error)
+        log.landmarks.measured(slots, rows, frame)
+        log.path.note_measured()
+        self._place(slots)
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
@@ -275,6 +305,26 @@ class PoseGraph:
                 P[row] = exact[key]
         return P
 
+    def _covariances_from_measured(self, slots: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmark positions as seen from the newest pose that measured any, in world axes."""
+        window, marks, measured = self.window(), self.measurement_log.landmarks, self.measurement_log.path.measured
+        place = int(np.searchsorted(window.frames, measured[-1])) if measured else len(window) - 1
+        J = self.landmarks_by_window(slots).copy()
+        J[:, :, 6 * place : 6 * place + 6] -= uncertainty.carried(window.poses[place], marks.position[slots])
+        return uncertainty.quadratic(J, window.covariance) + marks.covariance[slots]
+
+    def lost(self) -> bool:
+        """Whether what is in view hangs on a pose that is turned by an unknown angle: no linearisation holds there."""
+        window, path, enough = self.window(), self.measurement_log.path, recovery.CONFIRMED
+        if not path.measured or not recovery.unknown_turn(window.covariance[-6:, -6:]):
+            return False
+        newest = path.measured[-1]
+        if np.count_nonzero(self.measurement_log.measurements.frame == newest) < enough:
+            return False
+        with suppress(SolverError):  # the oldest pose, where it is held, may be turned in the world by any angle
+            return recovery.unknown_turn(self._solver.joint_covariance([pose_key(newest)]))
+        return False
+
     def converge(self) -> None:
         """Solve to the last: every variable is linearised anew where it stands until nothing moves any more."""
         if self._solved:
@@ -314,23 +364,27 @@ class PoseGraph:
 
     # --- factors ---
 
-    def _enter_pose(self, change: Change, impulse: float) -> list[int]:
+    def _enter_pose(self, change: Change) -> list[int]:
         """Add the newest pose with its prior or motion to the change, and solve; returns the new factors' slots."""
         path = self.measurement_log.path
         i = path.count - 1
         if i >= 3:
             self._factor_builder.eliminate_late(change)
-        self.measurement_log.history.impulses.append(impulse)
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
-        change.factors.add(pose_factor(self._make, path, i, impulse))
+        change.factors.add(pose_factor(self._make, path, i))
         self._window, self._solved = None, False
-        return self._solver.update(change, self._often if path.count % _EVERY else self._seldom)
+        thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver linearises all anew
+        return self._solver.update(change, self._seldom if thorough else self._often)
 
     # --- the lag ---
 
+    def _overdue(self) -> int | None:
+        """Frame of the oldest pose that shall stay, where others leave in this frame."""
+        return None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+
     def _advance(self) -> None:
         """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
-        first = None if self._config.lag is None else overdue(self.measurement_log, self._config.lag)
+        first = self._overdue()
         if first is None:
             return
         try:
@@ -362,7 +416,7 @@ class PoseGraph:
         makes the solver linearise anew.
         """
         path = self.measurement_log.path
-        first = max(0, path.count - self._config.window)
+        first = max(self.measurement_log.history.first, path.count - self._config.window)
         before = path.poses.copy()
         path.poses[first:] = self._solver.poses(pose_key(i) for i in range(first, path.count))
         self._moved += float(np.abs(path.poses[first] - before[first]).max())
@@ -460,7 +514,8 @@ class PoseGraph:
             change.factors.add(held.factor())
         solver = self._new_solver()
         new = solver.update(change)
-        held = _informed(held, solver)
+        with suppress(SolverError):
+            held = _informed(held, solver)
         self._broken = True  # until all of the following has been done
         self.measurement_log.history.held = held
         for track in self.measurement_log.landmarks.tracks.values():

@@ -178,6 +178,11 @@ def _carry(poses: Array, points: Array) -> Array:
     return np.concatenate([turn @ R, np.broadcast_to(R, turn.shape)], axis=3)
 
 
+def carried(T: Array, points: Array) -> Array:
+    """How points (M, 3) move that are fixed to a pose (4, 4), by its perturbation (M, 3, 6)."""
+    return _carry(T[None], points)[:, 0]
+
+
 def quadratic(A: Array, P: Array) -> Array:
     """``A P Aᵀ`` (M, k, k) for A (M, k, n)."""
     count, k, n = A.shape

@@ -289,6 +289,35 @@ def test_a_call_that_is_interrupted_did_not_happen(lag):
     near_the_truth(backend, data)
 
 
+def one_frame(backend, stamp, seen, old):
+    """The calls of a frame, in their order; each returns something to compare."""
+    return (
+        lambda: backend.predict(stamp).T_world_left,
+        lambda: backend.estimate(landmarks=False).covariance,
+        lambda: backend.update(seen.select(old)).used,
+        lambda: backend.add(seen.select(~old)) or 0,
+        lambda: backend.estimate().covariances,
+    )
+
+
+@pytest.mark.parametrize("lag", [None, 12])
+def test_predictions_and_estimates_may_be_interrupted(lag):
+    """The same call again gives what it gives without the interruption."""
+    data, known = drive(20), set()
+    whole, backend = (SmootherBackend(RIG, MODELS, lag=lag) for _ in range(2))
+    rng, interrupted = np.random.default_rng(0), 0
+    for k, (stamp, _, seen) in enumerate(data):
+        old = np.isin(seen.ids, list(known))
+        expected = [call() for call in one_frame(whole, stamp, seen, old)]
+        for i, call in enumerate(one_frame(backend, stamp, seen, old)):
+            if k and i in (0, 1, 4):
+                interrupted += interrupt(call, int(rng.integers(1, 25)))
+            np.testing.assert_allclose(call(), expected[i], rtol=1e-3, atol=1e-6)
+        known.update(seen.ids.tolist())
+    assert interrupted > 20
+    near_the_truth(backend, data)
+
+
 def interrupt(call, number: int) -> bool:
     """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
     left = number

@@ -44,7 +44,6 @@ class Subject:
         case: makes one of a random generator, in an empty folder, and gives it to the program.
         quiet: whether Python's warnings count as broken promises.
         short: number of cases in the tests.
-        open: what is still to be mended, where the promise is not kept yet; the tests expect failures then.
     """
 
     name: str
@@ -53,7 +52,6 @@ class Subject:
     case: Case
     quiet: bool = True
     short: int = 60
-    open: str = ""
 
 
 @dataclass(frozen=True)
