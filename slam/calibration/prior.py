@@ -24,7 +24,7 @@ _RESIDUAL = 2e-4
 #: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
 #: [focal lengths].
 MEAN_DISPARITY = 7e-4
-MEAN_VERTICAL = 1.4e-3
+MEAN_VERTICAL = 1.4e-3  # the same of the vertical disparity [focal lengths]
 
 #: Cameras that are knocked or warmed up turn by less than a milliradian, with the best calibration: an offset of all
 #: disparities [focal lengths].
