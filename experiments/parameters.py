@@ -27,7 +27,9 @@ INTRODUCTION = """# Parameters
 
 Every number in the algorithms that is not a setting, with what it is and where it comes from. Settings are listed by
 `slam run --help` and in the [reference](running.md). The table is made by `python experiments/parameters.py`.
+"""
 
+SENSITIVITY = """\
 The columns ½ and 2 say what happens to the position error where the number is half and twice as large: the ratio to the
 error with the default, the worse of both back ends, as the geometric mean over short runs of three worlds and a drive
 (`python experiments/sensitivity.py`). The runs with small perturbations of the pixels scatter by the factor that stands
@@ -120,21 +122,27 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
     ratios = sensitivity.get("ratios", {})
     lines = [INTRODUCTION]
     if ratios:
-        lines.append(f"Scatter of the default under perturbation: a factor of {sensitivity['scatter']:.2f}.\n")
+        lines += [
+            SENSITIVITY,
+            f"Scatter of the default under perturbation: a factor of {sensitivity['scatter']:.2f}.\n",
+        ]
+    titles = ["file", "name", "value", "what it is", *(["½", "2"] if ratios else [])]
+    rule = ["---", "---", "---:", "---", *(["---:", "---:"] if ratios else [])]
     for room in ROOMS:
         chosen = [p for p in parameters if p.file.startswith(room + "/")]
         if not chosen:
             continue
-        lines.append(
-            f"## {room}\n\n| file | name | value | what it is | ½ | 2 |\n| --- | --- | ---: | --- | ---: | ---: |"
-        )
+        lines += [f"## {room}\n", _row(titles), _row(rule)]
         for p in chosen:
-            half, twice = ratios.get(f"{p.module}:{p.name}", ["", ""])
-            file = p.file.removeprefix(room + "/")
-            comment = p.comment.replace("|", "\\|")
-            lines.append(f"| {file} | `{p.name}` | {p.value} | {comment} | {_ratio(half)} | {_ratio(twice)} |")
+            measured = ratios.get(f"{p.module}:{p.name}", ["", ""]) if ratios else []
+            cells = [p.file.removeprefix(room + "/"), f"`{p.name}`", str(p.value), p.comment.replace("|", "\\|")]
+            lines.append(_row([*cells, *map(_ratio, measured)]))
         lines.append("")
     return "\n".join(lines)
+
+
+def _row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
 
 
 def _ratio(value: Any) -> str:

@@ -15,7 +15,7 @@ from slam.objects.matching import match_far
 from slam.objects.tracks import Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
-_HYPOTHESES = 60
+_HYPOTHESES = 60  # poses tried for a body that is found again
 _LEAST = 3  # points that fix a pose
 _LEAST_ANEW = 4  # points that must agree where a body is found again
 
