@@ -37,8 +37,8 @@ def require_guess(owner: str, guess: Array | None) -> None:
     """
     if guess is None:
         return
-    if np.shape(guess) != (4, 4) or not np.isfinite(guess).all():
-        raise MeasurementError(f"{owner}: the guess must be a finite pose (4, 4), got an array of {np.shape(guess)}")
+    if not isinstance(guess, np.ndarray) or guess.shape != (4, 4) or not np.isfinite(guess).all():
+        raise MeasurementError(f"{owner}: the guess must be a finite pose, an array (4, 4)")
     R = guess[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise MeasurementError(f"{owner}: the guess must be a pose: its rotation is none")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or (guess[3] != (0, 0, 0, 1)).any():
+        raise MeasurementError(f"{owner}: the guess must be a rigid motion: a rotation and a translation")

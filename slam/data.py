@@ -237,7 +237,7 @@ class FrameStatus(StrEnum):
 
     STARTED = "started"  #: first frame, or the first one with anything to see: the map begins
     TRACKED = "tracked"  #: the pose was measured against the map
-    LOST = "lost"  #: nothing was recognised for several frames: the pose is the motion model's, and far off perhaps
+    LOST = "lost"  #: no match for several frames: the pose is predicted only, and may be far off
     PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
     FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
 

@@ -126,7 +126,7 @@ class ObjectBackend(Protocol):
 
 @runtime_checkable
 class RevisingBackend(Protocol):
-    """What a back end offers besides, where it can mend measurements that it was given long ago.
+    """What a back end offers besides, where it can correct past measurements anew.
 
     Attributes:
         revises_path: whether the path follows; else only the landmarks before the camera do.

@@ -116,7 +116,7 @@ class StereoSlam:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
             self.landmarks = known_map.rows
-            self._last = _Last(mapped=len(known_map) > 0)
+            self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
@@ -154,7 +154,7 @@ class StereoSlam:
 
         A frame with nothing to see is no error: the state is predicted and the status says so. A step that an exception
         ends, an interrupt for instance, did not happen, except that the back end's belief stands at its stamp: continue
-        with a later frame; see `roll_back`.
+        with a later frame; see `roll_back`. (What the calibration has learnt from its features stays.)
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
@@ -163,7 +163,7 @@ class StereoSlam:
         self.roll_back()
         index, stages = self._last.index + 1, self._stages
         if self._relocalizer.search is not None and not self._locate(features, index):
-            self._last = replace(self._last, index=index)
+            self._last, self._stamp = replace(self._last, index=index), features.stamp
             return self._relocalizer.search.lost(index, features)
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
@@ -175,11 +175,11 @@ class StereoSlam:
             prediction, matches = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
             matches = matches.without(held)
-            pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
-            self.calibration.observe(raw, pose)
         with stages.stage("update"):  # the measurement of the landmarks
             report = self.backend.update(matches.observations(features), matches.T_world_left)
             state = self._localizer.state_after(self._last.state, prediction, features, matches, report)
+            pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
+            self.calibration.observe(raw, pose)
         with stages.stage("estimate"):
             estimate = self.backend.estimate(landmarks=False)
             self._uncertainty.observe(estimate.T_world_left, report.used, self.backend.positions(report.used))
@@ -213,7 +213,7 @@ class StereoSlam:
         self._stages = Stages()
 
     def trajectory(self) -> Trajectory:
-        """The left camera's path: the back end's last word on every frame (in a known map, from when it was found)."""
+        """The left camera's path: the latest estimate of each frame's pose (in a known map, from when it was found)."""
         return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
 
     def estimate(self) -> Estimate:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from slam.data import Observations
-from slam.geometry.rig import RectifiedTwin, StereoRig
+from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
 
 _NEAREST = 1e-6  # no depth below this [m] is projected
@@ -29,7 +29,7 @@ class RectifiedStereo:
         scale: rectified pixels per original pixel, on average over the image.
     """
 
-    rectified_rig: RectifiedTwin
+    rectified_rig: RectifiedRig
     f: float
     u0: float
     v0: float
@@ -109,7 +109,7 @@ def by_pose(J: Array, local: Array) -> Array:
     return out
 
 
-def _scale(rectified_rig: RectifiedTwin) -> float:
+def _scale(rectified_rig: RectifiedRig) -> float:
     """Mean stretch of the left image by rectification."""
     rig = rectified_rig.original
     if rig.is_rectified:

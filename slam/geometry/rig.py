@@ -188,13 +188,13 @@ class StereoRig:
         return out
 
     @cached_property
-    def rectified(self) -> RectifiedTwin:
+    def rectified(self) -> RectifiedRig:
         """The rectified rig: itself where `is_rectified`."""
         return rectify(self)
 
 
 @dataclass(frozen=True)
-class RectifiedTwin:
+class RectifiedRig:
     """The rectified rig that sees the same, and the ways between its pixels and the original's.
 
     Attributes:
@@ -243,14 +243,14 @@ class RectifiedTwin:
         return tables[0], tables[1]
 
 
-def rectify(rig: StereoRig) -> RectifiedTwin:
+def rectify(rig: StereoRig) -> RectifiedRig:
     """The rectified rig of a rig, by OpenCV's ``stereoRectify`` with only valid pixels (no black borders).
 
     Raises:
         CalibrationError: the cameras look so far apart that no common rectified image is left.
     """
     if rig.is_rectified:
-        return RectifiedTwin(rig, rig, np.eye(3), np.eye(3))
+        return RectifiedRig(rig, rig, np.eye(3), np.eye(3))
     R_left, R_right, P_left, P_right = _stereo_rectify(rig)
     f = float(P_left[0, 0])
     if rig.left.model == "equidistant":
@@ -269,7 +269,7 @@ def rectify(rig: StereoRig) -> RectifiedTwin:
         rig.height,
         float(P_right[0, 2] - P_left[0, 2]),
     )
-    return RectifiedTwin(rig, rectified_rig, R_left, R_right)
+    return RectifiedRig(rig, rectified_rig, R_left, R_right)
 
 
 def _stereo_rectify(rig: StereoRig) -> tuple[Array, Array, Array, Array]:

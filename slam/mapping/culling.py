@@ -8,6 +8,8 @@ from slam.geometry.arrays import Array, BoolArray
 from slam.landmarks import LandmarkRows
 from slam.mapping.config import MapConfig
 
+_BLOCK = 256  # landmarks that are compared with all others at once
+
 
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV)."""
@@ -33,12 +35,13 @@ def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConf
     if not len(just) or not config.spacing:
         return out
     reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)
-    gap = positions[just][:, None] - positions[gone][None]
-    near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[just][:, None], reach[gone][None]) ** 2
     rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # of equals the older one is the better
-    first, second = np.nonzero(near & (just[:, None] != gone[None]))
-    one, other = just[first], gone[second]
-    out[np.where(rank[one] < rank[other], one, other)] = True
+    for some in np.split(just, range(_BLOCK, len(just), _BLOCK)):
+        gap = positions[some][:, None] - positions[gone][None]
+        near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[some][:, None], reach[gone][None]) ** 2
+        first, second = np.nonzero(near & (some[:, None] != gone[None]))
+        one, other = some[first], gone[second]
+        out[np.where(rank[one] < rank[other], one, other)] = True
     return out
 
 

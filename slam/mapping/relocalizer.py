@@ -69,9 +69,12 @@ class Relocalizer:
 
         Raises:
             ConfigurationError: the back end was not given by its name, or cannot start in a known map.
+            SlamError: the map is empty, or too large for the back end.
         """
         if self._backend is None:
             raise ConfigurationError("a system that starts in a known map needs its back end by name")
+        if not len(known):
+            raise SlamError(f"{known.source}: the map holds no landmarks, so the camera cannot be found in it")
         self.search = MapSearch(known, self._rig, self._localizer, self._models.initial_pose)
         self.search.fill(backend)
 

@@ -23,7 +23,7 @@ class ObjectDetector(Protocol):
         ...
 
     def restart(self) -> None:
-        """Forget the tracks and bodies, which do not go on where the camera was carried off; ids are not used again."""
+        """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
         ...
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:

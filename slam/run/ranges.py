@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
+from slam.bounds import LEAST
+
 Accepts = Callable[[float], bool]
 
 _TRIED = 130  # whole numbers from zero on that are tried one by one, to find sets such as 16 and 64
@@ -48,9 +50,9 @@ def _last_number(accepts: Accepts, inside: float, sign: float) -> float:
     if accepts(sign * _LARGE):
         return sign * inf
     if inside * sign < 0 and not accepts(sign * _SMALL):
-        return 0.0 if accepts(-sign * _SMALL) else _bisected(accepts, inside, -sign * _SMALL)
-    if inside == 0 and not accepts(sign * _SMALL):
-        return 0.0
+        return 0.0 if accepts(0.0) or accepts(-sign * _SMALL) else _bisected(accepts, inside, -sign * _SMALL)
+    if inside == 0 and not accepts(sign * _SMALL):  # zero itself is allowed, and numbers from `LEAST` on
+        return _bisected(accepts, sign * LEAST, sign * _LARGE) if accepts(sign * LEAST) else 0.0
     return _bisected(accepts, inside if inside * sign > 0 else sign * _SMALL, sign * _LARGE)
 
 

@@ -16,11 +16,13 @@ class TrackingState:
         unmatched: frames since the pose was last measured.
         unknown: how many of these showed enough features to recognise a known place.
         lost: for so long, and the prediction is so uncertain, that the camera's pose is not known.
+        showed_enough: the last frame showed enough features to recognise a known place.
     """
 
     unmatched: int = 0
     unknown: int = 0
     lost: bool = False
+    showed_enough: bool = False
 
     def after(self, measured: bool, uncertain: bool, stereo_features: int, lost_after: int) -> TrackingState:
         """The state after a frame.
@@ -34,8 +36,9 @@ class TrackingState:
         if measured:
             return TrackingState()
         unmatched = self.unmatched + 1
-        unknown = self.unknown + (stereo_features >= _ENOUGH_FEATURES)
-        return TrackingState(unmatched, unknown, self.lost or (uncertain and unmatched >= lost_after))
+        enough = stereo_features >= _ENOUGH_FEATURES
+        lost = self.lost or (uncertain and unmatched >= lost_after)
+        return TrackingState(unmatched, self.unknown + enough, lost, enough)
 
     def may_add(self, restart_after: int) -> bool:
         """Whether new landmarks may join the map.
@@ -43,4 +46,4 @@ class TrackingState:
         Not while the pose is unknown. But after `restart_after` frames that showed enough and matched nothing, the
         place is taken for an unknown one, and is mapped from the predicted pose on.
         """
-        return not self.unmatched or (self.unknown > 0 and self.unknown % restart_after == 0)
+        return not self.unmatched or (self.showed_enough and self.unknown % restart_after == 0)

@@ -94,6 +94,8 @@ def test_ranges_are_those_that_are_checked(every):
         (lambda x: x <= 0, 0.0, "(-∞, 0]"),
         (lambda x: True, 0.0, "(-∞, ∞)"),
         (lambda x: 1e-9 <= x <= 1e9, 1.0, "[1e-09, 1000000000]"),
+        (lambda x: x == 0 or 1e-9 <= x <= 5, 1.0, "[0, 5]"),
+        (lambda x: x == 0 or 1e-9 <= x <= 5, 0.0, "[0, 5]"),
     ],
 )
 def test_ranges_of_numbers(accepts, default, range_):

@@ -15,7 +15,7 @@ import slam
 from experiments.startup import STARTS, start_up, stored_map
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures
-from slam.errors import ConfigurationError, SlamError
+from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap, decode, encode, load_map, save_map
 from slam.models import EstimatorModels
@@ -205,8 +205,13 @@ def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backe
 def test_descriptors_of_another_kind_are_refused():
     known = first_run("ekf").snapshot()
     system = StereoSlam(RIG, None, "ekf", config=CONFIG, known_map=known)
-    with pytest.raises(SlamError, match="32 numbers, those of the front end 64"):
-        system.process_features(StereoFeatures.empty(0.0, 64))
+    assert system.process_features(StereoFeatures.empty(0.0, 64)).status is FrameStatus.LOST  # nothing to see
+    features, _ = Cloud(60, dimensions=64).features(np.eye(4), 1.0)
+    with pytest.raises(SlamError, match="descriptors have 64 numbers, those of earlier frames 32"):
+        system.process_features(features)
+    assert system.process_features(StereoFeatures.empty(2.0, 32)).status is FrameStatus.LOST
+    with pytest.raises(MeasurementError, match="not later"):
+        system.process_features(StereoFeatures.empty(1.5, 32))
     with pytest.raises(SlamError, match="front end 'orb'"):
         StereoSlam(RIG, "surf", "ekf", known_map=replace(known, frontend="orb"))
     with pytest.raises(ConfigurationError, match="by name"):
