@@ -169,7 +169,7 @@ class MapBackend(Protocol):
         """Add landmarks at `local` (N, 3) [m] in the newest camera's coordinates, with covariances (N, 3, 3) [m²].
 
         As `Backend.add`, but for landmarks whose place before the camera comes from elsewhere than a stereo pair: the
-        covariances say how well it is known, and the landmarks hang on the camera's pose as it was when they came.
+        covariances say how well it is known. The landmarks are correlated with the camera's pose at that time.
 
         Raises:
             MeasurementError: before the first `predict`; an id is in the map already, or a covariance is not symmetric

@@ -90,7 +90,10 @@ class StereoSlam:
     ) -> None:
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
-        self.config = c = config or SystemConfig.for_kind(kind, *names)
+        c = config or SystemConfig.for_kind(kind, *names)
+        if known_map is not None and len(known_map) > c.map.max_landmarks:  # all of it is kept
+            c = replace(c, map=replace(c.map, max_landmarks=len(known_map)))
+        self.config = c
         self.frontend: Frontend | None = (
             registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
         )
@@ -112,6 +115,7 @@ class StereoSlam:
         self._stages = Stages()
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._given = self.calibration.applied  # the correction of all that the back end was given
+        self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
         if known_map is not None:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
@@ -254,10 +258,13 @@ class StereoSlam:
         As all its measurements are then weighed anew, that waits for a change that is significant.
         """
         revising = isinstance(self.backend, RevisingBackend)
-        change = self.calibration.apply(_REVISION if revising else 0.0)
-        if not (isinstance(self.backend, RevisingBackend) and self.backend.revises_path) and change is not None:
-            step = change.after.parameters - change.before.parameters
-            self._uncertainty.path_keeps(step, self.backend.positions, landmarks_follow=revising)
+        self.calibration.apply(_REVISION if revising else 0.0)
+        applied = self.calibration.applied
+        if not (isinstance(self.backend, RevisingBackend) and self.backend.revises_path):
+            step = applied.parameters - self._accounted.parameters
+            if step.any():
+                self._uncertainty.path_keeps(step, self.backend.positions, landmarks_follow=revising)
+                self._accounted = applied
         if not isinstance(self.backend, RevisingBackend) or self.calibration.applied is self._given:
             return None
         revision = Revision(self._given, self.calibration.applied)

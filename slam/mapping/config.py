@@ -20,11 +20,11 @@ class MapConfig:
         erase_missed: a landmark is erased after so many successive frames in view without being measured ("not
             continuously detected"). Frames in which it may be hidden, or lies near the image's border, do not count.
         erase_share: a landmark is erased where it was measured in less than this share of the frames in view, judged
-            from `erase_missed` frames on.
+            after more than `erase_missed` frames.
         confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
-        spacing: of landmarks out of view (or hidden, or seen from elsewhere) that lie nearer to each other than this
-            share of the distance that they were first seen from, the one measured in most frames stays; 0 for all: a
-            map that grows with every look at the same place.
+        spacing: of landmarks that have gone out of view, and lie nearer to each other than this share of the distance
+            that they were first seen from, only the one measured in most frames stays; 0 keeps all, and the map then
+            grows each time the camera sees the same place.
         forget_after: landmarks not measured for so many frames are erased wherever they are, so that nothing is seen
             again; 0 for never: the map lasts.
         view_margin: distance from the border [px] within which a landmark is not sure to be detected.
@@ -34,9 +34,10 @@ class MapConfig:
             where their descriptors are alike.
         same_descriptor: largest descriptor distance of two landmarks that are one and the same.
         descriptor_update: weight of a landmark's newest descriptor against the one kept; 1 keeps the last, 0 the first.
-        lost_after: where no landmark was recognised for so many frames and the prediction is vague, the camera is lost.
-        restart_after: where nothing was recognised in so many frames that showed enough features for it, the place is
-            taken for an unknown one: new landmarks are added from the predicted pose; again after as many frames.
+        lost_after: the camera is lost after this many frames without a match, if the predicted pixels are less certain
+            than `association.tight_window`.
+        restart_after: after this many unmatched frames with enough features to recognise a known place, landmarks are
+            added from the predicted pose; again after as many more.
         max_landmarks: size of the map; beyond it, those measured longest ago are erased.
         monocular: features without a stereo match become landmarks too, when two views give their depth (paper B, 2.2).
     """

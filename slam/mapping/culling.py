@@ -48,7 +48,7 @@ def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConf
 def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) to erase so that `max_landmarks` remain: those measured longest ago.
 
-    Among those not measured now, the ones that were never recognised after their first sight go before all others.
+    Among those not measured now, the ones that were measured in one frame only go before all others.
     """
     out = np.zeros(len(landmarks), bool)
     surplus = len(landmarks) - config.max_landmarks

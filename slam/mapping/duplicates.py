@@ -17,7 +17,7 @@ _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are no
 
 
 def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, config: MapConfig) -> BoolArray:
-    """Which features (F,) are landmarks although they were not recognised: the same place and the same looks.
+    """Which features (F,) are landmarks although they were not matched: the same position and descriptor.
 
     The place is the same within `same_distance`, or within what the depth's uncertainty allows along the line of sight.
     """

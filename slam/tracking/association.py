@@ -48,7 +48,7 @@ class AssociationConfig:
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
         wide_d_match, wide_ratio: as `d_match` and `ratio`, for matching against the whole map without windows.
-        wide_share: where nothing was recognised in the last frame, a pose found by matching against the whole map must
+        wide_share: where nothing was matched in the last frame, a pose found by matching against the whole map must
             show again at least this share of the landmarks (or of the features, if fewer) in view from there.
         minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
         consistency_sigmas: reprojection error up to which a match agrees with a pose, in units of the pixel noise.
@@ -56,9 +56,8 @@ class AssociationConfig:
             against the whole map.
         tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
             matches suffice, and no second search is made.
-        max_jump, lost_jump: landmarks that agree on a pose further than this from the prediction, in its standard
-            deviations, are not believed at once: while landmarks are recognised in every frame, and after frames in
-            which none was. The prediction allows for what the motion model knows; what is further off was carried.
+        max_jump, lost_jump: a pose farther than this from the prediction, in its standard deviations, must be
+            confirmed by `kidnapped_after` frames. `lost_jump` holds after a frame without matches.
         kidnapped_after: where poses beyond `max_jump` or `lost_jump` agree with each other in so many successive
             frames, the camera was kidnapped (moved while it saw nothing), and a new back end starts at that place in
             the map.

@@ -1,4 +1,4 @@
-"""Whether the features that a caller hands over can be used: asked before a step changes anything."""
+"""Checks of the features that a caller gives, before a step changes anything."""
 
 from __future__ import annotations
 

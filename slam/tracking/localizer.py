@@ -146,7 +146,7 @@ class Localizer:
             positions: the landmarks' positions (N, 3) in world coordinates.
             features: of the frame.
             seed: of the random choice in the geometric check.
-            doubtful: nothing was recognised in the last frame: the whole map must say more, see `wide_share`.
+            doubtful: nothing was matched in the last frame: a pose from the whole map must show more, see `wide_share`.
         """
         if not len(landmarks) or not len(features):
             return LandmarkMatches.nothing()

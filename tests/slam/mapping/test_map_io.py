@@ -218,6 +218,23 @@ def test_descriptors_of_another_kind_are_refused():
         StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, known_map=known)
 
 
+def test_a_known_map_that_is_larger_than_the_limit_is_kept():
+    known = first_run("ekf").snapshot()
+    small = replace(CONFIG, map=replace(CONFIG.map, target_in_view=10, max_landmarks=10))
+    system = StereoSlam(RIG, None, "ekf", config=small, known_map=known)
+    assert system.config.map.max_landmarks == len(known) > 10
+
+
+def test_an_empty_map_is_refused():
+    known = first_run("ekf").snapshot()
+    empty = SavedMap(
+        known.ids[:0], known.positions[:0], known.covariances[:0], known.descriptors[:0], known.laplacian[:0],
+        known.seen[:0], known.in_view[:0],
+    )  # fmt: skip
+    with pytest.raises(SlamError, match="holds no landmarks"):
+        StereoSlam(RIG, None, "ekf", config=CONFIG, known_map=empty)
+
+
 def test_there_is_no_map_before_the_first_frame():
     with pytest.raises(SlamError, match="no map yet"):
         StereoSlam(RIG, None, "ekf").snapshot()
