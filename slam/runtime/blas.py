@@ -13,17 +13,15 @@ from threadpoolctl import LibController, ThreadpoolController
 _F = TypeVar("_F", bound=Callable[..., Any])
 _Changed = list[tuple[LibController, int]]
 
-_BRING_BLAS = ("numpy.linalg", "scipy.linalg", "cv2", "gtsam")  # packages with a BLAS library of their own, or none
-
 
 def _libraries() -> tuple[list[LibController], list[LibController]]:
     """The BLAS libraries that are loaded: with one number of threads for the process, and with one per thread."""
-    return _found(tuple(name in sys.modules for name in _BRING_BLAS))
+    return _found(len(sys.modules))
 
 
-@lru_cache(maxsize=2 ** len(_BRING_BLAS))
-def _found(loaded: tuple[bool, ...]) -> tuple[list[LibController], list[LibController]]:
-    """Looked up once for each set of packages that have been `loaded`."""
+@lru_cache(maxsize=1)
+def _found(modules: int) -> tuple[list[LibController], list[LibController]]:
+    """Looked up anew whenever `modules`, their number, has changed: any of them may have brought a library."""
     found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
     own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
     return [library for library in found if library not in own], own
