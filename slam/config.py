@@ -7,6 +7,7 @@ from typing import Any
 
 from slam.calibration.config import SelfCalibrationConfig
 from slam.errors import ConfigurationError
+from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
 from slam.objects.config import ObjectsConfig
@@ -53,6 +54,7 @@ class SystemConfig:
         models: noise, priors and motion model of all back ends.
         association: search windows, descriptor distances, geometric check.
         map: which features become landmarks and which landmarks are dropped.
+        atlas: keyframes, and loops where one of them is seen again.
         self_calibration: the rig's error, found while running.
         objects: the detector of moving objects.
         frontend: options of the front end by name.
@@ -65,6 +67,7 @@ class SystemConfig:
     models: EstimatorModels = field(default_factory=EstimatorModels)
     association: AssociationConfig = field(default_factory=AssociationConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    atlas: AtlasConfig = field(default_factory=AtlasConfig)
     self_calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     frontend: dict[str, Any] = field(default_factory=dict)

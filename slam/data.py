@@ -266,6 +266,10 @@ class FrameResult:
         located: False where the camera has not been found yet in the map that it was started with: its pose is none.
         revision: before the step, the pixels of all earlier frames were corrected anew (`RevisingBackend`); None where
             they were not.
+        T_map_odom: pose (4, 4) of the frame that the back end estimates in, which never jumps, in the map; the identity
+            before the first loop.
+        loop: index of the frame whose place this one shows again, where that closed a loop; else None.
+        keyframe: whether the frame has become a keyframe.
     """
 
     index: int
@@ -286,3 +290,6 @@ class FrameResult:
     objects: tuple[MovingObject, ...] = ()
     located: bool = True
     revision: Revision | None = None
+    T_map_odom: Array = field(default_factory=lambda: np.eye(4))
+    loop: int | None = None
+    keyframe: bool = False

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
 
 from slam.data import FrameResult, FrameStatus, Revision, UpdateStatus
+from slam.geometry.se3 import Array, inverse
+from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.mapper import MapChange, Step
 from slam.object_data import MovingObject
 
@@ -16,6 +21,7 @@ def frame_result(
     mapped_before: bool,
     revision: Revision | None,
     milliseconds: Mapping[str, float],
+    atlas: Atlas,
 ) -> FrameResult:
     """What a step did.
 
@@ -26,13 +32,14 @@ def frame_result(
         mapped_before: whether there ever was a landmark before this frame.
         revision: how the pixels of earlier frames were corrected anew before it.
         milliseconds: wall time per stage.
+        atlas: after the step; takes poses to the map.
     """
     status, reason = frame_status(step, len(change.added), mapped_before)
     return FrameResult(
         index=step.index,
         status=status,
         reason=reason,
-        estimate=step.estimate,
+        estimate=atlas.estimate(step.estimate),
         report=step.report,
         features=step.features,
         predicted=len(step.prediction.ids),
@@ -44,9 +51,26 @@ def frame_result(
         map_size=len(change.landmarks),
         milliseconds=dict(milliseconds),
         moving_features=step.labels.moving,
-        objects=objects,
+        objects=tuple(_in_map(thing, atlas.T_map_odom) for thing in objects) if atlas.loops else objects,
         revision=revision,
+        T_map_odom=atlas.T_map_odom,
+        loop=atlas.closed_in(step.index),
+        keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
     )
+
+
+def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
+    """A body in the map's coordinates; covariances are about its own axes, but for the velocity's."""
+    e, R = thing.estimate, np.kron(np.eye(2), T_map_odom[:3, :3])
+    motions = (T_map_odom @ T @ inverse(T_map_odom) for T in (thing.motion, thing.motion_since_found))
+    estimate = replace(
+        e,
+        T_world_object=T_map_odom @ e.T_world_object,
+        velocity=R @ e.velocity,
+        velocity_covariance=R @ e.velocity_covariance @ R.T,
+    )
+    motion, since = motions
+    return replace(thing, estimate=estimate, motion=motion, motion_since_found=since)
 
 
 def frame_status(step: Step, added: int, mapped_before: bool) -> tuple[FrameStatus, str]:

@@ -16,6 +16,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
+from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
@@ -110,6 +112,8 @@ class StereoSlam:
         self._uncertainty = RigUncertainty(self.calibration.model, c.models.pixel_sigma)
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
+        self.atlas = Atlas()
+        self._loop_closer = LoopCloser(rig, c.atlas, c.association, c.models)
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
@@ -195,10 +199,15 @@ class StereoSlam:
             change = self._mapper.update(self.backend, landmarks, step)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
-        step = replace(step, estimate=self._considered(estimate))
-        result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds)
+        with stages.stage("atlas"):  # a place seen again corrects the path since
+            step = replace(step, estimate=self._considered(estimate))
+            atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path)
+            change = self._mapper.give_back(self.backend, change, step, returned)
+        result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
-        self._last, self.landmarks, self._stages = self._last.after(step, change), change.landmarks, Stages()
+        self._last, self.landmarks, self.atlas, self._stages = (
+            self._last.after(step, change), change.landmarks, atlas, Stages(),
+        )  # fmt: skip
         return result
 
     def roll_back(self) -> None:
@@ -218,13 +227,19 @@ class StereoSlam:
 
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose (in a known map, from when it was found)."""
+        return self.atlas.path(self._path())
+
+    def _path(self) -> Trajectory:
+        """The path as the back end has it, in its own frame."""
         return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
         self.roll_back()
         search = self._relocalizer.search
-        return self._considered(self.backend.estimate()) if search is None else search.estimate(float("nan"))
+        if search is not None:
+            return search.estimate(float("nan"))
+        return self.atlas.estimate(self._considered(self.backend.estimate()))
 
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.

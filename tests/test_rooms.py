@@ -16,7 +16,7 @@ MAY_IMPORT = {
     "data": {"geometry"},
     "tracking": {"data", "geometry", "runtime"},
     "calibration": {"data", "geometry", "runtime"},
-    "mapping": {"tracking", "data", "geometry"},
+    "mapping": {"tracking", "data", "geometry", "runtime"},
     "objects": {"tracking", "data", "geometry", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},

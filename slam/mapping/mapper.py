@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.data import BoolArray, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.errors import ConfigurationError
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.config import MapConfig
@@ -58,11 +60,30 @@ class MapChange:
         landmarks: the map after it.
         added: new landmarks, and the features that they are from.
         erased: ids of the landmarks that left the map.
+        returned: landmarks of a place seen again that came back, and the features that they are now.
     """
 
     landmarks: LandmarkRows
     added: LandmarkMatches
     erased: IdArray
+    returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+
+
+@dataclass(frozen=True)
+class Returned:
+    """Features of an old keyframe that the present frame shows again.
+
+    Attributes:
+        rows: of the present features (M,).
+        ids: of the landmarks that they were (M,), −1 for none.
+        local: in left-camera coordinates (M, 3) [m].
+        covariances: theirs (M, 3, 3) [m²].
+    """
+
+    rows: NDArray[np.intp]
+    ids: IdArray
+    local: Array
+    covariances: Array
 
 
 class Mapper:
@@ -101,6 +122,28 @@ class Mapper:
         landmarks, added = self._add(backend, landmarks, step, known)
         landmarks, surplus = _erase(backend, landmarks, surplus_landmarks(landmarks, self.config))
         return MapChange(landmarks, added, np.concatenate([erased, surplus]))
+
+    def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned | None) -> MapChange:
+        """Let landmarks of a place seen again rejoin the map, where the back end can place them.
+
+        Under their old ids, where they had one. What the back end still had of them, where it had last left them, is
+        erased first. Features that are landmarks of the map already are left alone.
+        """
+        if returned is None or not isinstance(backend, MapBackend):
+            return change
+        taken = np.concatenate([step.matches.rows, change.added.rows])
+        free = np.flatnonzero(~np.isin(returned.rows, taken))
+        if not len(free):
+            return change
+        ids = returned.ids[free]
+        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        landmarks, _ = _erase(backend, change.landmarks, np.isin(change.landmarks.ids, ids))
+        backend.place(ids, returned.local[free], returned.covariances[free])
+        rows = returned.rows[free]
+        landmarks = landmarks.with_new(step.index, ids, step.features, rows, self._camera(backend))
+        order = np.argsort(landmarks.ids, kind="stable")
+        back = LandmarkMatches(ids, rows)
+        return replace(change, landmarks=landmarks.select(order), returned=back)
 
     def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
         """Let rows and back end agree after a step that was interrupted; what only one of both has leaves it.

@@ -9,7 +9,7 @@ from slam.config import SystemConfig
 from slam.run.settings_reference import descriptions
 
 #: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
-STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage")
+STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage", "atlas")
 
 #: Frames of coordinates.
 FRAMES = {

@@ -1,0 +1,48 @@
+"""Settings of the atlas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam.errors import ConfigurationError
+from slam.models import FORBID_UNKNOWN, require_not_negative
+
+_RANGES = {"features": (1, 100_000), "candidates": (0, 10_000), "inliers": (3, 100_000), "agreeing": (1, 1000)}
+
+
+@dataclass(frozen=True)
+class AtlasConfig:
+    """Settings of keyframes and of loops.
+
+    Attributes:
+        enabled: keep keyframes, and close loops where one of them is seen again.
+        keyframe_share: a frame becomes a keyframe where less than this share of what the last keyframe saw is in view.
+        keyframe_distance: or where the camera has gone this share of the median depth of what that one saw.
+        features: most features that a keyframe keeps.
+        return_depths: a place counts as left once the camera has gone this many times the median depth of what it saw.
+        candidates: number of keyframes that are compared in detail with a new one.
+        inliers: features that must agree on a pose for two keyframes to show the same place.
+        spread: least standard deviation of their pixels, as a share of the image's width.
+        agreeing: successive keyframes that must see the same return, before it is believed.
+        gate_sigmas: a return is refused where it contradicts the path by more than this many standard deviations.
+        give_back: landmarks of a place seen again return to the back end, where it can place landmarks.
+    """
+
+    enabled: bool = True
+    keyframe_share: float = 0.8
+    keyframe_distance: float = 0.2
+    features: int = 400
+    return_depths: float = 5.0
+    candidates: int = 8
+    inliers: int = 15
+    spread: float = 0.1
+    agreeing: int = 2
+    gate_sigmas: float = 5.0
+    give_back: bool = True
+
+    __pydantic_config__ = FORBID_UNKNOWN
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, _RANGES, "atlas")
+        if self.keyframe_share > 1:
+            raise ConfigurationError("atlas: keyframe_share is a share between 0 and 1")

@@ -1,0 +1,115 @@
+"""Keyframes: what the camera saw, in its own coordinates, and how it got there from the keyframe before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, adjoint, inverse, transform
+from slam.mapping.atlas.config import AtlasConfig
+
+_DEPTH_ERROR = 0.2  # largest relative standard deviation of a depth, as of a new landmark's (`MapConfig`)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One frame that is kept.
+
+    Attributes:
+        frame: index of the step.
+        stamp: [s].
+        T_odom_left: pose (4, 4) that the back end estimated then.
+        covariance: its covariance (6, 6) then.
+        step_covariance: covariance (6, 6) of the motion since the keyframe before, perturbing this pose on the right.
+        travelled: length of the path up to here [m].
+        depth: median depth of the features [m].
+        points: features in coordinates of the rectified left camera (F, 3) [m].
+        descriptors: theirs (F, D).
+        laplacian: signs of their Laplacians (F,).
+        landmarks: ids of the landmarks that they were in the back end's map (F,), −1 for none.
+    """
+
+    frame: int
+    stamp: float
+    T_odom_left: Array
+    covariance: Array
+    step_covariance: Array
+    travelled: float
+    depth: float
+    points: NDArray[np.float32]
+    descriptors: NDArray[np.float16]
+    laplacian: NDArray[np.int8]
+    landmarks: IdArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
+    """Whether a camera sees other things than a keyframe, or the same ones from elsewhere.
+
+    Args:
+        keyframe: the earlier one.
+        motion: pose (4, 4) of the camera in the keyframe's coordinates.
+        rig: the rectified cameras.
+        config: settings.
+    """
+    if np.linalg.norm(motion[:3, 3]) > config.keyframe_distance * keyframe.depth:
+        return True
+    uv = rig.left.project(transform(inverse(motion), keyframe.points.astype(float)))
+    return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
+
+
+def kept_features(
+    rig: StereoRig, features: StereoFeatures, landmark_of: IdArray, moving: NDArray[np.intp], sigma: float, most: int
+) -> tuple[NDArray[np.intp], Array]:
+    """Rows of the features that a keyframe keeps, and their points (F, 3) [m] in left-camera coordinates.
+
+    Those whose depth is known and that do not move; landmarks first, then the strongest.
+
+    Args:
+        rig: the cameras.
+        features: of the frame (N rows).
+        landmark_of: id of the landmark that each feature is (N,), −1 for none.
+        moving: rows of features that move.
+        sigma: noise of uL, vL, uR [px].
+        most: how many are kept at most.
+    """
+    points = rig.triangulate(features.uv_left, features.uv_right)
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    deviation = np.sqrt(rig.triangulation_covariance(points[known], sigma)[:, 2, 2])
+    good: BoolArray = deviation < _DEPTH_ERROR * points[known, 2]
+    good &= ~np.isin(known, moving)
+    rows = known[good]
+    order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))[:most]
+    rows = np.sort(rows[order])
+    return rows, points[rows]
+
+
+def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array, floor: Array) -> Array:
+    """Covariance (6, 6) of the motion since a keyframe, from the covariances of both poses.
+
+    The motion's error is taken to be independent of the first pose's: then ``P = Ad P₀ Adᵀ + Q`` with the adjoint of
+    the motion's inverse, and Q is what has been added. Where a back end becomes surer meanwhile, as it sees landmarks
+    of before again, Q has no positive part; it is never less than `floor`.
+
+    Args:
+        before: the earlier keyframe.
+        T_odom_left: the later pose (4, 4).
+        covariance: of the later pose (6, 6).
+        floor: covariance (6, 6) of a pose that one frame's measurements give.
+    """
+    back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
+    return positive_part(covariance - back @ before.covariance @ back.T) + floor
+
+
+def positive_part(matrix: Array) -> Array:
+    """A symmetric matrix (6, 6) without its negative eigenvalues; rotations and metres are brought to one scale."""
+    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(root @ root.T)

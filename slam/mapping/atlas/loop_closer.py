@@ -1,0 +1,226 @@
+"""From a frame to a new keyframe, and from a keyframe to a closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import IdArray, StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, adjoint, inverse, log, transform
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.config import AtlasConfig
+from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed
+from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
+from slam.mapping.atlas.pose_graph import Chain, relative_pose, solve
+from slam.mapping.mapper import Returned, Step
+from slam.models import EstimatorModels
+from slam.runtime.blas import one_blas_thread
+from slam.tracking.association import AssociationConfig
+from slam.tracking.localizer import LandmarkMatches, Localizer
+
+_VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared in detail
+_PATIENCE = 3  # keyframes within which another one must see the same return
+_MINIMAL = 6  # features that give a pose with a covariance
+_HYPOTHESES = 300  # poses tried: one in a hundred places is missed where a quarter of its matches are right
+
+
+class LoopCloser:
+    """Adds keyframes to an atlas and closes loops.
+
+    Inside, all is in pixels and coordinates of the rectified rig.
+
+    Args:
+        rig: the cameras.
+        config: settings.
+        association: settings of the search by descriptor.
+        models: noise of uL, vL, uR [px].
+    """
+
+    def __init__(
+        self, rig: StereoRig, config: AtlasConfig, association: AssociationConfig, models: EstimatorModels
+    ) -> None:
+        self._rectified = rig.rectified
+        self._rig = rig.rectified.rig
+        self._config = config
+        self._sigma = models.pixel_sigma
+        self._localizer = Localizer(self._rig, replace(association, wide_hypotheses=_HYPOTHESES), models)
+
+    @one_blas_thread
+    def update(
+        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
+    ) -> tuple[Atlas, Returned | None]:
+        """The atlas after a frame, and what it shows again where a loop was closed.
+
+        Args:
+            atlas: before.
+            step: what the frame brought.
+            added: landmarks that joined the map in it.
+            path: gives the path in odom so far.
+        """
+        if not self._config.enabled or (step.state.unmatched and len(atlas)) or not self._is_keyframe(atlas, step):
+            return atlas, None
+        landmark_of = step.matches.landmark_of(len(step.features))
+        landmark_of[added.rows] = added.ids
+        step = replace(step, features=self._rectify(step.features))
+        new = self._keyframe(atlas, step, landmark_of)
+        if new is None:
+            return atlas, None
+        candidates = self._candidates(atlas, new, step.features, landmark_of)
+        descriptors = new.descriptors.astype(np.float32)
+        atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=atlas.index.with_new(descriptors))
+        best = self._best_sighting(atlas, candidates, step.features, step.index)
+        return (atlas, None) if best is None else self._close(atlas, *best, step.features, path)
+
+    def _rectify(self, features: StereoFeatures) -> StereoFeatures:
+        """Features in pixels of the rectified rig."""
+        r = self._rectified
+        if r.original.is_rectified:
+            return features
+        return replace(features, uv_left=r.rectify_left(features.uv_left), uv_right=r.rectify_right(features.uv_right))
+
+    def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
+        """Whether the camera sees other things, or from elsewhere, than in the last keyframe."""
+        if not len(atlas) or self._in_doubt(atlas):
+            return True
+        last = atlas.keyframes[-1]
+        X = self._rectified.T_left_rectified
+        motion = inverse(X) @ inverse(last.T_odom_left) @ step.estimate.T_world_left @ X
+        return view_has_changed(last, motion, self._rig, self._config)
+
+    def _in_doubt(self, atlas: Atlas) -> bool:
+        """Whether the last keyframe has seen a return that is to be confirmed: the next frame can do that."""
+        pending = atlas.pending
+        return pending is not None and pending.second == len(atlas) - 1 and not atlas.confirmed
+
+    def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
+        """The frame as a keyframe; None where too few features have a depth."""
+        features, moving = step.features, step.labels.moving
+        rows, points = kept_features(self._rig, features, landmark_of, moving, self._sigma, self._config.features)
+        if len(rows) < _MINIMAL:
+            return None
+        T, P = step.estimate.T_world_left, step.estimate.covariance
+        travelled, added = 0.0, np.zeros((6, 6))
+        if len(atlas):
+            last = atlas.keyframes[-1]
+            travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
+            z, _ = self._rig.project_stereo(points, jacobian=False)
+            _, single = refined_pose(self._rig, points, z, np.eye(4), self._sigma)
+            A = adjoint(self._rectified.T_left_rectified)
+            added = step_covariance(last, T, P, A @ single @ A.T)
+        return Keyframe(
+            step.index,
+            features.stamp,
+            T,
+            P,
+            added,
+            travelled,
+            float(np.median(points[:, 2])),
+            points.astype(np.float32),
+            features.descriptors[rows].astype(np.float16),
+            features.laplacian[rows],
+            landmark_of[rows],
+        )
+
+    def _candidates(
+        self, atlas: Atlas, new: Keyframe, features: StereoFeatures, landmark_of: IdArray
+    ) -> NDArray[np.intp]:
+        """Numbers of keyframes that may show this place again, the likeliest first.
+
+        Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
+        it knows by itself.
+        """
+        travelled = np.array([k.travelled for k in atlas.keyframes])
+        left = travelled < new.travelled - self._config.return_depths * new.depth
+        if not left.any():
+            return np.zeros(0, np.intp)
+        similarity = atlas.index.similarity(new.descriptors.astype(np.float32))
+        similarity[~left] = -np.inf
+        best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
+        best = best[np.isfinite(similarity[best])]
+        known = landmark_of[landmark_of >= 0]
+        rows = [k for k in best if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
+        number = [alike(atlas.keyframes[k], features, self._localizer.config) for k in rows]
+        order = np.argsort(-np.array(number, int), kind="stable")[:_VERIFIED]
+        return np.array([rows[i] for i in order if number[i] >= self._config.inliers], np.intp)
+
+    def _best_sighting(
+        self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
+    ) -> tuple[Loop, Sighting] | None:
+        """The candidate with which most features agree on a pose."""
+        best: tuple[int, Sighting] | None = None
+        for k in candidates.tolist():
+            seen = sighting(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
+            if seen is not None and (best is None or len(seen.matches) > len(best[1].matches)):
+                best = k, seen
+        if best is None:
+            return None
+        first, seen = best
+        X = self._rectified.T_left_rectified
+        A = adjoint(X)
+        T, P = X @ seen.T_keyframe_left @ inverse(X), A @ seen.covariance @ A.T
+        return Loop(first, len(atlas) - 1, T, P, len(seen.matches)), seen
+
+    def _close(
+        self, atlas: Atlas, loop: Loop, seen: Sighting, features: StereoFeatures, path: Callable[[], Trajectory]
+    ) -> tuple[Atlas, Returned | None]:
+        """Close a loop where the path allows it and a keyframe just before has seen the same return."""
+        chain = atlas.chain(path())
+        start = atlas.in_map(chain)
+        T, P = relative_pose(chain, atlas.loops, start, loop.first, loop.second)
+        limit = self._config.gate_sigmas**2
+        if _distance(T, loop.T_first_second, P + loop.covariance) > limit:
+            return replace(atlas, refused=atlas.refused + 1), None
+        before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
+        if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
+            return atlas, None
+        atlas = replace(atlas, confirmed=True)
+        if atlas.loops and not self._says_more(chain, atlas.loops[-1], loop):
+            return atlas, None
+        loops = (*atlas.loops, loop)
+        solution = solve(chain, loops, start)
+        if (solution.disagreement > limit).any():
+            return replace(atlas, refused=atlas.refused + 1, pending=None), None
+        atlas = replace(
+            atlas,
+            loops=loops,
+            corrected=solution.poses,
+            anchor=solution.covariance,
+            T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
+        )
+        return atlas, self._returned(atlas.keyframes[loop.first], seen) if self._config.give_back else None
+
+    def _agree(self, chain: Chain, before: Loop, loop: Loop) -> bool:
+        """Whether two loops, a few keyframes one after the other, tell of the same return."""
+        if loop.second - before.second > _PATIENCE:
+            return False
+        T_old, P_old = chain.motion(before.first, loop.first)
+        T_new, P_new = chain.motion(before.second, loop.second)
+        expected = inverse(T_old) @ before.T_first_second @ T_new
+        back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
+        P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
+        return _distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
+
+    def _says_more(self, chain: Chain, last: Loop, loop: Loop) -> bool:
+        """Whether a loop tells more of where the camera is than the path since the last one does."""
+        _, P = chain.motion(last.second, loop.second)
+        return bool(np.trace(P[3:, 3:]) > np.trace(loop.covariance[3:, 3:]))
+
+    def _returned(self, keyframe: Keyframe, seen: Sighting) -> Returned:
+        """The old keyframe's features that agree, in the coordinates of the present left camera."""
+        m, X = seen.matches, self._rectified.T_left_rectified
+        back = X @ inverse(seen.T_keyframe_left)
+        points = keyframe.points[m.landmarks].astype(float)
+        P = self._rig.triangulation_covariance(points, self._sigma)
+        covariances = back[:3, :3] @ P @ back[:3, :3].T
+        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(back, points), covariances)
+
+
+def _distance(expected: Array, found: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of two poses (4, 4)."""
+    xi = log(inverse(expected) @ found)
+    return float(xi @ np.linalg.solve(covariance, xi))

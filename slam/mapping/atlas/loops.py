@@ -1,0 +1,145 @@
+"""Is this the place of that keyframe? Descriptors propose, geometry decides, and gives the pose with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.data import StereoFeatures
+from slam.geometry.pnp import measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, exp, hat, inverse, transform
+from slam.landmarks import LandmarkRows
+from slam.mapping.atlas.config import AtlasConfig
+from slam.mapping.atlas.keyframes import Keyframe
+from slam.mapping.relocalizer import nowhere
+from slam.tracking.association import AssociationConfig, Matches, match_everywhere
+from slam.tracking.localizer import LandmarkMatches, Localizer
+
+#: What descriptors find slides over the surface when it is seen from elsewhere, all features of a place alike [px].
+_SLIDE = 1.0
+
+_ROUNDS = 5  # of least squares, at most
+_CONVERGED = 1e-6  # step [rad], [m]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A keyframe's place, seen again.
+
+    Attributes:
+        T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
+        covariance: its covariance (6, 6), perturbing on the right.
+        matches: the keyframe's features that agree, by their rows, and the present frame's.
+    """
+
+    T_keyframe_left: Array
+    covariance: Array
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Two keyframes that show the same place.
+
+    Attributes:
+        first, second: their numbers, the older one first.
+        T_first_second: the second one's pose in the first one's coordinates (4, 4).
+        covariance: its covariance (6, 6), perturbing on the right.
+        inliers: number of features that agree.
+    """
+
+    first: int
+    second: int
+    T_first_second: Array
+    covariance: Array
+    inliers: int
+
+
+def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
+    """Number of a keyframe's features that match the present ones by descriptor alone."""
+    return len(match_everywhere(keyframe.descriptors.astype(np.float32), keyframe.laplacian, features, config))
+
+
+def sighting(
+    keyframe: Keyframe,
+    features: StereoFeatures,
+    rig: StereoRig,
+    localizer: Localizer,
+    config: AtlasConfig,
+    seed: int,
+    guess: Array | None = None,
+) -> Sighting | None:
+    """The present camera's pose before a keyframe, or None where too few features agree on one, or all in one spot.
+
+    Args:
+        keyframe: the older one.
+        features: of the present frame.
+        rig: the cameras.
+        localizer: finds features without a prediction, and those that agree.
+        config: settings.
+        seed: of the random choice in the geometric check.
+        guess: where the present camera may be in the keyframe's coordinates (4, 4); tried first.
+    """
+    points = keyframe.points.astype(float)
+    prediction = nowhere(features.stamp, np.eye(4) if guess is None else guess)
+    found = localizer.match(prediction, _rows(keyframe), points, features, seed)
+    rows = _with_depth(found, features)
+    if found.T_world_left is None or len(rows) < config.inliers:
+        return None
+    ids, seen = found.ids[rows], found.rows[rows]
+    across = np.linalg.eigvalsh(np.cov(features.uv_left[seen].T))[-1]
+    if np.sqrt(across) < config.spread * rig.width:
+        return None
+    measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
+    T, covariance = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
+    slide = _SLIDE / rig.left.fu
+    covariance += np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
+    return Sighting(T, covariance, Matches(ids.astype(np.intp), seen))
+
+
+def refined_pose(
+    rig: StereoRig, points: Array, measured: Array, T_world_left: Array, pixel_sigma: float
+) -> tuple[Array, Array]:
+    """The pose (4, 4) of least squares, and its covariance (6, 6), from points that one stereo frame triangulated.
+
+    Both frames have noise: that of the points is carried into the present pixels.
+
+    Args:
+        rig: the cameras.
+        points: in the earlier camera's coordinates (M, 3) [m].
+        measured: (uL, vL, uR) (M, 3) [px] in the present frame, all finite.
+        T_world_left: first guess of the present camera in the earlier one's coordinates (4, 4).
+        pixel_sigma: noise of uL, vL, uR [px].
+    """
+    P = rig.triangulation_covariance(points, pixel_sigma)
+    T, normal = T_world_left, np.eye(6)
+    for _ in range(_ROUNDS):
+        local = transform(inverse(T), points)
+        z, H = rig.project_stereo(local)
+        J = H @ np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+        HR = H @ T[:3, :3].T
+        W = np.linalg.inv(pixel_sigma**2 * np.eye(3) + HR @ P @ np.swapaxes(HR, 1, 2))
+        good = np.isfinite(z).all(axis=1)
+        JW = np.swapaxes(J, 1, 2)[good] @ W[good]
+        normal = (JW @ J[good]).sum(axis=0)
+        step = np.linalg.solve(normal, (JW @ (measured - z)[good][:, :, None]).sum(axis=0)[:, 0])
+        T = T @ exp(step)
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return T, np.linalg.inv(normal)
+
+
+def _with_depth(found: LandmarkMatches, features: StereoFeatures) -> np.ndarray:
+    """Rows of the matches whose features have a right pixel."""
+    return np.flatnonzero(features.has_stereo[found.rows])
+
+
+def _rows(keyframe: Keyframe) -> LandmarkRows:
+    """A keyframe's features as landmarks, their ids their rows."""
+    count = len(keyframe)
+    once = np.ones(count, np.int64)
+    return LandmarkRows(
+        np.arange(count), keyframe.descriptors.astype(np.float32), keyframe.laplacian, once, once, 0 * once, -once
+    )
