@@ -20,7 +20,8 @@ FACING = 0.25
 
 _MARGIN = 2.0  # no feature so near to the image's border [px]
 _SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
-_KEPT = 20_000  # frames whose visible landmarks are kept
+_KEPT = 20_000  # frames whose visible landmarks are kept; fewer in a world of many landmarks
+_USUAL = 2000  # landmarks of a world that is small enough for that
 _FALSE = -1
 _POOL = 4096  # errors of descriptors that are drawn beforehand
 
@@ -36,6 +37,8 @@ class ObservationModel:
         outliers: share of false features; half as many true ones are given a false match in the right image.
         descriptor: length of descriptors.
         descriptor_noise: typical length of the error of a unit descriptor.
+        descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
+        clutter: share of features that are points of the world, but never detected again.
         confusion: share of landmarks that look nearly like another one.
     """
 
@@ -45,6 +48,8 @@ class ObservationModel:
     outliers: float
     descriptor: int
     descriptor_noise: float
+    descriptor_drift: float
+    clutter: float
     confusion: float
 
     @classmethod
@@ -89,12 +94,14 @@ class Appearance:
         laplacian: sign (P,) int8.
         response: strength (P,).
         errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
+        drifts: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
     """
 
     descriptors: NDArray[np.float32]
     laplacian: NDArray[np.int8]
     response: Array
     errors: NDArray[np.float32]
+    drifts: NDArray[np.float32]
 
 
 def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
@@ -114,9 +121,15 @@ def appearance(world: World, model: ObservationModel, layout: int) -> Appearance
         descriptors[twins] = _unit(descriptors[originals] + 0.15 * _unit(rng.standard_normal((len(twins), size))))
     laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
     errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
+    response = np.exp(rng.normal(6.5, 1.0, count))
+    drifts = np.zeros((0, 3, size))
+    if model.descriptor_drift > 0:
+        drifts = rng.standard_normal((_POOL, 3, size)) * (model.descriptor_drift / np.sqrt(size))
+    looks = world.landmarks.looks
     return Appearance(
-        descriptors.astype(np.float32), laplacian, np.exp(rng.normal(6.5, 1.0, count)), errors.astype(np.float32)
-    )
+        descriptors[looks].astype(np.float32), laplacian[looks], response[looks], errors.astype(np.float32),
+        drifts.astype(np.float32),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -144,7 +157,7 @@ def seen_landmarks(world: World, frame: int) -> VisibleLandmarks:
     """`visible_landmarks`, kept with the world: the next recording of it sees the same."""
     found: VisibleLandmarks | None = world.seen.get(frame)
     if found is None:
-        if len(world.seen) >= _KEPT:
+        if len(world.seen) >= _KEPT // max(1, len(world.landmarks) // _USUAL):
             world.seen.clear()
         found = world.seen[frame] = visible_landmarks(world, frame)
     return found
@@ -154,28 +167,45 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     """Landmarks within reach, inside the left image, on surfaces that face the camera and not hidden."""
     T = world.T_world_left[frame]
     bodies = world.T_world_body(frame)
-    positions = world.landmarks.world_positions(bodies)
+    near = world.landmarks_near(frame)
+    landmarks = world.landmarks.select(near)
+    positions = landmarks.world_positions(bodies)
     points = (positions - T[:3, 3]) @ T[:3, :3]
-    ids = _candidates(world, points)
-    offsets = positions[ids] - T[:3, 3]
-    normals = world.landmarks.normals[ids]
-    moving = world.landmarks.object[ids]
-    if moving.any():
-        normals = (bodies[moving][:, :3, :3] @ normals[:, :, None])[..., 0]
+    rows = _candidates(world, points)
+    offsets = positions[rows] - T[:3, 3]
+    normals = _turned(landmarks.normals[rows], landmarks.object[rows], bodies)
     facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)
-    ids = ids[facing]
-    uv_left, uv_right = world.rig.project(points[ids])
+    rows = rows[facing]
+    uv_left, uv_right = world.rig.project(points[rows])
     inside = world.rig.left.in_image(uv_left, _MARGIN)
-    ids, uv_left, uv_right = ids[inside], uv_left[inside], uv_right[inside]
+    rows, uv_left, uv_right = rows[inside], uv_left[inside], uv_right[inside]
     uv_right[~world.rig.right.in_image(uv_right, _MARGIN)] = np.nan
-    if len(world.occluders):
-        occluders = world.occluders.placed(bodies)
+    occluders = world.occluders_near(frame).placed(bodies)
+    if len(occluders):
         right_centre = T[:3, 3] - T[:3, :3] @ world.rig.b
-        seen = ~hidden(T[:3, 3], positions[ids], occluders)
-        ids, uv_left, uv_right = ids[seen], uv_left[seen], uv_right[seen]
-        uv_right[hidden(right_centre, positions[ids], occluders)] = np.nan
-    size = np.maximum(world.rig.left.fu * world.landmarks.size[ids] / points[ids, 2], _SMALLEST)
-    return VisibleLandmarks(ids, points[ids], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+        seen = ~hidden(T[:3, 3], positions[rows], occluders)
+        rows, uv_left, uv_right = rows[seen], uv_left[seen], uv_right[seen]
+        uv_right[hidden(right_centre, positions[rows], occluders)] = np.nan
+    size = np.maximum(world.rig.left.fu * landmarks.size[rows] / points[rows, 2], _SMALLEST)
+    return VisibleLandmarks(near[rows], points[rows], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+
+
+def _turned(normals: Array, objects: IdArray, bodies: Array) -> Array:
+    """Directions (N, 3) on objects in world axes."""
+    if not objects.any():
+        return normals
+    return np.asarray((bodies[objects][:, :3, :3] @ normals[:, :, None])[..., 0])
+
+
+def _views(world: World, frame: int, ids: IdArray, points: Array) -> Array:
+    """Unit vectors (N, 3) to the camera from landmarks at `points` (N, 3): along, down and out of their surfaces."""
+    surface, objects = world.landmarks.surface[ids], world.landmarks.object[ids]
+    bodies = world.T_world_body(frame)
+    to_camera = -points @ world.T_world_left[frame, :3, :3].T
+    arrays = world.arrays
+    axes = (arrays.along[surface], arrays.down[surface], arrays.normal[surface])
+    columns = [(_unit(_turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
+    return _unit(np.stack(columns, axis=1))
 
 
 def _candidates(world: World, points: Array) -> IdArray:
@@ -211,17 +241,19 @@ def simulate(
         _falsify(uv_left, uv_right, np.flatnonzero(false_stereo), rng)
     extra = round(len(rows) * model.outliers / (1 - model.outliers))
     false_left, false_right = _false_pixels(world.rig, extra, rng)
-    uv_left, uv_right = np.concatenate([uv_left, false_left]), np.concatenate([uv_right, false_right])
+    passing_left, passing_right = _clutter(world.rig, seen, round(len(rows) * model.clutter / (1 - model.clutter)), rng)
+    uv_left = np.concatenate([uv_left, false_left, passing_left])
+    uv_right = np.concatenate([uv_right, false_right, passing_right])
     uv_right[~_inside(world.rig, uv_right)] = np.nan
     order = rng.permutation(len(uv_left))
     order = order[_inside(world.rig, uv_left[order])]
-    source = np.concatenate([rows, np.full(extra, _FALSE)])[order]
-    false_stereo = np.concatenate([false_stereo, np.zeros(extra, bool)])[order]
-    return _features(world, looks, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
+    source = np.concatenate([rows, np.full(extra + len(passing_left), _FALSE)])[order]
+    false_stereo = np.concatenate([false_stereo, np.zeros(extra + len(passing_left), bool)])[order]
+    return _features(world, looks, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
 
 
 def _features(
-    world: World, looks: Appearance, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
+    world: World, looks: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
     uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
 ) -> SimulatedFeatures:  # fmt: skip
     """Features with the looks of their landmarks; `source` are their rows in `seen`, −1 for those that are nothing."""
@@ -231,6 +263,11 @@ def _features(
     landmark = ids.copy()
     landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
     descriptors = looks.descriptors[landmark] + looks.errors[rng.integers(0, _POOL, len(ids))]
+    true = np.flatnonzero(ids != _FALSE)
+    if len(looks.drifts) and len(true):
+        views = _views(world, frame, ids[true], seen.points[source[true]]).astype(np.float32)
+        drifts = looks.drifts[world.landmarks.looks[ids[true]] % _POOL]
+        descriptors[true] += np.einsum("ni,nid->nd", views, drifts)
     descriptors[false] = rng.standard_normal((len(false), descriptors.shape[1]), np.float32)
     descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]
@@ -269,6 +306,16 @@ def _false_pixels(rig: StereoRig, count: int, rng: np.random.Generator) -> tuple
     uv_right = np.stack([uv_left[:, 0] * rng.random(count), uv_left[:, 1] + rng.normal(0, 1, count)], axis=1)
     uv_right[rng.random(count) < 0.5] = np.nan
     return uv_left, uv_right
+
+
+def _clutter(rig: StereoRig, seen: VisibleLandmarks, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Left and right pixels (count, 2) of points near visible landmarks that are features in this frame alone."""
+    if not count:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    rows = rng.integers(0, len(seen.ids), count)
+    points = seen.points[rows] * (1 + 0.05 * rng.standard_normal((count, 1)))
+    points[:, :2] += 0.03 * points[:, 2:] * rng.standard_normal((count, 2))
+    return rig.project(points)
 
 
 def _inside(rig: StereoRig, uv: Array) -> BoolArray:

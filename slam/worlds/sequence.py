@@ -46,15 +46,17 @@ class WorldSequence:
         format: ``"synthetic"``.
         world: what is recorded.
         values: the values of all options.
+        rig: the stereo rig as the system is told of it; `world.rig` is the true one.
         ground_truth: pose of the left camera at every frame.
         warnings: always empty; recorded sequences have faults to report here.
     """
 
     format = "synthetic"
 
-    def __init__(self, name: str, world: World, values: Mapping[str, Any]) -> None:
+    def __init__(self, name: str, world: World, values: Mapping[str, Any], rig: StereoRig | None = None) -> None:
         self.name = name
         self.world = world
+        self.rig = world.rig if rig is None else rig
         self.values = dict(values)
         self.warnings: list[str] = []
         self.faults = Faults.of(values, len(world), values["seed"])
@@ -62,11 +64,6 @@ class WorldSequence:
         self._stamps = (world.stamps + self.faults.delay)[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
         self._model = ObservationModel.of(values)
-
-    @property
-    def rig(self) -> StereoRig:
-        """The stereo rig."""
-        return self.world.rig
 
     @property
     def kind(self) -> str:
