@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.worlds.appearance import Appearance, ObservationModel, unit
 from slam.worlds.geometry import hidden
 from slam.worlds.world import World
 
@@ -23,39 +21,6 @@ _SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
 _KEPT = 20_000  # frames whose visible landmarks are kept; fewer in a world of many landmarks
 _USUAL = 2000  # landmarks of a world that is small enough for that
 _FALSE = -1
-_POOL = 4096  # errors of descriptors that are drawn beforehand
-
-
-@dataclass(frozen=True)
-class ObservationModel:
-    """How landmarks become features; the attributes are the options of the same names.
-
-    Attributes:
-        sigma: standard deviation of uL, vL and uR [px].
-        detect: chance that a visible landmark is detected.
-        stereo: chance that it is matched in the right image.
-        outliers: share of false features; half as many true ones are given a false match in the right image.
-        descriptor: length of descriptors.
-        descriptor_noise: typical length of the error of a unit descriptor.
-        descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
-        clutter: share of features that are points of the world, but never detected again.
-        confusion: share of landmarks that look nearly like another one.
-    """
-
-    sigma: float
-    detect: float
-    stereo: float
-    outliers: float
-    descriptor: int
-    descriptor_noise: float
-    descriptor_drift: float
-    clutter: float
-    confusion: float
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> ObservationModel:
-        """From the values of the options."""
-        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
 
 
 @dataclass(frozen=True)
@@ -83,53 +48,6 @@ class SimulatedFeatures:
             f.laplacian[keep], f.descriptors[keep], f.threshold,
         )  # fmt: skip
         return SimulatedFeatures(features, self.ids[keep], self.objects[keep], self.false_stereo[keep])
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """What tells landmarks apart.
-
-    Attributes:
-        descriptors: unit vectors (P, D) float32.
-        laplacian: sign (P,) int8.
-        response: strength (P,).
-        errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
-        drifts: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
-    """
-
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    response: Array
-    errors: NDArray[np.float32]
-    drifts: NDArray[np.float32]
-
-
-def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
-    """Looks of all landmarks.
-
-    Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
-    from another one.
-    """
-    rng = np.random.default_rng([layout, 11])
-    count, size = len(world.landmarks), model.descriptor
-    common = rng.standard_normal(size)
-    common *= 1.2 / np.linalg.norm(common)
-    descriptors = _unit(common + _unit(rng.standard_normal((count, size))))
-    twins = np.flatnonzero(rng.random(count) < model.confusion)
-    if count > 1:
-        originals = (twins + rng.integers(1, count, len(twins))) % count
-        descriptors[twins] = _unit(descriptors[originals] + 0.15 * _unit(rng.standard_normal((len(twins), size))))
-    laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
-    errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
-    response = np.exp(rng.normal(6.5, 1.0, count))
-    drifts = np.zeros((0, 3, size))
-    if model.descriptor_drift > 0:
-        drifts = rng.standard_normal((_POOL, 3, size)) * (model.descriptor_drift / np.sqrt(size))
-    looks = world.landmarks.looks
-    return Appearance(
-        descriptors[looks].astype(np.float32), laplacian[looks], response[looks], errors.astype(np.float32),
-        drifts.astype(np.float32),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -197,15 +115,22 @@ def _turned(normals: Array, objects: IdArray, bodies: Array) -> Array:
     return np.asarray((bodies[objects][:, :3, :3] @ normals[:, :, None])[..., 0])
 
 
-def _views(world: World, frame: int, ids: IdArray, points: Array) -> Array:
-    """Unit vectors (N, 3) to the camera from landmarks at `points` (N, 3): along, down and out of their surfaces."""
+def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) -> Array:
+    """Unit vectors (N, 3) to the camera along, down and out of the landmarks' surfaces; zero for what is nothing.
+
+    `source` are rows of `seen`, −1 for what is nothing.
+    """
+    views = np.zeros((len(source), 3))
+    true = np.flatnonzero(source != _FALSE)
+    ids = seen.ids[source[true]]
     surface, objects = world.landmarks.surface[ids], world.landmarks.object[ids]
     bodies = world.T_world_body(frame)
-    to_camera = -points @ world.T_world_left[frame, :3, :3].T
+    to_camera = -seen.points[source[true]] @ world.T_world_left[frame, :3, :3].T
     arrays = world.arrays
     axes = (arrays.along[surface], arrays.down[surface], arrays.normal[surface])
-    columns = [(_unit(_turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
-    return _unit(np.stack(columns, axis=1))
+    columns = [(unit(_turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
+    views[true] = unit(np.stack(columns, axis=1))
+    return views
 
 
 def _candidates(world: World, points: Array) -> IdArray:
@@ -262,13 +187,8 @@ def _features(
     false = np.flatnonzero(ids == _FALSE)
     landmark = ids.copy()
     landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
-    descriptors = looks.descriptors[landmark] + looks.errors[rng.integers(0, _POOL, len(ids))]
-    true = np.flatnonzero(ids != _FALSE)
-    if len(looks.drifts) and len(true):
-        views = _views(world, frame, ids[true], seen.points[source[true]]).astype(np.float32)
-        drifts = looks.drifts[world.landmarks.looks[ids[true]] % _POOL]
-        descriptors[true] += np.einsum("ni,nid->nd", views, drifts)
-    descriptors[false] = rng.standard_normal((len(false), descriptors.shape[1]), np.float32)
+    descriptors = looks.describe(landmark, _views(world, frame, seen, source) if looks.drifting else None, rng)
+    descriptors[false] = looks.of_nothing(len(false), rng)
     descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]
     objects[false] = _FALSE
@@ -322,8 +242,3 @@ def _inside(rig: StereoRig, uv: Array) -> BoolArray:
     """Which pixels (N, 2) lie in an image; NaN does not."""
     x, y = uv[:, 0], uv[:, 1]
     return (x >= 0) & (y >= 0) & (x <= rig.width - 1) & (y <= rig.height - 1)
-
-
-def _unit(rows: Array) -> Array:
-    """Rows scaled to unit length."""
-    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

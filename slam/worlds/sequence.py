@@ -15,9 +15,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
+from slam.worlds.appearance import Appearance, ObservationModel, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
-from slam.worlds.observe import Appearance, ObservationModel, SimulatedFeatures, appearance, simulate
+from slam.worlds.observe import SimulatedFeatures, simulate
 from slam.worlds.truth import TruthImages, truth_images
 from slam.worlds.world import World
 
