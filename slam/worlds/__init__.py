@@ -9,6 +9,7 @@ May import `slam.geometry` and the data.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from importlib import import_module
 from types import ModuleType
@@ -16,16 +17,17 @@ from typing import Any
 
 from slam.errors import UnknownNameError
 from slam.naming import unknown
+from slam.worlds import miscalibration
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
 from slam.worlds.sequence import WorldSequence
 from slam.worlds.world import World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
 
-_NAMES = ("aisle", "box", "boxes", "desk", "field", "startup", "street")
+_NAMES = ("aisle", "box", "boxes", "desk", "drive", "field", "startup", "street")
 
 #: Options that change the world itself; the others only change how it is recorded.
-_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {"seed"}
+_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {"seed", *miscalibration.NAMES}
 
 
 def names() -> list[str]:
@@ -44,7 +46,10 @@ def open_world(text: str) -> WorldSequence:
     name, _, query = text.partition("?")
     values = parse_query(name, query, options(name))
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
-    return WorldSequence(text, _build(name, key), values)
+    world = _build(name, key)
+    rig = miscalibration.true_rig(world.rig, values)
+    recorded = world if rig is world.rig else replace(world, rig=rig, seen={})
+    return WorldSequence(text, recorded, values, world.rig)
 
 
 def options(name: str) -> dict[str, Option]:

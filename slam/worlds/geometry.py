@@ -6,7 +6,7 @@ World axes follow paper B's experiments: x right, y forward (away from the first
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -236,6 +236,7 @@ class Landmarks:
         surface: index of the rectangle that they lie on (P,).
         object: id of the object, 0 for the still world (P,).
         size: diameter of what is painted there (P,) [m].
+        looks: which landmark it looks like, usually itself (P,).
     """
 
     positions: Array
@@ -243,9 +244,14 @@ class Landmarks:
     surface: IdArray
     object: IdArray
     size: Array = field(repr=False)
+    looks: IdArray = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def select(self, rows: IdArray) -> Landmarks:
+        """These rows; `surface` and `looks` stay as they are."""
+        return Landmarks(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def world_positions(self, T_world_body: Array) -> Array:
         """Positions (P, 3) in the world, for body poses (B + 1, 4, 4) whose row 0 is the identity."""
@@ -257,21 +263,35 @@ class Landmarks:
         return out
 
 
-def place_landmarks(rectangles: Iterable[Rectangle], density: float, rng: np.random.Generator) -> Landmarks:
+def place_landmarks(
+    rectangles: Iterable[Rectangle], density: float, rng: np.random.Generator, alike: bool = False
+) -> Landmarks:
     """Choose landmarks among the marks of all rectangles: at most `density` per square metre, at random.
 
-    Marks smaller than 1 mm or within 5 mm of the border are left out.
+    Marks smaller than 1 mm or within 5 mm of the border are left out. With `alike`, the same marks are chosen where a
+    texture comes again, and they look like those of the first time.
     """
-    columns: list[list[np.ndarray]] = [[], [], [], [], []]
+    chosen: dict[Texture, tuple[Array, int]] = {}
+    columns: list[list[np.ndarray]] = [[], [], [], [], [], []]
+    count = 0
     for index, r in enumerate(rectangles):
-        marks = r.texture.marks()
-        inside = (marks[:, :2] > 0.005).all(axis=1) & (marks[:, 0] < r.texture.width - 0.005)
-        marks = marks[inside & (marks[:, 1] < r.texture.height - 0.005) & (marks[:, 2] > 1e-3)]
-        wanted = min(len(marks), round(density * r.texture.width * r.texture.height))
-        marks = marks[np.sort(rng.permutation(len(marks))[:wanted])]
+        if not alike or r.texture not in chosen:
+            chosen[r.texture] = _chosen_marks(r.texture, density, rng), count
+        marks, first = chosen[r.texture]
         n = len(marks)
-        rows = (r.points(marks[:, :2]), np.tile(r.normal, (n, 1)), np.full(n, index), np.full(n, r.body), marks[:, 2])
+        normals, looks = np.tile(r.normal, (n, 1)), np.arange(first, first + n)
+        rows = (r.points(marks[:, :2]), normals, np.full(n, index), np.full(n, r.body), marks[:, 2], looks)
         for column, part in zip(columns, rows):
             column.append(part)
-    positions, normals, surface, body, size = (np.concatenate(c) for c in columns)
-    return Landmarks(positions, normals, surface.astype(np.int64), body.astype(np.int64), size)
+        count += n
+    positions, normals, surface, body, size, looks = (np.concatenate(c) for c in columns)
+    return Landmarks(positions, normals, surface.astype(np.int64), body.astype(np.int64), size, looks.astype(np.int64))
+
+
+def _chosen_marks(texture: Texture, density: float, rng: np.random.Generator) -> Array:
+    """Marks (M, 3) of a texture that are landmarks."""
+    marks = texture.marks()
+    inside = (marks[:, :2] > 0.005).all(axis=1) & (marks[:, 0] < texture.width - 0.005)
+    marks = marks[inside & (marks[:, 1] < texture.height - 0.005) & (marks[:, 2] > 1e-3)]
+    wanted = min(len(marks), round(density * texture.width * texture.height))
+    return marks[np.sort(rng.permutation(len(marks))[:wanted])]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.worlds.appearance import Appearance, ObservationModel, unit
 from slam.worlds.geometry import hidden
 from slam.worlds.world import World
 
@@ -20,37 +18,9 @@ FACING = 0.25
 
 _MARGIN = 2.0  # no feature so near to the image's border [px]
 _SMALLEST = 9.0  # no feature is smaller: SURF's first filter [px]
-_KEPT = 20_000  # frames whose visible landmarks are kept
+_KEPT = 20_000  # frames whose visible landmarks are kept; fewer in a world of many landmarks
+_USUAL = 2000  # landmarks of a world that is small enough for that
 _FALSE = -1
-_POOL = 4096  # errors of descriptors that are drawn beforehand
-
-
-@dataclass(frozen=True)
-class ObservationModel:
-    """How landmarks become features; the attributes are the options of the same names.
-
-    Attributes:
-        sigma: standard deviation of uL, vL and uR [px].
-        detect: chance that a visible landmark is detected.
-        stereo: chance that it is matched in the right image.
-        outliers: share of false features; half as many true ones are given a false match in the right image.
-        descriptor: length of descriptors.
-        descriptor_noise: typical length of the error of a unit descriptor.
-        confusion: share of landmarks that look nearly like another one.
-    """
-
-    sigma: float
-    detect: float
-    stereo: float
-    outliers: float
-    descriptor: int
-    descriptor_noise: float
-    confusion: float
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> ObservationModel:
-        """From the values of the options."""
-        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
 
 
 @dataclass(frozen=True)
@@ -81,45 +51,6 @@ class SimulatedFeatures:
 
 
 @dataclass(frozen=True)
-class Appearance:
-    """What tells landmarks apart.
-
-    Attributes:
-        descriptors: unit vectors (P, D) float32.
-        laplacian: sign (P,) int8.
-        response: strength (P,).
-        errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
-    """
-
-    descriptors: NDArray[np.float32]
-    laplacian: NDArray[np.int8]
-    response: Array
-    errors: NDArray[np.float32]
-
-
-def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
-    """Looks of all landmarks.
-
-    Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
-    from another one.
-    """
-    rng = np.random.default_rng([layout, 11])
-    count, size = len(world.landmarks), model.descriptor
-    common = rng.standard_normal(size)
-    common *= 1.2 / np.linalg.norm(common)
-    descriptors = _unit(common + _unit(rng.standard_normal((count, size))))
-    twins = np.flatnonzero(rng.random(count) < model.confusion)
-    if count > 1:
-        originals = (twins + rng.integers(1, count, len(twins))) % count
-        descriptors[twins] = _unit(descriptors[originals] + 0.15 * _unit(rng.standard_normal((len(twins), size))))
-    laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
-    errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
-    return Appearance(
-        descriptors.astype(np.float32), laplacian, np.exp(rng.normal(6.5, 1.0, count)), errors.astype(np.float32)
-    )
-
-
-@dataclass(frozen=True)
 class VisibleLandmarks:
     """Landmarks that can be seen in one frame, a row each.
 
@@ -144,7 +75,7 @@ def seen_landmarks(world: World, frame: int) -> VisibleLandmarks:
     """`visible_landmarks`, kept with the world: the next recording of it sees the same."""
     found: VisibleLandmarks | None = world.seen.get(frame)
     if found is None:
-        if len(world.seen) >= _KEPT:
+        if len(world.seen) >= _KEPT // max(1, len(world.landmarks) // _USUAL):
             world.seen.clear()
         found = world.seen[frame] = visible_landmarks(world, frame)
     return found
@@ -154,28 +85,52 @@ def visible_landmarks(world: World, frame: int) -> VisibleLandmarks:
     """Landmarks within reach, inside the left image, on surfaces that face the camera and not hidden."""
     T = world.T_world_left[frame]
     bodies = world.T_world_body(frame)
-    positions = world.landmarks.world_positions(bodies)
+    near = world.landmarks_near(frame)
+    landmarks = world.landmarks.select(near)
+    positions = landmarks.world_positions(bodies)
     points = (positions - T[:3, 3]) @ T[:3, :3]
-    ids = _candidates(world, points)
-    offsets = positions[ids] - T[:3, 3]
-    normals = world.landmarks.normals[ids]
-    moving = world.landmarks.object[ids]
-    if moving.any():
-        normals = (bodies[moving][:, :3, :3] @ normals[:, :, None])[..., 0]
+    rows = _candidates(world, points)
+    offsets = positions[rows] - T[:3, 3]
+    normals = _turned(landmarks.normals[rows], landmarks.object[rows], bodies)
     facing = -(normals * offsets).sum(axis=1) > FACING * np.linalg.norm(offsets, axis=1)
-    ids = ids[facing]
-    uv_left, uv_right = world.rig.project(points[ids])
+    rows = rows[facing]
+    uv_left, uv_right = world.rig.project(points[rows])
     inside = world.rig.left.in_image(uv_left, _MARGIN)
-    ids, uv_left, uv_right = ids[inside], uv_left[inside], uv_right[inside]
+    rows, uv_left, uv_right = rows[inside], uv_left[inside], uv_right[inside]
     uv_right[~world.rig.right.in_image(uv_right, _MARGIN)] = np.nan
-    if len(world.occluders):
-        occluders = world.occluders.placed(bodies)
+    occluders = world.occluders_near(frame).placed(bodies)
+    if len(occluders):
         right_centre = T[:3, 3] - T[:3, :3] @ world.rig.b
-        seen = ~hidden(T[:3, 3], positions[ids], occluders)
-        ids, uv_left, uv_right = ids[seen], uv_left[seen], uv_right[seen]
-        uv_right[hidden(right_centre, positions[ids], occluders)] = np.nan
-    size = np.maximum(world.rig.left.fu * world.landmarks.size[ids] / points[ids, 2], _SMALLEST)
-    return VisibleLandmarks(ids, points[ids], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+        seen = ~hidden(T[:3, 3], positions[rows], occluders)
+        rows, uv_left, uv_right = rows[seen], uv_left[seen], uv_right[seen]
+        uv_right[hidden(right_centre, positions[rows], occluders)] = np.nan
+    size = np.maximum(world.rig.left.fu * landmarks.size[rows] / points[rows, 2], _SMALLEST)
+    return VisibleLandmarks(near[rows], points[rows], uv_left, uv_right, np.isfinite(uv_right[:, 0]), size)
+
+
+def _turned(normals: Array, objects: IdArray, bodies: Array) -> Array:
+    """Directions (N, 3) on objects in world axes."""
+    if not objects.any():
+        return normals
+    return np.asarray((bodies[objects][:, :3, :3] @ normals[:, :, None])[..., 0])
+
+
+def _views(world: World, frame: int, seen: VisibleLandmarks, source: IdArray) -> Array:
+    """Unit vectors (N, 3) to the camera along, down and out of the landmarks' surfaces; zero for what is nothing.
+
+    `source` are rows of `seen`, −1 for what is nothing.
+    """
+    views = np.zeros((len(source), 3))
+    true = np.flatnonzero(source != _FALSE)
+    ids = seen.ids[source[true]]
+    surface, objects = world.landmarks.surface[ids], world.landmarks.object[ids]
+    bodies = world.T_world_body(frame)
+    to_camera = -seen.points[source[true]] @ world.T_world_left[frame, :3, :3].T
+    arrays = world.arrays
+    axes = (arrays.along[surface], arrays.down[surface], arrays.normal[surface])
+    columns = [(unit(_turned(axis, objects, bodies)) * to_camera).sum(axis=1) for axis in axes]
+    views[true] = unit(np.stack(columns, axis=1))
+    return views
 
 
 def _candidates(world: World, points: Array) -> IdArray:
@@ -211,17 +166,19 @@ def simulate(
         _falsify(uv_left, uv_right, np.flatnonzero(false_stereo), rng)
     extra = round(len(rows) * model.outliers / (1 - model.outliers))
     false_left, false_right = _false_pixels(world.rig, extra, rng)
-    uv_left, uv_right = np.concatenate([uv_left, false_left]), np.concatenate([uv_right, false_right])
+    passing_left, passing_right = _clutter(world.rig, seen, round(len(rows) * model.clutter / (1 - model.clutter)), rng)
+    uv_left = np.concatenate([uv_left, false_left, passing_left])
+    uv_right = np.concatenate([uv_right, false_right, passing_right])
     uv_right[~_inside(world.rig, uv_right)] = np.nan
     order = rng.permutation(len(uv_left))
     order = order[_inside(world.rig, uv_left[order])]
-    source = np.concatenate([rows, np.full(extra, _FALSE)])[order]
-    false_stereo = np.concatenate([false_stereo, np.zeros(extra, bool)])[order]
-    return _features(world, looks, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
+    source = np.concatenate([rows, np.full(extra + len(passing_left), _FALSE)])[order]
+    false_stereo = np.concatenate([false_stereo, np.zeros(extra + len(passing_left), bool)])[order]
+    return _features(world, looks, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
 
 
 def _features(
-    world: World, looks: Appearance, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
+    world: World, looks: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
     uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
 ) -> SimulatedFeatures:  # fmt: skip
     """Features with the looks of their landmarks; `source` are their rows in `seen`, −1 for those that are nothing."""
@@ -230,8 +187,8 @@ def _features(
     false = np.flatnonzero(ids == _FALSE)
     landmark = ids.copy()
     landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
-    descriptors = looks.descriptors[landmark] + looks.errors[rng.integers(0, _POOL, len(ids))]
-    descriptors[false] = rng.standard_normal((len(false), descriptors.shape[1]), np.float32)
+    descriptors = looks.describe(landmark, _views(world, frame, seen, source) if looks.drifting else None, rng)
+    descriptors[false] = looks.of_nothing(len(false), rng)
     descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]
     objects[false] = _FALSE
@@ -271,12 +228,17 @@ def _false_pixels(rig: StereoRig, count: int, rng: np.random.Generator) -> tuple
     return uv_left, uv_right
 
 
+def _clutter(rig: StereoRig, seen: VisibleLandmarks, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Left and right pixels (count, 2) of points near visible landmarks that are features in this frame alone."""
+    if not count:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    rows = rng.integers(0, len(seen.ids), count)
+    points = seen.points[rows] * (1 + 0.05 * rng.standard_normal((count, 1)))
+    points[:, :2] += 0.03 * points[:, 2:] * rng.standard_normal((count, 2))
+    return rig.project(points)
+
+
 def _inside(rig: StereoRig, uv: Array) -> BoolArray:
     """Which pixels (N, 2) lie in an image; NaN does not."""
     x, y = uv[:, 0], uv[:, 1]
     return (x >= 0) & (y >= 0) & (x <= rig.width - 1) & (y <= rig.height - 1)
-
-
-def _unit(rows: Array) -> Array:
-    """Rows scaled to unit length."""
-    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

@@ -65,6 +65,10 @@ RECORDING = (
     Option("width", 320, "image width [px]; the focal length grows with it", 64, 4096),
     Option("height", 240, "image height [px]", 48, 4096),
     Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
+    Option("focal_error", 0.0, "by what share the focal length that the system is told is too long", -0.2, 0.2),
+    Option(
+        "turn_error", 0.0, "turn of the right camera about each of its axes that the system is not told [mrad]", -50, 50
+    ),
 )
 
 #: Keys for observations made without images.
@@ -76,6 +80,8 @@ OBSERVATION = (
     Option("outliers", 0.05, "share of features that are false, or are given a false match in the right image", 0, 0.9),
     Option("descriptor", 64, "length of descriptors", 4, 256),
     Option("descriptor_noise", 0.12, "typical length of the error of a unit descriptor", 0, 10),
+    Option("descriptor_drift", 0.0, "change of a unit descriptor as the direction of view turns, per radian", 0, 10),
+    Option("clutter", 0.0, "share of features that are points of the world, but never detected again", 0, 0.9),
     Option("confusion", 0.1, "share of landmarks that look nearly like another one", 0, 1),
 )
 

@@ -15,9 +15,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
+from slam.worlds.appearance import Appearance, ObservationModel, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
-from slam.worlds.observe import Appearance, ObservationModel, SimulatedFeatures, appearance, simulate
+from slam.worlds.observe import SimulatedFeatures, simulate
 from slam.worlds.truth import TruthImages, truth_images
 from slam.worlds.world import World
 
@@ -46,15 +47,17 @@ class WorldSequence:
         format: ``"synthetic"``.
         world: what is recorded.
         values: the values of all options.
+        rig: the stereo rig as the system is told of it; `world.rig` is the true one.
         ground_truth: pose of the left camera at every frame.
         warnings: always empty; recorded sequences have faults to report here.
     """
 
     format = "synthetic"
 
-    def __init__(self, name: str, world: World, values: Mapping[str, Any]) -> None:
+    def __init__(self, name: str, world: World, values: Mapping[str, Any], rig: StereoRig | None = None) -> None:
         self.name = name
         self.world = world
+        self.rig = world.rig if rig is None else rig
         self.values = dict(values)
         self.warnings: list[str] = []
         self.faults = Faults.of(values, len(world), values["seed"])
@@ -62,11 +65,6 @@ class WorldSequence:
         self._stamps = (world.stamps + self.faults.delay)[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
         self._model = ObservationModel.of(values)
-
-    @property
-    def rig(self) -> StereoRig:
-        """The stereo rig."""
-        return self.world.rig
 
     @property
     def kind(self) -> str:

@@ -8,10 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import IdArray
+from slam.data import BoolArray, IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
+from slam.worlds.places import Places
+
+_SMALL = 8000  # landmarks or rectangles that are gone through in every frame: the way to those near it would cost more
+
+
+def _to_corner(rig: StereoRig) -> float:
+    """Distance to a point in a corner of the left image, over its depth; generously."""
+    camera = rig.left
+    x, y = max(camera.u0, camera.width - camera.u0) / camera.fu, max(camera.v0, camera.height - camera.v0) / camera.fv
+    return float(1.1 * np.sqrt(1 + x * x + y * y))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +39,7 @@ class World:
         T_world_object: poses of the objects 1..B at each frame (B, N, 4, 4).
         reach: nearest and farthest distance at which a landmark can be detected [m].
         texels: texels per metre at which the surfaces are painted.
+        lasting: first frame in which each rectangle is there, and the first in which it is not (Q, 2); None for always.
         sky: colour (BGR) where no surface is.
         painted: textures painted so far, filled by the recorder.
         seen: landmarks seen in frames so far, filled by the simulator of observations.
@@ -45,6 +56,7 @@ class World:
     reach: tuple[float, float]
     texels: float
     sky: tuple[int, int, int] = (230, 225, 220)
+    lasting: IdArray | None = None
     painted: dict[Any, Any] = field(default_factory=dict, repr=False)
     seen: dict[int, Any] = field(default_factory=dict, repr=False)
 
@@ -78,4 +90,44 @@ class World:
     @cached_property
     def occluders(self) -> RectangleArrays:
         """The rectangles that may hide others."""
-        return self.arrays.select(np.array([r.occludes for r in self.rectangles], bool))
+        return self.arrays.select(self._occluding)
+
+    def landmarks_near(self, frame: int) -> IdArray:
+        """Ids of the landmarks that may be within reach in a frame; in a small world all of them."""
+        count = len(self.landmarks)
+        if count <= _SMALL:
+            rows = np.arange(count)
+        else:
+            sight = self.reach[1] * _to_corner(self.rig)
+            rows = self._landmark_places.within(self.T_world_left[frame, :3, 3], sight)
+        return rows if self.lasting is None else rows[self._there(self.landmarks.surface[rows], frame)]
+
+    def occluders_near(self, frame: int) -> RectangleArrays:
+        """The rectangles that may hide landmarks within reach in a frame; in a small world all that may hide any."""
+        if len(self.occluders) <= _SMALL and self.lasting is None:
+            return self.occluders
+        sight = self.reach[1] * _to_corner(self.rig)
+        rows = self._occluder_places.within(self.T_world_left[frame, :3, 3], sight)
+        return self.occluders.select(rows[self._there(self._occluding[rows], frame)])
+
+    def _there(self, rectangles: IdArray, frame: int) -> BoolArray:
+        """Which of these rectangles are there in a frame."""
+        if self.lasting is None:
+            return np.ones(len(rectangles), bool)
+        first, end = self.lasting[rectangles].T
+        return (first <= frame) & (frame < end)
+
+    @cached_property
+    def _occluding(self) -> IdArray:
+        """Indices of the rectangles that may hide others."""
+        return np.flatnonzero([r.occludes for r in self.rectangles])
+
+    @cached_property
+    def _landmark_places(self) -> Places:
+        """Landmarks by place."""
+        return Places.of(self.landmarks.positions, self.landmarks.object > 0)
+
+    @cached_property
+    def _occluder_places(self) -> Places:
+        """Occluders by place."""
+        return Places.of(self.occluders.middle, self.occluders.body > 0, float(self.occluders.radius.max()))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.data import IdArray
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, so3_exp
@@ -55,13 +56,13 @@ def clock(values: Mapping[str, Any], duration: float) -> tuple[Array, Array]:
 def assemble(
     name: str, kind: str, values: Mapping[str, Any], rig: StereoRig, stamps: Array, T_world_left: Array,
     rectangles: Iterable[Rectangle], reach: tuple[float, float], texels: float,
-    T_world_object: Array | None = None,
+    T_world_object: Array | None = None, lasting: IdArray | None = None, alike: bool = False,
 ) -> World:  # fmt: skip
-    """A world with its landmarks chosen; the arguments are the world's attributes."""
+    """A world with its landmarks chosen; the arguments are the world's attributes, and `alike` of `place_landmarks`."""
     surfaces = tuple(rectangles)
-    landmarks = place_landmarks(surfaces, values["density"], np.random.default_rng([values["layout"], 31]))
+    landmarks = place_landmarks(surfaces, values["density"], np.random.default_rng([values["layout"], 31]), alike)
     objects = np.zeros((0, len(stamps), 4, 4)) if T_world_object is None else T_world_object
-    return World(name, kind, rig, stamps, T_world_left, surfaces, landmarks, objects, reach, texels)
+    return World(name, kind, rig, stamps, T_world_left, surfaces, landmarks, objects, reach, texels, lasting=lasting)
 
 
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:

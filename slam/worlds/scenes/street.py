@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Rectangle, cuboid, rectangle
+from slam.worlds.geometry import Rectangle, rectangle
 from slam.worlds.options import Option
 from slam.worlds.paths import camera_poses, smooth_step, sway, yaw_pitch_roll
 from slam.worlds.scenes.common import assemble, clock, make_rig
+from slam.worlds.scenes.roadside import car
 from slam.worlds.textures.surfaces import Facade, Material
 from slam.worlds.world import World
 
@@ -41,7 +42,7 @@ def build(values: Mapping[str, Any]) -> World:
     poses = camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
     rectangles = _houses(layout) + _ground(layout) + _parked_cars(layout)
     for body in range(1, values["cars"] + 1):
-        rectangles += _car(np.eye(4), 5000 + 20 * layout + body, body)
+        rectangles += car(np.eye(4), 5000 + 20 * layout + body, body)
     objects = np.array([_drive(t, body) for body in range(1, values["cars"] + 1)]).reshape(-1, len(t), 4, 4)
     return assemble("street", "driving", values, rig, stamps, poses, rectangles, (4.0, 60.0), 64.0, objects)
 
@@ -111,22 +112,6 @@ def _ground(layout: int) -> list[Rectangle]:
     ]
 
 
-def _car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
-    """A car of two boxes; its frame: origin on the ground in its middle, y ahead."""
-    out = []
-    parts = (
-        ((1.75, 4.3, 0.75), (-0.875, -2.15, 0.2), ("car_back", "car_front", "car_side")),
-        ((1.5, 2.3, 0.55), (-0.75, -1.35, 0.95), ("cabin_end", "cabin_end", "cabin_side")),
-    )
-    for size, corner, (rear, fore, side) in parts:
-        x, y, z = size
-        sides = {"front": (rear, x, z), "back": (fore, x, z), "left": (side, y, z), "right": (side, y, z)}
-        faces = {face: Material(a, b, name, seed, 12, (0.05, 0.25)) for face, (name, a, b) in sides.items()}
-        faces["top"] = Material(x, y, "car_top", seed, 1, (0.05, 0.2))
-        out += cuboid(faces, size, corner, body, T)
-    return out
-
-
 def _parked_cars(layout: int) -> list[Rectangle]:
     """Cars at both kerbs."""
     rng = np.random.default_rng([layout, 45])
@@ -142,16 +127,16 @@ def _parked_cars(layout: int) -> list[Rectangle]:
             place, heading = path(np.array([s]), side)
             turn = heading[0] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.02)
             T = pose(yaw_pitch_roll(turn, 0, 0), np.array([*place[0], 0.0]))
-            out += _car(T, 100 * layout + 1000 * (side > 0) + number)
+            out += car(T, 100 * layout + 1000 * (side > 0) + number)
     return out
 
 
-def _drive(t: Array, car: int) -> Array:
+def _drive(t: Array, number: int) -> Array:
     """Poses (N, 4, 4) of a moving car: 1 drives ahead, 2 comes towards the camera, 3 does so later."""
-    if car == 1:
+    if number == 1:
         s, across, turn = 14 + driven(t) + 5 * np.sin(2 * np.pi * t / 19), 0.0, 0.0
     else:
-        s = (95.0 if car == 2 else 330.0) - (7.0 if car == 2 else 9.0) * t
+        s = (95.0 if number == 2 else 330.0) - (7.0 if number == 2 else 9.0) * t
         across, turn = _LANE, np.pi
     place, heading = path(s, across)
     R = np.array([yaw_pitch_roll(h + turn, 0, 0) for h in heading])

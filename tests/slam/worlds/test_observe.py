@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from slam.worlds import open_world
-from slam.worlds.observe import ObservationModel, appearance, visible_landmarks
+from slam.worlds.appearance import ObservationModel, appearance
+from slam.worlds.observe import visible_landmarks
 
 CLEAN = "detect=1&stereo=1&outliers=0&confusion=0"
 

@@ -1,0 +1,148 @@
+"""What tells landmarks apart: their descriptors, and how these change with noise and with the direction of view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import IdArray
+from slam.geometry.se3 import Array
+from slam.worlds.world import World
+
+_POOL = 4096  # errors of descriptors that are drawn beforehand
+_COMMON = 1.2  # what all descriptors have in common, over what is each one's own
+_DIRECTIONS = 6.0  # each further direction of descriptors that drift varies less, by 1 / e over so many
+_DRIFTING = 0.6  # share of the variance of descriptors that changes with the direction of view
+
+
+@dataclass(frozen=True)
+class ObservationModel:
+    """How landmarks become features; the attributes are the options of the same names.
+
+    Attributes:
+        sigma: standard deviation of uL, vL and uR [px].
+        detect: chance that a visible landmark is detected.
+        stereo: chance that it is matched in the right image.
+        outliers: share of false features; half as many true ones are given a false match in the right image.
+        descriptor: length of descriptors.
+        descriptor_noise: typical length of the error of a unit descriptor.
+        descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
+        clutter: share of features that are points of the world, but never detected again.
+        confusion: share of landmarks that look nearly like another one.
+    """
+
+    sigma: float
+    detect: float
+    stereo: float
+    outliers: float
+    descriptor: int
+    descriptor_noise: float
+    descriptor_drift: float
+    clutter: float
+    confusion: float
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> ObservationModel:
+        """From the values of the options."""
+        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What tells landmarks apart.
+
+    Attributes:
+        descriptors: what does not change with the direction of view (P, D) float32; unit vectors without drift.
+        laplacian: sign (P,) int8.
+        response: strength (P,).
+        phase: where in its changes with the direction of view each one is, a whole number (P,).
+        errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
+        common, spread: mean of all descriptors, and standard deviations of each one's own part (D,).
+        waves: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
+        pace: how fast they do [rad/rad].
+    """
+
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    response: Array
+    phase: IdArray
+    errors: NDArray[np.float32]
+    common: Array
+    spread: Array
+    waves: NDArray[np.float32]
+    pace: float
+
+    @property
+    def drifting(self) -> bool:
+        """Whether descriptors change with the direction of view."""
+        return len(self.waves) > 0
+
+    def describe(self, landmark: IdArray, views: Array | None, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Descriptors (N, D) of landmarks, with noise, not of unit length.
+
+        Args:
+            landmark: which ones (N,).
+            views: unit vectors (N, 3) to the camera in axes along, down and out of their surfaces; where they drift.
+            rng: of the noise.
+        """
+        clean = self.descriptors[landmark]
+        if views is not None:
+            phase = self.phase[landmark]
+            swing = np.sin(self.pace * views + phase[:, None] * (1.0, 2.0, 3.0)).astype(np.float32)
+            clean = unit(clean + np.einsum("ni,nid->nd", swing, self.waves[phase % _POOL]))
+        return clean + self.errors[rng.integers(0, _POOL, len(landmark))]
+
+    def of_nothing(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Descriptors (count, D) of features that are no landmarks."""
+        own = rng.standard_normal((count, len(self.common)), np.float32)
+        return (self.common + own * self.spread).astype(np.float32) if self.drifting else own
+
+
+def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
+    """Looks of all landmarks.
+
+    Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
+    from another one. Those that drift are as far apart as SURF's on a drive through a town: also the nearest of some
+    hundred ones, for which they vary less in some directions than in others.
+    """
+    rng = np.random.default_rng([layout, 11])
+    count, size = len(world.landmarks), model.descriptor
+    drifts = model.descriptor_drift > 0
+    common = rng.standard_normal(size)
+    common *= _COMMON / np.linalg.norm(common)
+    spread = np.exp(-np.arange(size) / _DIRECTIONS) if drifts else np.ones(size)
+    spread /= np.linalg.norm(spread)
+    own = rng.standard_normal((count, size))
+    descriptors = common + np.sqrt(1 - _DRIFTING) * spread * own if drifts else unit(common + unit(own))
+    phase = np.arange(count)
+    twins = np.flatnonzero(rng.random(count) < model.confusion)
+    if count > 1:
+        originals = (twins + rng.integers(1, count, len(twins))) % count
+        near = descriptors[originals] + 0.15 * unit(rng.standard_normal((len(twins), size)))
+        descriptors[twins] = near if drifts else unit(near)
+        phase[twins] = originals
+    laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
+    errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
+    response = np.exp(rng.normal(6.5, 1.0, count))
+    waves = np.zeros((0, 3, size))
+    if drifts:
+        waves = rng.standard_normal((_POOL, 3, size)) * (spread * np.sqrt(_DRIFTING * 2 / 3))
+    looks = world.landmarks.looks
+    return Appearance(
+        descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
+        errors.astype(np.float32), common, spread, waves.astype(np.float32), _pace(model.descriptor_drift),
+    )  # fmt: skip
+
+
+def _pace(drift: float) -> float:
+    """Pace of the waves [rad/rad] whose sum changes a descriptor by `drift` per radian, while that is little."""
+    return float(drift * np.sqrt(3 * (_COMMON**2 + 1) / _DRIFTING))
+
+
+def unit(rows: Array) -> Array:
+    """Rows scaled to unit length."""
+    return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]

@@ -1,0 +1,168 @@
+"""Paths to drive along: read from a file, sampled at a frame rate, levelled, and what of them is new road."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from slam.data import BoolArray
+from slam.errors import SequenceError, TrajectoryError
+from slam.files import expanded, read_text
+from slam.geometry.se3 import Array, pose
+from slam.geometry.trajectory import Trajectory
+
+STEP = 0.5  #: distance between samples of a road [m]
+SAME_ROAD = 5.0  #: a later drive within this distance of a road's middle runs along that road [m]
+
+_FILE_RATE = 10.0  # of paths without stamps, KITTI's [Hz]
+_SHORTEST, _LONGEST = 10.0, 100_000.0  # of a path [m]
+_LONGEST_STEP = 50.0  # from one pose to the next [m]
+_SMOOTHED = 2.0  # standard deviation of the filter that takes noise off the road's course [m]
+_BEYOND = 60.0  # a road goes on so far behind the path's start and beyond its end [m]
+_TURNED = 25.0  # what lies so much further along the path is another drive along a road, or another road [m]
+
+
+def read_path(text: str) -> Trajectory:
+    """The path of a file: rows of twelve numbers (KITTI, at 10 Hz) or of eight (TUM); stamps begin at 0.
+
+    Raises:
+        SequenceError: no file is named, it is missing or no path, or nobody could drive along it.
+    """
+    if not text:
+        raise SequenceError("no path is named: drive?path=FILE, poses in the form of KITTI or TUM")
+    file = expanded(text)
+    try:
+        if _columns(file) == 12:
+            path = Trajectory.read_kitti(file)
+            path = Trajectory(path.stamps / _FILE_RATE, path.poses)
+        else:
+            path = Trajectory.read_tum(file)
+            path = Trajectory(path.stamps - path.stamps[0], path.poses)
+    except TrajectoryError as error:
+        raise SequenceError(str(error)) from error
+    _require_drive(file, path)
+    return path
+
+
+def _columns(file: Path) -> int:
+    """Numbers in the first row of a table."""
+    lines = (line.partition("#")[0].split() for line in read_text(file, error=TrajectoryError).splitlines())
+    return len(next(filter(None, lines), []))
+
+
+def _require_drive(file: Path, path: Trajectory) -> None:
+    """Refuse what is no path of a vehicle."""
+    R = path.poses[:, :3, :3]
+    wrong = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
+    wrong |= np.linalg.det(R) < 0
+    if wrong.any():
+        raise SequenceError(f"{file}: the pose of row {int(np.argmax(wrong))} has no rotation")
+    if not _SHORTEST <= path.length <= _LONGEST:
+        limits = f"{_SHORTEST:.0f} m to {_LONGEST / 1000:.0f} km"
+        raise SequenceError(f"{file}: a path of {path.length:.1f} m in {len(path)} poses; a drive needs {limits}")
+    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    if steps.max() > _LONGEST_STEP:
+        row = int(np.argmax(steps)) + 1
+        raise SequenceError(f"{file}: row {row} is {steps.max():.0f} m from the one before: no path of a vehicle")
+    if np.linalg.norm(path.poses[:, :3, 1].mean(axis=0)) < 0.5:
+        raise SequenceError(f"{file}: the camera's y axes point in all directions, downwards was expected")
+
+
+def sampled(path: Trajectory, values: Mapping[str, Any]) -> Trajectory:
+    """The path at the frames of the options `rate`, `speed` and `frames`; poses of the path stay as they are."""
+    count = int(path.stamps[-1] * values["rate"] / values["speed"] + 1e-6) + 1
+    count = min(count, values["frames"] or count)
+    stamps = np.arange(count) / values["rate"]
+    times = np.minimum(stamps * values["speed"], path.stamps[-1])
+    nearest = _nearest(path, times)
+    positions = np.stack([np.interp(times, path.stamps, x) for x in path.positions.T], axis=1)
+    turns = Slerp(path.stamps, Rotation.from_matrix(path.poses[:, :3, :3]))(times)
+    poses = pose(turns.as_matrix(), positions)
+    exact = np.abs(path.stamps[nearest] - times) < 1e-6
+    poses[exact] = path.poses[nearest[exact]]
+    return Trajectory(stamps, poses)
+
+
+def _nearest(path: Trajectory, times: Array) -> np.ndarray:
+    """Rows of the path nearest in time (N,)."""
+    after = np.clip(np.searchsorted(path.stamps, times), 1, len(path) - 1)
+    return after - (times - path.stamps[after - 1] < path.stamps[after] - times)
+
+
+def level(path: Trajectory) -> Array:
+    """Rotation (3, 3) from a path's axes to level ones: x right, y forward at the start, z up.
+
+    Upwards is where the camera's y axis points away from, on average.
+    """
+    up = -path.poses[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    ahead = path.poses[0, :3, 2]
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+@dataclass(frozen=True)
+class Road:
+    """The roads that a path runs along, sampled along the path; what is driven again counts once.
+
+    Attributes:
+        xy: middle of the road (N, 2) [m], level.
+        left: unit vectors to its left (N, 2).
+        way: distance along the path (N,) [m], from below 0 to beyond its end.
+        drives: all of the path, also what is driven again (M, 3) [m], level.
+    """
+
+    xy: Array
+    left: Array
+    way: Array
+    drives: Array
+
+    @classmethod
+    def along(cls, positions: Array) -> Road:
+        """The roads of camera positions (N, 3) [m] in level axes."""
+        way, course = _course(positions)
+        heading = np.gradient(course[:, :2], axis=0)
+        heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-9)
+        new = _new_road(course[:, :2], way)
+        left = np.stack([-heading[:, 1], heading[:, 0]], axis=1)
+        return cls(course[new, :2], left[new], way[new], course)
+
+
+def _course(positions: Array) -> tuple[Array, Array]:
+    """Distances along a path (N,) [m] in equal steps, and smoothed places there (N, 3) [m], continued at both ends."""
+    steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    moved = np.concatenate([[True], steps > 1e-4])
+    way = np.concatenate([[0.0], np.cumsum(steps)])[moved]
+    even = np.arange(0.0, way[-1], STEP)
+    course = np.stack([np.interp(even, way, x) for x in positions[moved].T], axis=1)
+    course = gaussian_filter1d(course, _SMOOTHED / STEP, axis=0, mode="nearest")
+    beyond = np.arange(STEP, _BEYOND, STEP)
+    span = min(round(4 / STEP), len(course) - 1)
+    ends = [(course[0], course[0] - course[span]), (course[-1], course[-1] - course[-1 - span])]
+    before, after = (start + beyond[:, None] * _level_unit(step) for start, step in ends)
+    way = np.concatenate([-beyond[::-1], even, even[-1] + beyond])
+    return way, np.concatenate([before[::-1], course, after])
+
+
+def _level_unit(step: Array) -> Array:
+    """A level unit vector (3,) along a step (3,)."""
+    flat = np.array([step[0], step[1], 0.0])
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def _new_road(xy: Array, way: Array) -> BoolArray:
+    """Which samples (N,) are not within `SAME_ROAD` of an earlier road."""
+    near = cKDTree(xy).query_ball_point(xy, SAME_ROAD)
+    new = np.zeros(len(xy), bool)
+    for i, rows in enumerate(near):
+        others = np.array(rows)
+        new[i] = not (new[others] & (way[others] < way[i] - _TURNED)).any()
+    return new

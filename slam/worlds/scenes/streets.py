@@ -1,0 +1,228 @@
+"""Streets along a path: house fronts on both sides, trees and parked cars, the same ones wherever it comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slam.data import IdArray
+from slam.geometry.se3 import Array, pose
+from slam.worlds.drives import SAME_ROAD, STEP, Road
+from slam.worlds.geometry import Rectangle, rectangle
+from slam.worlds.paths import yaw_pitch_roll
+from slam.worlds.scenes.roadside import cabinet, car, trunk
+from slam.worlds.textures.surfaces import Facade, Material
+
+EYE = 1.65  #: height of the camera above the ground [m]
+ASIDE = 9.0  #: from a road's middle to the house fronts [m]
+STRETCH = 48.0  #: streets are built in stretches of this length [m], so that one can be like another
+
+_HOUSES = 4  # on each side of a stretch
+_NARROWEST = 3.0  # of a house front [m]
+_FOUNDATION = 0.3  # of house fronts below the lowest ground before them [m]
+_TREES, _CARS, _CABINETS = 4, 5, 2  # on each side of a stretch
+_CAR_ASIDE, _TREE_ASIDE, _CABINET_ASIDE = 6.2, 7.6, 8.3  # from a road's middle [m]
+_CLEAR = 2.6  # nothing stands so near to where the camera drives [m]
+_TILE = 16.0  # edges of the ground's parts [m]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What stands on one side of a stretch.
+
+    Attributes:
+        widths, heights: of its houses [m].
+        trees, cars, cabinets: distances along the stretch [m].
+        seed: of their looks.
+    """
+
+    widths: Array
+    heights: Array
+    trees: Array
+    cars: Array
+    cabinets: Array
+    seed: int
+
+
+@lru_cache(maxsize=4096)
+def _plan(layout: int, stretch: int, side: int) -> Plan:
+    """The plan of a stretch (from 0) and a side (−1 right, 1 left)."""
+    rng = np.random.default_rng([layout, 51, stretch, side + 1])
+    cuts = (np.arange(1, _HOUSES) + rng.uniform(-0.2, 0.2, _HOUSES - 1)) * STRETCH / _HOUSES
+    edges = np.concatenate([[0.0], np.round(cuts, 2), [STRETCH]])
+    even = (np.arange(_CARS) + rng.uniform(0.3, 0.7, _CARS)) * STRETCH / _CARS
+    return Plan(
+        np.diff(edges), np.round(rng.uniform(7, 12, _HOUSES), 2), rng.uniform(0, STRETCH, _TREES),
+        even[rng.random(_CARS) < 0.7], rng.uniform(0, STRETCH, _CABINETS), int(rng.integers(1 << 24)) * 100,
+    )  # fmt: skip
+
+
+class Streets:
+    """Streets along a road.
+
+    Args:
+        road: the roads.
+        layout: seed of what stands where.
+        alike: share of stretches that are copies of others.
+    """
+
+    def __init__(self, road: Road, layout: int, alike: float) -> None:
+        self._road = road
+        self._layout = layout
+        self._tree = cKDTree(road.xy)
+        self._drives = cKDTree(road.drives[:, :2])
+        near = self._drives.query_ball_point(road.xy, SAME_ROAD + STEP)
+        heights = road.drives[:, 2] - EYE
+        self._low = np.array([heights[rows].min() for rows in near])
+        self._high = np.array([heights[rows].max() for rows in near])
+        self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
+        self._source = _sources(int(self._stretch[-1]) + 1, alike, layout)
+
+    def houses(self) -> list[Rectangle]:
+        """House fronts along both sides of every road, and across both ends of the path."""
+        return [
+            front for side in (1, -1) for run in self._runs(side) for front in self._fronts(run, side)
+        ] + self._ends()
+
+    def _runs(self, side: int) -> Iterator[IdArray]:
+        """Successive samples of the road with a house front beside them: no road runs there."""
+        edge = self._road.xy + side * ASIDE * self._road.left
+        free = self._tree.query(edge)[0] > ASIDE - 0.1
+        rows = np.flatnonzero(free)
+        step = np.linalg.norm(np.diff(edge[rows], axis=0), axis=1)
+        apart = (np.diff(self._road.way[rows]) > 1.5 * STEP) | (step > 4 * STEP)
+        yield from (run for run in np.split(rows, np.flatnonzero(apart) + 1) if len(run) > 1)
+
+    def _fronts(self, run: IdArray, side: int) -> Iterator[Rectangle]:
+        """The house fronts of one run, a house each."""
+        way = self._road.way[run]
+        edge = self._road.xy[run] + side * ASIDE * self._road.left[run]
+        for a, b in pairwise(self._edges(way[0], way[-1], side)):
+            ends = np.array([[np.interp(w, way, x) for x in edge.T] for w in (a, b)])
+            before = run[(way >= a) & (way <= b)]
+            if not len(before):
+                continue
+            plan, house = self._house((a + b) / 2, side)
+            width = float(np.linalg.norm(ends[1] - ends[0]))
+            if abs(width - plan.widths[house]) < 0.25:
+                width = float(plan.widths[house])  # as it is wherever the same house stands
+            spread = float((self._high - self._low)[before].max())
+            height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
+            facade = Facade(round(width, 2), height, plan.seed + house)
+            start, end = ends if side > 0 else ends[::-1]
+            top = float(self._low[before].min()) - _FOUNDATION + height
+            yield rectangle(facade, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+
+    def _edges(self, first: float, last: float, side: int) -> Array:
+        """Where house fronts begin and end between two distances along the path (N,) [m]."""
+        zero = self._road.way[0]
+        found = [first]
+        for stretch in range(int((first - zero) // STRETCH), int((last - zero) // STRETCH) + 1):
+            plan = self._plan(stretch, side)
+            found += (zero + stretch * STRETCH + np.cumsum([0.0, *plan.widths[:-1]])).tolist()
+        inside = np.array(found)
+        inside = inside[(inside > first + _NARROWEST) & (inside < last - _NARROWEST)]
+        return np.concatenate([[first], inside, [last]])
+
+    def _house(self, way: float, side: int) -> tuple[Plan, int]:
+        """The plan, and which of its houses stands at a distance along the path."""
+        stretch, along = divmod(way - self._road.way[0], STRETCH)
+        plan = self._plan(int(stretch), side)
+        return plan, min(int(np.searchsorted(np.cumsum(plan.widths), along)), _HOUSES - 1)
+
+    def _plan(self, stretch: int, side: int) -> Plan:
+        """What stands on a side of a stretch."""
+        return _plan(self._layout, int(self._source[min(stretch, len(self._source) - 1)]), side)
+
+    def _ends(self) -> list[Rectangle]:
+        """House fronts across the road behind the start and beyond the end, unless other roads run there."""
+        out = []
+        for row, to_left in ((0, 1), (-1, -1)):
+            middle, left = self._road.xy[row], self._road.left[row]
+            rows = self._tree.query_ball_point(middle, 2 * ASIDE)
+            if np.abs(self._road.way[rows] - self._road.way[row]).max() > 3 * ASIDE:
+                continue
+            plan = self._plan(int(self._stretch[row]), 1)
+            facade = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
+            start = middle - to_left * ASIDE * left
+            top = float(self._low[row]) - _FOUNDATION + facade.height
+            out.append(rectangle(facade, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
+        return out
+
+    def furniture(self) -> list[Rectangle]:
+        """Trees and switch cabinets."""
+        out = []
+        for way, side, plan, number in self._places("trees"):
+            T = self._pose(way, side, _TREE_ASIDE)
+            out += [] if T is None else trunk(T, plan.seed + 10 + number)
+        for way, side, plan, number in self._places("cabinets"):
+            T = self._pose(way, side, _CABINET_ASIDE)
+            out += [] if T is None else cabinet(T, plan.seed + 20 + number)
+        return out
+
+    def parking(self) -> Iterator[tuple[Array, int]]:
+        """Poses (4, 4) of parked cars, and seeds of their looks."""
+        for way, side, plan, number in self._places("cars"):
+            T = self._pose(way, side, _CAR_ASIDE)
+            if T is not None:
+                yield T, plan.seed + 30 + number
+
+    def parked_cars(self) -> list[Rectangle]:
+        """Parked cars, the same ones at all times."""
+        return [part for T, seed in self.parking() for part in car(T, seed)]
+
+    def _places(self, what: str) -> Iterator[tuple[float, int, Plan, int]]:
+        """Distance along the path, side, plan and number of everything of one kind."""
+        for stretch in np.unique(self._stretch).tolist():
+            for side in (1, -1):
+                plan = self._plan(stretch, side)
+                for number, along in enumerate(getattr(plan, what).tolist()):
+                    yield self._road.way[0] + stretch * STRETCH + along, side, plan, number
+
+    def _pose(self, way: float, side: int, aside: float) -> Array | None:
+        """Pose (4, 4) on the ground at a road's side, y along the traffic there; None where it would be in the way."""
+        row = int(np.abs(self._road.way - way).argmin())
+        if abs(self._road.way[row] - way) > STEP:
+            return None
+        left = self._road.left[row]
+        along = np.array([left[1], -left[0]])
+        xy = self._road.xy[row] + (way - self._road.way[row]) * along + side * aside * left
+        if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR:
+            return None
+        heading = float(np.arctan2(-along[0], along[1])) + (np.pi if side > 0 else 0.0)
+        return pose(yaw_pitch_roll(heading, 0, 0), np.array([*xy, self._low[row]]))
+
+    def ground(self) -> list[Rectangle]:
+        """Square parts of the ground under all roads, as steep as the roads there."""
+        around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * ASIDE
+        cells = np.unique(np.floor((self._road.xy[:, None] + around) / _TILE).reshape(-1, 2).astype(int), axis=0)
+        return [self._tile(cell, number) for number, cell in enumerate(cells)]
+
+    def _tile(self, cell: IdArray, number: int) -> Rectangle:
+        """One part of the ground: the plane that fits the roads around it best."""
+        middle = (cell + 0.5) * _TILE
+        rows = np.array(self._tree.query_ball_point(middle, 1.5 * _TILE))
+        x, y = (self._road.xy[rows] - middle).T
+        slope_x, slope_y, height = np.linalg.lstsq(
+            np.column_stack([x, y, np.ones(len(rows))]), self._low[rows], rcond=1e-3
+        )[0]
+        corner = np.array([-_TILE / 2, _TILE / 2])
+        origin = (*(middle + corner), height + corner @ (slope_x, slope_y))
+        texture = Material(_TILE, _TILE, "road", 100 * self._layout + number, 0.3, (0.05, 0.3))
+        along, down = np.array([_TILE, 0, _TILE * slope_x]), np.array([0, -_TILE, -_TILE * slope_y])
+        return Rectangle(np.array(origin), along, down, texture)
+
+
+def _sources(count: int, alike: float, layout: int) -> IdArray:
+    """Which stretch each stretch looks like (count,): itself, or for a share `alike` another one."""
+    rng = np.random.default_rng([layout, 52])
+    copies = rng.random(count) < alike
+    originals = np.flatnonzero(~copies) if not copies.all() else np.array([0])
+    source = np.arange(count)
+    source[copies] = rng.choice(originals, int(copies.sum()))
+    return source
