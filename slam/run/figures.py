@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ class RunData:
         sequence, backend: names.
         folder: where it was read from.
         truth_is_exact: whether the truth has no errors of its own: that of a world.
+        loops: rows of `final` whose places are the same (L, 2), the later one first.
     """
 
     name: str
@@ -59,6 +60,7 @@ class RunData:
     backend: str = ""
     folder: Path = Path()
     truth_is_exact: bool = True
+    loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
@@ -79,12 +81,12 @@ class RunData:
         landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
-        truth = folder / "truth.txt"
+        truth, final = folder / "truth.txt", Trajectory.read_tum(folder / "trajectory_final.txt")
         config = json.loads(read_text(folder / "config.json"))
         return cls(
             name,
             Trajectory.read_tum(folder / "trajectory.txt"),
-            Trajectory.read_tum(folder / "trajectory_final.txt"),
+            final,
             _numbers(landmarks, ("x", "y", "z")),
             upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             last_seen == int(frames[-1]["frame"]),
@@ -96,7 +98,15 @@ class RunData:
             str(config["backend"]),
             folder,
             config["format"] == "synthetic",
+            _loops(frames, final),
         )
+
+
+def _loops(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
+    """Rows of the final path (L, 2) whose places are the same."""
+    stamps = {row["frame"]: float(row["stamp"]) for row in frames}
+    pairs = [(stamps[row["frame"]], stamps[row["loop"]]) for row in frames if row.get("loop")]
+    return np.searchsorted(final.stamps, np.array(pairs).reshape(-1, 2) - 1e-9).clip(0, max(len(final) - 1, 0))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -148,9 +158,19 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
         axis.add_collection(ellipses)
         axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
     axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
+    draw_loops(axis, run)
     _draw_truth(axis, run.online, truth, (0, 2))
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
     _limit_to_most(axis, run)
+
+
+def draw_loops(axis: Axes, run: RunData) -> None:
+    """The path that loops have corrected, from above, and the places where they were closed."""
+    if not len(run.loops):
+        return
+    final = run.final.positions[:, [0, 2]]
+    axis.plot(*final.T, color=_COLOURS[2], lw=1.5, label="path, corrected by loops")
+    axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_COLOURS[1], label="loops closed")
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:

@@ -201,7 +201,7 @@ def _drive(
         try:
             for number, result in results:
                 record.add(number, result)
-                files.write_frame(number, result)
+                files.write_frame(number, result, None if result.loop is None else record.numbers[result.loop])
                 if score is not None:
                     score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
@@ -374,6 +374,7 @@ def _results(
     }
     if isinstance(system, StereoSlam):
         found["self_calibration"] = system.calibration.summary()
+        found["loops"] = system.atlas.summary()
     if score is not None:
         found["objects"] = score.summary()
     return {**found, "milliseconds": _timings(record), "frames_per_second": _rate(record)}

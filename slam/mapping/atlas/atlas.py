@@ -14,7 +14,7 @@ import numpy as np
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.keyframes import Keyframe, positive_part
+from slam.mapping.atlas.keyframes import Keyframe, what_was_added
 from slam.mapping.atlas.loops import Loop
 from slam.mapping.atlas.places import PlaceIndex
 from slam.mapping.atlas.pose_graph import Chain, shared_out, solve
@@ -49,6 +49,10 @@ class Atlas:
     def __len__(self) -> int:
         return len(self.keyframes)
 
+    def summary(self) -> dict[str, int]:
+        """Numbers of keyframes, of loops in the pose graph, and of sightings that contradicted the path."""
+        return {"keyframes": len(self), "closed": len(self.loops), "refused": self.refused}
+
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""
         if not self.loops or self.keyframes[self.loops[-1].second].frame != frame:
@@ -67,6 +71,12 @@ class Atlas:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
         return np.concatenate([self.corrected, self.T_map_odom @ chain.poses[len(self.corrected) :]])
 
+    def positions(self) -> Array:
+        """Positions (K, 3) [m] of all keyframes in the map."""
+        since = np.array([k.T_odom_left[:3, 3] for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 3)
+        T = self.T_map_odom
+        return np.concatenate([self.corrected[:, :3, 3], since @ T[:3, :3].T + T[:3, 3]])
+
     def estimate(self, estimate: Estimate) -> Estimate:
         """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says."""
         if self.anchor is None:
@@ -74,7 +84,7 @@ class Atlas:
         T, R = self.T_map_odom, self.T_map_odom[:3, :3]
         before = self.keyframes[len(self.corrected) - 1]
         back = adjoint(inverse(estimate.T_world_left) @ before.T_odom_left)
-        since = positive_part(estimate.covariance - back @ before.covariance @ back.T)
+        since = what_was_added(estimate.covariance, back @ before.covariance @ back.T)
         return replace(
             estimate,
             T_world_left=T @ estimate.T_world_left,

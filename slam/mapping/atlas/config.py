@@ -20,6 +20,9 @@ class AtlasConfig:
         keyframe_distance: or where the camera has gone this share of the median depth of what that one saw.
         features: most features that a keyframe keeps.
         return_depths: a place counts as left once the camera has gone this many times the median depth of what it saw.
+        view_depths: a place is seen again from no farther than this many times that depth.
+        drift: share of its length by which a path may be wrong, besides what its covariance says: places farther off
+            are not compared.
         candidates: number of keyframes that are compared in detail with a new one.
         inliers: features that must agree on a pose for two keyframes to show the same place.
         spread: least standard deviation of their pixels, as a share of the image's width.
@@ -32,7 +35,9 @@ class AtlasConfig:
     keyframe_share: float = 0.8
     keyframe_distance: float = 0.2
     features: int = 400
-    return_depths: float = 5.0
+    return_depths: float = 3.0
+    view_depths: float = 3.0
+    drift: float = 0.02
     candidates: int = 8
     inliers: int = 15
     spread: float = 0.1

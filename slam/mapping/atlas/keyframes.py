@@ -104,12 +104,15 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array, flo
         floor: covariance (6, 6) of a pose that one frame's measurements give.
     """
     back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
-    return positive_part(covariance - back @ before.covariance @ back.T) + floor
+    return what_was_added(covariance, back @ before.covariance @ back.T) + floor
 
 
-def positive_part(matrix: Array) -> Array:
-    """A symmetric matrix (6, 6) without its negative eigenvalues; rotations and metres are brought to one scale."""
-    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(scale, scale))
+def what_was_added(after: Array, before: Array) -> Array:
+    """The positive part (6, 6) of what one covariance has more than another.
+
+    Rotations and metres are brought to one scale by the deviations of `after`.
+    """
+    scale = np.sqrt(np.diag(after))
+    values, vectors = np.linalg.eigh((after - before) / np.outer(scale, scale))
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(root @ root.T)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray, StereoFeatures
+from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.geometry.trajectory import Trajectory
@@ -134,12 +134,11 @@ class LoopCloser:
         Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
         it knows by itself.
         """
-        travelled = np.array([k.travelled for k in atlas.keyframes])
-        left = travelled < new.travelled - self._config.return_depths * new.depth
-        if not left.any():
+        possible = self._within_reach(atlas, new)
+        if not possible.any():
             return np.zeros(0, np.intp)
         similarity = atlas.index.similarity(new.descriptors.astype(np.float32))
-        similarity[~left] = -np.inf
+        similarity[~possible] = -np.inf
         best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
         best = best[np.isfinite(similarity[best])]
         known = landmark_of[landmark_of >= 0]
@@ -147,6 +146,18 @@ class LoopCloser:
         number = [alike(atlas.keyframes[k], features, self._localizer.config) for k in rows]
         order = np.argsort(-np.array(number, int), kind="stable")[:_VERIFIED]
         return np.array([rows[i] for i in order if number[i] >= self._config.inliers], np.intp)
+
+    def _within_reach(self, atlas: Atlas, new: Keyframe) -> BoolArray:
+        """Which keyframes (K,) the camera has left, but may be back at, as far as its path is known."""
+        if not len(atlas):
+            return np.zeros(0, bool)
+        c, length = self._config, np.array([new.travelled - k.travelled for k in atlas.keyframes])
+        positions = atlas.positions()
+        here = atlas.T_map_odom[:3, :3] @ new.T_odom_left[:3, 3] + atlas.T_map_odom[:3, 3]
+        far = np.linalg.norm(positions - here, axis=1)
+        sigma = np.sqrt(np.trace(new.covariance[3:, 3:]))
+        reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
+        return np.asarray((length > c.return_depths * new.depth) & (far < reach))
 
     def _best_sighting(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int

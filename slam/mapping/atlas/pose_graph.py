@@ -26,7 +26,8 @@ class Chain:
 
     Attributes:
         poses: T_odom_left (K, 4, 4).
-        steps: covariance (K, 6, 6) of the motion from the keyframe before, perturbing on the right; the first counts not.
+        steps: covariance (K, 6, 6) of the motion from the keyframe before, perturbing on the right; the first has no
+            meaning.
     """
 
     poses: Array

@@ -1,0 +1,189 @@
+"""A drive that comes back: the loop is closed above any back end, and the path is better for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import slam
+from slam.config import SystemConfig
+from slam.data import Estimate, FrameResult, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import adjoint, exp, inverse, transform
+from slam.geometry.trajectory import Trajectory
+
+LAP = 100  # frames
+BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
+
+
+class Odometry:
+    """A back end that knows the true path but for a drift, and has nothing but what every back end must have."""
+
+    def __init__(self, rig: StereoRig, truth: Trajectory) -> None:
+        self._rig, self._truth = rig, truth
+        self._poses: list[np.ndarray] = []
+        self._P = np.diag(np.full(6, 1e-10))
+        self._points: dict[int, np.ndarray] = {}
+
+    def predict(self, stamp: float) -> Prediction:
+        k = len(self._poses)
+        if k:
+            step = inverse(self._truth.poses[k - 1]) @ self._truth.poses[k] @ exp(BIAS)
+            back = adjoint(inverse(step))
+            self._P = back @ self._P @ back.T + np.diag(SIGMAS**2)
+        self._poses.append(self._poses[-1] @ step if k else np.eye(4))
+        ids = np.array(sorted(self._points), np.int64)
+        left, right = self._rig.project(transform(inverse(self._poses[-1]), self.positions(ids)))
+        seen = self._rig.left.in_image(left)
+        S = np.tile(9.0 * np.eye(2), (seen.sum(), 1, 1))
+        return Prediction(stamp, self._poses[-1], self._P, ids[seen], left[seen], right[seen], S)
+
+    def update(self, observations: Observations, guess: np.ndarray | None = None) -> UpdateReport:
+        status = UpdateStatus.OK if len(observations) else UpdateStatus.EMPTY
+        return UpdateReport(status, "", observations.ids, observations.ids[:0], float("nan"), 0)
+
+    def add(self, observations: Observations) -> None:
+        local = self._rig.triangulate(observations.uv_left, observations.uv_right)
+        self._points |= dict(zip(observations.ids.tolist(), transform(self._poses[-1], local)))
+
+    def remove(self, ids) -> None:
+        for i in np.asarray(ids).tolist():
+            del self._points[i]
+
+    def estimate(self, landmarks: bool = True) -> Estimate:
+        ids = np.array(sorted(self._points) if landmarks else [], np.int64)
+        k = len(self._poses) - 1
+        P = np.tile(np.eye(3), (len(ids), 1, 1))
+        return Estimate(self._truth.stamps[k], self._poses[-1], self._P, ids, self.positions(ids), P)
+
+    def positions(self, ids) -> np.ndarray:
+        return np.array([self._points[i] for i in np.asarray(ids).tolist()]).reshape(-1, 3)
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(self._truth.stamps[: len(self._poses)], np.array(self._poses))
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory):
+    """A round of 100 m, and 30 m of it once more."""
+    step = exp(np.array([0.0, 2 * np.pi / LAP, 0.0, 0.0, 0.0, 1.0]))
+    poses = [np.eye(4)]
+    for _ in range(LAP + 29):
+        poses.append(poses[-1] @ step)
+    file: Path = tmp_path_factory.mktemp("paths") / "round.txt"
+    Trajectory(0.1 * np.arange(len(poses)), np.array(poses)).write_tum(file)
+    return slam.open_sequence(f"synthetic:drive?path={file}&descriptor=16")
+
+
+def system_for(sequence, backend: object, settings: tuple[str, ...] = ()) -> slam.StereoSlam:
+    name = backend if isinstance(backend, str) else None
+    config = SystemConfig.for_kind(sequence.kind, None, name).with_settings(
+        ["map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off", "self_calibration.enabled=false",
+         *settings]
+    )  # fmt: skip
+    return slam.StereoSlam(sequence.rig, None, backend, config=config)  # type: ignore[arg-type]
+
+
+def drive(sequence, backend: object, *settings: str) -> tuple[slam.StereoSlam, list[FrameResult]]:
+    system = system_for(sequence, backend, settings)
+    return system, [system.process_features(sequence.observations(k)) for k in range(len(sequence))]
+
+
+def errors(poses: np.ndarray, truth: Trajectory) -> np.ndarray:
+    """Distance of each pose from the truth [m], with the first ones on each other."""
+    return np.linalg.norm((inverse(truth.poses[0]) @ truth.poses)[:, :3, 3] - poses[:, :3, 3], axis=1)
+
+
+@pytest.fixture(scope="module")
+def closed(sequence):
+    return drive(sequence, Odometry(sequence.rig, sequence.ground_truth))
+
+
+def first_loop(results: list[FrameResult]) -> int:
+    return next(r.index for r in results if r.loop is not None)
+
+
+def test_loops_are_closed_where_they_are(closed):
+    system, results = closed
+    for now, then in [(r.index, r.loop) for r in results if r.loop is not None]:
+        assert abs(now - then - LAP) <= 8
+    assert first_loop(results) < LAP + 12
+    assert system.atlas.summary()["refused"] == 0
+    assert system.atlas.summary()["keyframes"] == sum(r.keyframe for r in results)
+
+
+def test_the_path_is_better(closed, sequence):
+    system, results = closed
+    online = np.array([r.estimate.T_world_left for r in results])
+    odom = np.array([inverse(r.T_map_odom) @ r.estimate.T_world_left for r in results])
+    np.testing.assert_allclose(odom, system.backend.trajectory().poses, atol=1e-9)
+    truth, after = sequence.ground_truth, first_loop(results)
+    assert errors(online, truth)[after:].max() < 0.2 * errors(odom, truth)[after:].min()
+    final, before = (np.sqrt((errors(poses, truth) ** 2).mean()) for poses in (system.trajectory().poses, odom))
+    assert final < 0.4 * before
+
+
+def test_the_path_has_no_jump_where_it_is_corrected(closed):
+    steps = np.linalg.norm(np.diff(closed[0].trajectory().positions, axis=0), axis=1)
+    assert steps.min() > 0.95 and steps.max() < 1.05
+
+
+def test_nothing_changes_before_the_loop(closed, sequence):
+    results = closed[1]
+    _, without = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.enabled=false")
+    for a, b in zip(results[: first_loop(results)], without):
+        assert (a.estimate.T_world_left == b.estimate.T_world_left).all()
+        assert (a.estimate.covariance == b.estimate.covariance).all()
+        assert (a.matched == b.matched).all()
+    assert not any(r.keyframe for r in without)
+
+
+def test_the_pose_is_surer_after_the_loop(closed):
+    results = closed[1]
+    first = first_loop(results)
+    before, after = (np.trace(results[k].estimate.covariance[3:, 3:]) for k in (first - 1, first))
+    assert after < 0.5 * before
+    assert np.trace(results[-1].estimate.covariance[3:, 3:]) < before
+
+
+def test_a_loop_that_contradicts_the_path_is_refused(sequence):
+    system, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.gate_sigmas=0.01")
+    assert all(r.loop is None for r in results)
+    assert system.atlas.summary()["refused"] > 0
+
+
+def test_one_keyframe_alone_closes_no_loop(sequence):
+    _, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=2")
+    _, single = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=1")
+    assert first_loop(single) < first_loop(results)
+
+
+def test_an_interrupted_keyframe_leaves_the_atlas_as_it_was(sequence, monkeypatch: pytest.MonkeyPatch):
+    system = system_for(sequence, "ekf")
+    for k in range(3):
+        system.process_features(sequence.observations(k))
+    before = system.atlas
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(system._mapper, "give_back", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            system.process_features(sequence.observations(8))
+    assert system.atlas is before
+    system.process_features(sequence.observations(9))
+    assert len(system.atlas) == len(before) + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
+    _, results = drive(sequence, backend)
+    first = first_loop(results)
+    long_ago = np.concatenate([r.matched for r in results[: LAP // 2]])
+    erased = np.concatenate([r.erased for r in results[:first]])
+    again = np.concatenate([r.matched for r in results[first + 1 :]])
+    assert np.isin(again, np.intersect1d(long_ago, erased)).any()

@@ -1,0 +1,145 @@
+"""A place seen again gives the pose between both views, and another place gives none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.data import StereoFeatures
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
+from slam.mapping.atlas.config import AtlasConfig
+from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed, what_was_added
+from slam.mapping.atlas.loops import refined_pose, sighting
+from slam.models import EstimatorModels
+from slam.tracking.association import AssociationConfig
+from slam.tracking.localizer import Localizer
+
+SIGMA = 0.5
+CAMERA = PinholeCamera(300.0, 300.0, 320.0, 180.0, 640, 360)
+RIG = StereoRig(CAMERA, CAMERA, np.eye(3), np.array([-0.5, 0.0, 0.0]))
+LOCALIZER = Localizer(RIG, AssociationConfig(), EstimatorModels(pixel_sigma=SIGMA))
+
+
+def world(seed: int) -> tuple[Array, Array]:
+    """Points (300, 3) [m] before the first camera, and unit descriptors."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-10, 10, 300), rng.uniform(-3, 3, 300), rng.uniform(6, 20, 300)])
+    descriptors = rng.normal(size=(300, 16))
+    return points, (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
+
+
+def view(T_world_left: Array, points: Array, descriptors: Array, seed: int) -> StereoFeatures:
+    """What a camera at a pose sees of the points, with noise."""
+    rng = np.random.default_rng(seed)
+    left, right = RIG.project(transform(inverse(T_world_left), points))
+    seen = RIG.left.in_image(left) & RIG.right.in_image(right)
+    left = left[seen] + rng.normal(0, SIGMA, (seen.sum(), 2))
+    right = np.column_stack([right[seen, 0] + rng.normal(0, SIGMA, seen.sum()), left[:, 1]])
+    one = np.ones(seen.sum())
+    return StereoFeatures(0.0, left, right, one, 0 * one, one, one.astype(np.int8), descriptors[seen])
+
+
+def keyframe(features: StereoFeatures) -> Keyframe:
+    """The frame as a keyframe."""
+    nothing = np.full(len(features), -1)
+    rows, points = kept_features(RIG, features, nothing, np.zeros(0, np.intp), SIGMA, 400)
+    return Keyframe(
+        0, 0.0, np.eye(4), np.eye(6), np.zeros((6, 6)), 0.0, float(np.median(points[:, 2])),
+        points.astype(np.float32), features.descriptors[rows].astype(np.float16), features.laplacian[rows],
+        nothing[rows],
+    )  # fmt: skip
+
+
+MOVED = exp(np.array([0.02, 0.1, -0.01, 0.4, -0.1, 1.0]))
+
+
+def test_the_pose_of_a_place_seen_again():
+    nees = []
+    for seed in range(20):
+        points, descriptors = world(seed)
+        old = keyframe(view(np.eye(4), points, descriptors, 2 * seed))
+        measured = view(MOVED, points, descriptors, 2 * seed + 1)
+        found = sighting(old, measured, RIG, LOCALIZER, AtlasConfig(), seed)
+        assert found is not None and len(found.matches) > 50
+        error = log(inverse(found.T_keyframe_left) @ MOVED)
+        assert np.linalg.norm(error[3:]) < 0.15 and np.linalg.norm(error[:3]) < 0.01
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(nees) < 6.0  # features do not slide here, which the covariance allows for
+
+
+def test_least_squares_knows_how_sure_it_is():
+    nees = []
+    for seed in range(60):
+        rng, points = np.random.default_rng(seed), world(seed)[0][:80]
+        true, _ = RIG.project_stereo(points, jacobian=False)
+        first = true + rng.normal(0, SIGMA, true.shape)
+        moved, _ = RIG.project_stereo(transform(inverse(MOVED), points), jacobian=False)
+        good = np.isfinite(moved).all(axis=1)
+        right = np.column_stack([first[:, 2], first[:, 1]])
+        triangulated = RIG.triangulate(first[:, :2], right)[good]
+        second = (moved + rng.normal(0, SIGMA, moved.shape))[good]
+        T, P = refined_pose(RIG, triangulated, second, MOVED @ exp(np.full(6, 0.02)), SIGMA)
+        error = log(inverse(T) @ MOVED)
+        nees.append(error @ np.linalg.solve(P, error))
+    assert 4.0 < np.mean(nees) < 8.5  # 6 is right; 60 draws have a deviation of 0.45, and depths are skewed
+
+
+def test_another_place_is_not_the_same():
+    old = keyframe(view(np.eye(4), *world(0), 0))
+    for seed in range(1, 11):
+        assert sighting(old, view(MOVED, *world(seed), seed), RIG, LOCALIZER, AtlasConfig(), seed) is None
+
+
+def test_matches_in_one_spot_are_not_enough():
+    _, descriptors = world(0)
+    rng = np.random.default_rng(0)
+    spot = np.column_stack([rng.uniform(0, 0.5, 300), rng.uniform(0, 0.5, 300), rng.uniform(9, 10, 300)])
+    old, seen = keyframe(view(np.eye(4), spot, descriptors, 0)), view(MOVED, spot, descriptors, 1)
+    assert sighting(old, seen, RIG, LOCALIZER, AtlasConfig(), 0) is None
+    assert sighting(old, seen, RIG, LOCALIZER, AtlasConfig(spread=0.0), 0) is not None
+
+
+def test_moving_features_are_not_kept():
+    features = view(np.eye(4), *world(0), 0)
+    nothing = np.full(len(features), -1)
+    rows, _ = kept_features(RIG, features, nothing, np.arange(10), SIGMA, 400)
+    assert rows.min() == 10
+
+
+def test_landmarks_are_kept_first():
+    features = view(np.eye(4), *world(0), 0)
+    landmark_of = np.full(len(features), -1)
+    landmark_of[-5:] = np.arange(5)
+    rows, _ = kept_features(RIG, features, landmark_of, np.zeros(0, np.intp), SIGMA, 5)
+    assert rows.tolist() == list(range(len(features) - 5, len(features)))
+
+
+@pytest.mark.parametrize(("motion", "changed"), [
+    (np.zeros(6), False),
+    ([0, 0, 0, 0, 0, 5.0], True),
+    ([0, 0, 0, 0, 0, 0.5], False),
+    ([0, 1.0, 0, 0, 0, 0], True),
+])  # fmt: skip
+def test_a_keyframe_where_the_view_has_changed(motion: list[float], changed: bool):
+    old = keyframe(view(np.eye(4), *world(0), 0))
+    assert view_has_changed(old, exp(np.array(motion, float)), RIG, AtlasConfig()) == changed
+
+
+def test_covariance_of_a_step_is_what_was_added():
+    old, step = keyframe(view(np.eye(4), *world(0), 0)), exp(np.array([0, 0.1, 0, 0, 0, 1.0]))
+    added = np.diag([1e-4, 2e-4, 1e-4, 1e-2, 1e-2, 3e-2])
+    back = adjoint(inverse(step))
+    after = back @ old.covariance @ back.T + added
+    np.testing.assert_allclose(step_covariance(old, step, after, np.zeros((6, 6))), added, atol=1e-12)
+    less = 0.5 * back @ old.covariance @ back.T
+    assert np.abs(step_covariance(old, step, less, added) - added).max() < 1e-12
+
+
+def test_what_was_added_is_never_negative():
+    a, b = np.random.default_rng(0).normal(size=(2, 6, 6))
+    P, Q = a @ a.T, b @ b.T
+    np.testing.assert_allclose(what_was_added(P + Q, P), Q, atol=1e-10)
+    assert np.linalg.eigvalsh(what_was_added(P, P + 0.5 * Q)).max() < 1e-10
+    assert np.abs(what_was_added(P, P)).max() == 0

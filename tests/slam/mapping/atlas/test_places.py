@@ -1,0 +1,57 @@
+"""A place seen again is the most similar one, and an index keeps what it had when another one grows from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.mapping.atlas.places import PlaceIndex, aggregate, learn_words
+
+
+def places(count: int, seed: int = 0) -> np.ndarray:
+    """Descriptors (count, 200, 16) of unit length."""
+    found = np.random.default_rng(seed).normal(size=(count, 200, 16)).astype(np.float32)
+    return found / np.linalg.norm(found, axis=2, keepdims=True)
+
+
+def noisy(descriptors: np.ndarray, seed: int) -> np.ndarray:
+    """Half of a place's descriptors as seen again, and as many others."""
+    rng = np.random.default_rng(seed)
+    seen = descriptors[::2] + 0.05 * rng.normal(size=descriptors[::2].shape)
+    both = np.concatenate([seen, rng.normal(size=(100, 16))]).astype(np.float32)
+    return both / np.linalg.norm(both, axis=1, keepdims=True)
+
+
+def test_finds_the_place():
+    every, index = places(100), PlaceIndex()
+    for some in every:
+        index = index.with_new(some)
+    assert index.count == 100
+    right = [int(np.argmax(index.similarity(noisy(some, k)))) == k for k, some in enumerate(every)]
+    assert np.mean(right) > 0.95
+
+
+def test_knows_nothing_before_the_words_are_learnt():
+    index = PlaceIndex().with_new(places(1)[0])
+    assert index.words is None
+    assert index.similarity(places(1)[0]).tolist() == [0.0]
+
+
+def test_two_that_grow_from_one_do_not_disturb_it():
+    every, index = places(40), PlaceIndex()
+    for some in every[:30]:
+        index = index.with_new(some)
+    before = index.similarity(every[3]).copy()
+    index.with_new(every[35])
+    again = index.with_new(every[36])
+    assert (index.similarity(every[3]) == before).all()
+    assert np.argmax(again.similarity(every[36])) == 30
+
+
+def test_words_are_the_same_each_time():
+    descriptors = places(20).reshape(-1, 16)
+    assert (learn_words(descriptors, 64) == learn_words(descriptors, 64)).all()
+
+
+def test_a_frame_without_features_is_like_none():
+    words = learn_words(places(20).reshape(-1, 16), 64)
+    assert not aggregate(np.zeros((0, 16), np.float32), words).any()

@@ -1,0 +1,120 @@
+"""The pose graph over the ends of loops gives what one over all keyframes gives."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam.geometry.se3 import adjoint, exp, inverse, log
+from slam.mapping.atlas.loops import Loop
+from slam.mapping.atlas.pose_graph import Chain, relative_pose, shared_out, solve
+
+SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
+
+
+def circle(count: int = 60, laps: float = 1.5) -> np.ndarray:
+    """True poses (N, 4, 4) of a camera that goes round and comes back."""
+    step = exp(np.array([0.0, 2 * np.pi * laps / count, 0.0, 0.0, 0.0, 1.0]))
+    poses = [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+def problem(seed: int) -> tuple[np.ndarray, Chain, tuple[Loop, ...]]:
+    """True poses, a chain with drift, and loops after one lap."""
+    rng = np.random.default_rng(seed)
+    true = circle()
+    odom = [true[0]]
+    for before, now in pairwise(true):
+        odom.append(odom[-1] @ inverse(before) @ now @ exp(rng.normal(size=6) * SIGMAS))
+    sigma = np.array([1e-3, 1e-3, 1e-3, 0.02, 0.02, 0.02])
+    loops = tuple(
+        Loop(i, i + 40, inverse(true[i]) @ true[i + 40] @ exp(rng.normal(size=6) * sigma), np.diag(sigma**2), 50)
+        for i in (2, 9, 15)
+    )
+    return true, Chain(np.array(odom), np.tile(np.diag(SIGMAS**2), (len(true), 1, 1))), loops
+
+
+def whole(chain: Chain, loops: tuple[Loop, ...]) -> tuple[gtsam.Values, gtsam.Marginals]:
+    """The problem with all keyframes as variables."""
+
+    def pose3(T: np.ndarray) -> gtsam.Pose3:
+        return gtsam.Pose3(gtsam.Rot3.ClosestTo(T[:3, :3]), T[:3, 3])
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose3(0, pose3(chain.poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    for i, T in enumerate(chain.poses):
+        values.insert(i, pose3(T))
+        if i:
+            step = pose3(inverse(chain.poses[i - 1]) @ T)
+            graph.add(gtsam.BetweenFactorPose3(i - 1, i, step, gtsam.noiseModel.Gaussian.Covariance(chain.steps[i])))
+    for loop in loops:
+        noise = gtsam.noiseModel.Gaussian.Covariance(loop.covariance)
+        graph.add(gtsam.BetweenFactorPose3(loop.first, loop.second, pose3(loop.T_first_second), noise))
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return values, gtsam.Marginals(graph, values)
+
+
+def test_the_same_as_with_all_keyframes():
+    _, chain, loops = problem(0)
+    solution = solve(chain, loops, chain.poses)
+    values, marginals = whole(chain, loops)
+    full = np.array([values.atPose3(i).matrix() for i in range(len(chain.poses))])
+    # Stretches are linearised where the path is, so it is the same to second order of the change, which is some 0.1 m.
+    moved = np.linalg.norm(full[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
+    assert moved > 0.05
+    assert np.abs(solution.poses - full).max() < 0.05 * moved
+    expected = marginals.marginalCovariance(len(full) - 1)
+    np.testing.assert_allclose(solution.covariance, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_loops_take_most_of_the_drift_away():
+    before, after, nees = [], [], []
+    for seed in range(10):
+        true, chain, loops = problem(seed)
+        solution = solve(chain, loops, chain.poses)
+        before.append(np.linalg.norm(chain.poses[-1, :3, 3] - true[-1, :3, 3]))
+        after.append(np.linalg.norm(solution.poses[-1, :3, 3] - true[-1, :3, 3]))
+        error = log(inverse(solution.poses[-1]) @ true[-1])
+        nees.append(error @ np.linalg.solve(solution.covariance, error))
+    assert np.median(after) < 0.7 * np.median(before)  # the rest is the drift of the first lap
+    assert 3.0 < np.mean(nees) < 10.0  # 6 is right; ten draws of χ² with 6 degrees have a deviation of 1.1
+
+
+def test_a_false_loop_disagrees():
+    _, chain, loops = problem(0)
+    good = loops[0]
+    false = Loop(5, 30, np.eye(4), good.covariance, 50)
+    assert solve(chain, loops, chain.poses).disagreement.max() < 25
+    assert solve(chain, (*loops, false), chain.poses).disagreement.max() > 100
+
+
+def test_relative_pose_without_loops_is_that_of_the_path():
+    _, chain, _ = problem(1)
+    T, P = relative_pose(chain, (), chain.poses, 10, 25)
+    direct, expected = chain.motion(10, 25)
+    np.testing.assert_allclose(T, direct, atol=1e-9)
+    np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_motion_back_has_the_carried_covariance():
+    _, chain, _ = problem(2)
+    T, P = chain.motion(3, 8)
+    back, Q = chain.motion(8, 3)
+    np.testing.assert_allclose(back @ T, np.eye(4), atol=1e-12)
+    A = adjoint(T)
+    np.testing.assert_allclose(Q, A @ P @ A.T, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_shared_out_keeps_the_ends(share: float):
+    rng = np.random.default_rng(3)
+    begin, motion, rest = (exp(rng.normal(size=(1, 6))) for _ in range(3))
+    change = 0.1 * rng.normal(size=(1, 6))
+    out = shared_out(begin, motion, rest, share * change)
+    end = out @ rest
+    np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
