@@ -19,7 +19,7 @@ from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
-from slam.mapping.mapper import MapChange, Mapper, Step
+from slam.mapping.mapper import MapChange, Mapper, Returned, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
@@ -180,7 +180,7 @@ class StereoSlam:
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
-            prediction, matches = self._localize(prediction, landmarks, features, index)
+            prediction, matches, seen_again = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
@@ -202,7 +202,7 @@ class StereoSlam:
         with stages.stage("atlas"):  # a place seen again corrects the path since
             step = replace(step, estimate=self._considered(estimate))
             atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path)
-            change = self._mapper.give_back(self.backend, change, step, returned)
+            change = self._mapper.give_back(self.backend, change, step, returned or seen_again)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
@@ -302,19 +302,26 @@ class StereoSlam:
 
     def _localize(
         self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures, index: int
-    ) -> tuple[Prediction, LandmarkMatches]:
-        """Landmarks in this frame; where the camera was kidnapped, a new back end's prediction with them."""
-        positions = self.backend.positions(landmarks.ids)
-        matches = self._localizer.localize(prediction, landmarks, positions, features, self._last.state, index)
+    ) -> tuple[Prediction, LandmarkMatches, Returned | None]:
+        """Landmarks in this frame; where the camera was kidnapped, a new back end's prediction with them.
+
+        Where it is in a place of the atlas that the back end's landmarks do not show, what it sees of that comes third.
+        """
+        positions, state = self.backend.positions(landmarks.ids), self._last.state
+        found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
+        elsewhere = None if found is None else found.T_odom_left
+        matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)
         if not matches.kidnapped:
-            return prediction, matches
+            return prediction, matches, None
         assert matches.T_world_left is not None
         if not self._relocalizer.can_restart(self.backend):
-            return prediction, LandmarkMatches.nothing()
+            return prediction, LandmarkMatches.nothing(), None
         new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
         prediction, r = new.predict(features.stamp), self._relocalizer
         self.backend, self._given, r.past, r.restarted = (
             new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
         self.objects.restart()
-        return prediction, self._localizer.match(prediction, landmarks, positions, features, index)
+        if found is not None and matches.T_world_left is elsewhere:
+            return prediction, LandmarkMatches.nothing(), found.returned
+        return prediction, self._localizer.match(prediction, landmarks, positions, features, index), None

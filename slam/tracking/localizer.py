@@ -91,15 +91,19 @@ class Localizer:
         features: StereoFeatures,
         state: TrackingState,
         seed: int,
+        elsewhere: Array | None = None,
     ) -> LandmarkMatches:
         """`match`, but poses farther from the prediction than it allows are not believed before several frames agree.
 
-        None match meanwhile; then the matches have no landmarks but the pose, and are marked as `kidnapped`.
+        None match meanwhile; then the matches have no landmarks but the pose, and are marked as `kidnapped`. So it is
+        with the pose `elsewhere` (4, 4), from places that the landmarks do not show, where nothing matches.
         """
         doubtful = state.unmatched > 0
         matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
         T, c = matches.T_world_left, self.config
-        if T is None or jump(prediction, T) <= (c.lost_jump if doubtful else c.max_jump):
+        if T is None and elsewhere is not None:
+            T = elsewhere
+        elif T is None or jump(prediction, T) <= (c.lost_jump if doubtful else c.max_jump):
             self._hypotheses = PoseHypotheses()
             return matches
         self._hypotheses = self._hypotheses.after(T, features.stamp, self._models)

@@ -14,10 +14,10 @@ import numpy as np
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.chain import Chain, shared_out
 from slam.mapping.atlas.keyframes import Keyframe, what_was_added
 from slam.mapping.atlas.loops import Loop
 from slam.mapping.atlas.places import PlaceIndex
-from slam.mapping.atlas.pose_graph import Chain, shared_out, solve
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,12 @@ class Atlas:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
         return np.concatenate([self.corrected, self.T_map_odom @ chain.poses[len(self.corrected) :]])
 
+    def pose_in_map(self, number: int) -> Array:
+        """Pose T_map_left (4, 4) of a keyframe."""
+        if number < len(self.corrected):
+            return np.asarray(self.corrected[number])
+        return self.T_map_odom @ self.keyframes[number].T_odom_left
+
     def positions(self) -> Array:
         """Positions (K, 3) [m] of all keyframes in the map."""
         since = np.array([k.T_odom_left[:3, 3] for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 3)
@@ -97,6 +103,8 @@ class Atlas:
         """A path in odom, taken to the map; what loops move two keyframes by is shared out evenly in time between."""
         if not self.loops or not len(path):
             return path
+        from slam.mapping.atlas.pose_graph import solve
+
         chain = self.chain(path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         return Trajectory(path.stamps, _between_keyframes(path, np.array([k.stamp for k in self.keyframes]), moved))

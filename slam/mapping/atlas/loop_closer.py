@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,11 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed
 from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
-from slam.mapping.atlas.pose_graph import Chain, relative_pose, solve
+from slam.mapping.atlas.places import Vectors
 from slam.mapping.mapper import Returned, Step
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
@@ -27,6 +28,19 @@ _VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared
 _PATIENCE = 3  # keyframes within which another one must see the same return
 _MINIMAL = 6  # features that give a pose with a covariance
 _HYPOTHESES = 300  # poses tried: one in a hundred places is missed where a quarter of its matches are right
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a camera is that may have been anywhere.
+
+    Attributes:
+        T_odom_left: its pose (4, 4) in the back end's frame.
+        returned: what it sees of the place.
+    """
+
+    T_odom_left: Array
+    returned: Returned
 
 
 class LoopCloser:
@@ -76,6 +90,26 @@ class LoopCloser:
         best = self._best_sighting(atlas, candidates, step.features, step.index)
         return (atlas, None) if best is None else self._close(atlas, *best, step.features, path)
 
+    @one_blas_thread
+    def find(self, atlas: Atlas, features: StereoFeatures, seed: int) -> Found | None:
+        """The keyframe whose place a camera sees that may be anywhere; None where no place is clear.
+
+        Args:
+            atlas: the places.
+            features: of the frame.
+            seed: of the random choice in the geometric check.
+        """
+        if not self._config.enabled or len(features) < self._config.inliers:
+            return None
+        features = self._rectify(features)
+        likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
+        best = self._best_sighting(atlas, self._ranked(atlas, likely, features), features, seed)
+        if best is None:
+            return None
+        loop, seen = best
+        T = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first) @ loop.T_first_second
+        return Found(T, self._returned(atlas.keyframes[loop.first], seen))
+
     def _rectify(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified rig."""
         r = self._rectified
@@ -104,7 +138,8 @@ class LoopCloser:
         if len(rows) < _MINIMAL:
             return None
         T, P = step.estimate.T_world_left, step.estimate.covariance
-        travelled, added = 0.0, np.zeros((6, 6))
+        travelled = 0.0
+        added: Array = np.zeros((6, 6))
         if len(atlas):
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
@@ -137,15 +172,23 @@ class LoopCloser:
         possible = self._within_reach(atlas, new)
         if not possible.any():
             return np.zeros(0, np.intp)
-        similarity = atlas.index.similarity(new.descriptors.astype(np.float32))
+        likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
+        known = landmark_of[landmark_of >= 0]
+        rows = [k for k in likely.tolist() if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
+        return self._ranked(atlas, np.array(rows, np.intp), features)
+
+    def _most_alike(self, atlas: Atlas, descriptors: Vectors, possible: BoolArray) -> NDArray[np.intp]:
+        """Numbers of the possible keyframes (K,) whose descriptors as a whole are most similar."""
+        similarity = atlas.index.similarity(descriptors)
         similarity[~possible] = -np.inf
         best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
-        best = best[np.isfinite(similarity[best])]
-        known = landmark_of[landmark_of >= 0]
-        rows = [k for k in best if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
-        number = [alike(atlas.keyframes[k], features, self._localizer.config) for k in rows]
-        order = np.argsort(-np.array(number, int), kind="stable")[:_VERIFIED]
-        return np.array([rows[i] for i in order if number[i] >= self._config.inliers], np.intp)
+        return np.asarray(best[np.isfinite(similarity[best])])
+
+    def _ranked(self, atlas: Atlas, likely: NDArray[np.intp], features: StereoFeatures) -> NDArray[np.intp]:
+        """Those keyframes that most features match, enough of them, the best first."""
+        number = np.array([alike(atlas.keyframes[k], features, self._localizer.config) for k in likely], int)
+        order = np.argsort(-number, kind="stable")[:_VERIFIED]
+        return likely[order[number[order] >= self._config.inliers]]
 
     def _within_reach(self, atlas: Atlas, new: Keyframe) -> BoolArray:
         """Which keyframes (K,) the camera has left, but may be back at, as far as its path is known."""
@@ -180,6 +223,8 @@ class LoopCloser:
         self, atlas: Atlas, loop: Loop, seen: Sighting, features: StereoFeatures, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
+        from slam.mapping.atlas.pose_graph import relative_pose, solve
+
         chain = atlas.chain(path())
         start = atlas.in_map(chain)
         T, P = relative_pose(chain, atlas.loops, start, loop.first, loop.second)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import slam
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, FrameResult, Observations, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
@@ -187,3 +188,20 @@ def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
     erased = np.concatenate([r.erased for r in results[:first]])
     again = np.concatenate([r.matched for r in results[first + 1 :]])
     assert np.isin(again, np.intersect1d(long_ago, erased)).any()
+
+
+def test_a_camera_carried_to_a_place_of_long_ago_is_found(sequence):
+    system = system_for(sequence, "ekf", ("map.max_landmarks=60",))
+    for k in range(60):
+        system.process_features(sequence.observations(k))
+    blind = [StereoFeatures.empty(6.0 + 0.1 * i, 16) for i in range(6)]
+    carried = [replace(sequence.observations(5 + i), stamp=6.6 + 0.1 * i) for i in range(10)]
+    old = system.landmarks.ids.max()
+    results = [system.process_features(f) for f in [*blind, *carried]]
+    statuses = [r.status.value for r in results]
+    assert "tracked" not in statuses[:6]
+    assert statuses[10:] == ["tracked"] * 6  # the fourth frame starts at the place: three must agree on it
+    assert len(system.restarted) == 1
+    truth = inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses[14]
+    assert np.linalg.norm(results[-1].estimate.T_world_left[:3, 3] - truth[:3, 3]) < 0.3
+    assert (np.concatenate([r.matched for r in results[10:]]) <= old).any()

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from slam.geometry.se3 import adjoint, exp, inverse, log
+from slam.mapping.atlas.chain import Chain, shared_out
 from slam.mapping.atlas.loops import Loop
-from slam.mapping.atlas.pose_graph import Chain, relative_pose, shared_out, solve
+from slam.mapping.atlas.pose_graph import relative_pose, solve
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 
