@@ -13,6 +13,7 @@ from slam.data import IdArray
 from slam.geometry.se3 import Array
 from slam.worlds.world import World
 
+_VISIT = 60.0  # landmarks that change do so after as long a time [s]
 _POOL = 4096  # errors of descriptors that are drawn beforehand
 _COMMON = 1.2  # what all descriptors have in common, over what is each one's own
 _DIRECTIONS = 6.0  # each further direction of descriptors that drift varies less, by 1 / e over so many
@@ -31,6 +32,7 @@ class ObservationModel:
         descriptor: length of descriptors.
         descriptor_noise: typical length of the error of a unit descriptor.
         descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
+        change: share of landmarks that look different when the camera comes back after a minute.
         clutter: share of features that are points of the world, but never detected again.
         confusion: share of landmarks that look nearly like another one.
     """
@@ -42,6 +44,7 @@ class ObservationModel:
     descriptor: int
     descriptor_noise: float
     descriptor_drift: float
+    change: float
     clutter: float
     confusion: float
 
@@ -64,6 +67,7 @@ class Appearance:
         common, spread: mean of all descriptors, and standard deviations of each one's own part (D,).
         waves: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
         pace: how fast they do [rad/rad].
+        change: share of landmarks that look different when the camera comes back.
     """
 
     descriptors: NDArray[np.float32]
@@ -75,26 +79,44 @@ class Appearance:
     spread: Array
     waves: NDArray[np.float32]
     pace: float
+    change: float
 
     @property
     def drifting(self) -> bool:
         """Whether descriptors change with the direction of view."""
         return len(self.waves) > 0
 
-    def describe(self, landmark: IdArray, views: Array | None, rng: np.random.Generator) -> NDArray[np.float32]:
+    def describe(
+        self, landmark: IdArray, views: Array | None, time: float, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
         """Descriptors (N, D) of landmarks, with noise, not of unit length.
 
         Args:
             landmark: which ones (N,).
             views: unit vectors (N, 3) to the camera in axes along, down and out of their surfaces; where they drift.
+            time: of the frame [s].
             rng: of the noise.
         """
-        clean = self.descriptors[landmark]
+        visit = self._visit(landmark, time) if self.change > 0 else None
+        like = landmark
+        if visit is not None:
+            changed = visit % 10_000 < 10_000 * (1 - np.sqrt(1 - self.change))  # at each of two visits
+            like = np.where(changed, visit // 10_000 % len(self.descriptors), landmark)
+        clean = self.descriptors[like]
         if views is not None:
-            phase = self.phase[landmark]
+            phase = self.phase[like]
             swing = np.sin(self.pace * views + phase[:, None] * (1.0, 2.0, 3.0)).astype(np.float32)
             clean = unit(clean + np.einsum("ni,nid->nd", swing, self.waves[phase % _POOL]))
+        if visit is not None:
+            clean = clean + self.errors[visit % _POOL]
         return clean + self.errors[rng.integers(0, _POOL, len(landmark))]
+
+    def _visit(self, landmark: IdArray, time: float) -> IdArray:
+        """Numbers (N,) drawn anew for each landmark about once a minute, each at a time of its own."""
+        own = landmark.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        minute = (time / _VISIT + (own >> np.uint64(40)).astype(float) / 2**24).astype(np.uint64)
+        mixed = (own ^ (minute * np.uint64(0xC2B2AE3D27D4EB4F))) * np.uint64(0xFF51AFD7ED558CCD)
+        return (mixed >> np.uint64(20)).astype(np.int64)
 
     def of_nothing(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Descriptors (count, D) of features that are no landmarks."""
@@ -135,6 +157,7 @@ def appearance(world: World, model: ObservationModel, layout: int) -> Appearance
     return Appearance(
         descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
         errors.astype(np.float32), common, spread, waves.astype(np.float32), _pace(model.descriptor_drift),
+        model.change,
     )  # fmt: skip
 
 

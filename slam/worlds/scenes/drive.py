@@ -22,7 +22,8 @@ OPTIONS = (
     Option("alike", 0.0, "share of the streets' stretches of 48 m that look like another one", 0, 1),
 )
 DEFAULTS: dict[str, Any] = {
-    **street.DEFAULTS, "density": 1.2, "detect": 0.75, "descriptor": 16, "descriptor_noise": 0.1, "descriptor_drift": 2.2, "clutter": 0.3,
+    **street.DEFAULTS, "density": 1.2, "detect": 0.75, "change": 0.5, "clutter": 0.3,
+    "descriptor": 16, "descriptor_noise": 0.1, "descriptor_drift": 2.2,
 }  # fmt: skip
 
 REACH = (4.0, 60.0)  #: nearest and farthest distance of a feature [m]
