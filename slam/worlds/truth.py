@@ -34,7 +34,10 @@ def truth_images(world: World, frame: int) -> TruthImages:
     rays = pixel_rays(camera)
     nearness = np.zeros((camera.height, camera.width))
     objects = np.zeros((camera.height, camera.width), np.int32)
-    for row in np.flatnonzero(((placed.origin - T[:3, 3]) * placed.normal).sum(axis=1) < -1e-9):
+    facing = ((placed.origin - T[:3, 3]) * placed.normal).sum(axis=1) < -1e-9
+    before = (placed.middle - T[:3, 3]) @ T[:3, 2] > -placed.radius
+    rows = np.flatnonzero(facing & before)
+    for row in rows[world.there(rows, frame)]:
         _cast(placed, int(row), T, camera, rays, nearness, objects)
     with np.errstate(divide="ignore"):
         depth = np.where(nearness > 0, 1 / nearness, 0.0)
