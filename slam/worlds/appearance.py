@@ -66,7 +66,7 @@ class Appearance:
         errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
         common, spread: mean of all descriptors, and standard deviations of each one's own part (D,).
         waves: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
-        pace: how fast they do [rad/rad].
+        directions: along which the direction of view matters for each of the three, and how much (E, 3, 3) [rad/rad].
         change: share of landmarks that look different when the camera comes back.
     """
 
@@ -78,7 +78,7 @@ class Appearance:
     common: Array
     spread: Array
     waves: NDArray[np.float32]
-    pace: float
+    directions: Array
     change: float
 
     @property
@@ -105,7 +105,8 @@ class Appearance:
         clean = self.descriptors[like]
         if views is not None:
             phase = self.phase[like]
-            swing = np.sin(self.pace * views + phase[:, None] * (1.0, 2.0, 3.0)).astype(np.float32)
+            seen = np.einsum("nij,nj->ni", self.directions[phase % _POOL], views)
+            swing = np.sin(seen + phase[:, None]).astype(np.float32)
             clean = unit(clean + np.einsum("ni,nid->nd", swing, self.waves[phase % _POOL]))
         if visit is not None:
             clean = clean + self.errors[visit % _POOL]
@@ -150,20 +151,20 @@ def appearance(world: World, model: ObservationModel, layout: int) -> Appearance
     laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
     errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
     response = np.exp(rng.normal(6.5, 1.0, count))
-    waves = np.zeros((0, 3, size))
+    waves, directions = np.zeros((0, 3, size)), np.zeros((0, 3, 3))
     if drifts:
+        directions = _pace(model.descriptor_drift) * rng.standard_normal((_POOL, 3, 3))
         waves = rng.standard_normal((_POOL, 3, size)) * (spread * np.sqrt(_DRIFTING * 2 / 3))
     looks = world.landmarks.looks
     return Appearance(
         descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
-        errors.astype(np.float32), common, spread, waves.astype(np.float32), _pace(model.descriptor_drift),
-        model.change,
+        errors.astype(np.float32), common, spread, waves.astype(np.float32), directions, model.change,
     )  # fmt: skip
 
 
 def _pace(drift: float) -> float:
     """Pace of the waves [rad/rad] whose sum changes a descriptor by `drift` per radian, while that is little."""
-    return float(drift * np.sqrt(3 * (_COMMON**2 + 1) / _DRIFTING))
+    return float(drift * np.sqrt((_COMMON**2 + 1) / _DRIFTING))
 
 
 def unit(rows: Array) -> Array:

@@ -24,6 +24,7 @@ STRETCH = 48.0  #: streets are built in stretches of this length [m], so that on
 
 _HOUSES = 4  # on each side of a stretch
 _NARROWEST = 3.0  # of a house front [m]
+_BENT = 0.5  # most that the road turns along one front [rad]
 _FOUNDATION = 0.3  # of house fronts below the lowest ground before them [m]
 _EVEN = 0.2  # a town with no greater differences in height is level [m]
 _TREES, _CARS, _CABINETS = 4, 5, 2  # on each side of a stretch
@@ -111,7 +112,7 @@ class Streets:
         """The house fronts of one run, a house each."""
         way = self._road.way[run]
         edge = self._road.xy[run] + side * ASIDE * self._road.left[run]
-        for a, b in pairwise(self._edges(way[0], way[-1], side)):
+        for a, b, part in self._pieces(way[0], way[-1], side):
             ends = np.array([[np.interp(w, way, x) for x in edge.T] for w in (a, b)])
             before = run[(way >= a) & (way <= b)]
             if not len(before):
@@ -122,10 +123,18 @@ class Streets:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
             spread = float((self._high - self._low)[before].max())
             height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
-            facade = Facade(round(width, 2), height, plan.seed + house)
+            facade = Facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
             top = float(self._low[before].min()) - self._foundation + height
             yield rectangle(facade, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+
+    def _pieces(self, first: float, last: float, side: int) -> Iterator[tuple[float, float, int]]:
+        """From where to where each house front reaches [m along the path], and its number where a house is bent."""
+        for a, b in pairwise(self._edges(first, last, side).tolist()):
+            start, end = (self._road.left[np.abs(self._road.way - w).argmin()] for w in (a, b))
+            parts = int(np.ceil(np.arccos(np.clip(start @ end, -1, 1)) / _BENT + 1e-9))
+            cuts = np.linspace(a, b, parts + 1).tolist()
+            yield from ((c, d, part) for part, (c, d) in enumerate(pairwise(cuts)))
 
     def _edges(self, first: float, last: float, side: int) -> Array:
         """Where house fronts begin and end between two distances along the path (N,) [m]."""
