@@ -13,13 +13,13 @@ from slam.worlds.paths import camera_poses
 from slam.worlds.scenes import drive, town
 from slam.worlds.scenes.streets import ASIDE, STRETCH
 
-LAP = 600  # frames of a round in `loop`
+LAP = 450  # frames of a round in `loop`
 SMALL = "width=310&height=94"
 
 
 @pytest.fixture(scope="session")
 def loop(tmp_path_factory) -> Path:
-    """A file with two rounds of a circle of 600 m in KITTI's axes, on a slope; the second one repeats the first."""
+    """A file with two rounds of a circle of 450 m in KITTI's axes, on a slope; the second one repeats the first."""
     angle = 2 * np.pi * np.arange(2 * LAP) / LAP
     radius = LAP / (2 * np.pi)
     positions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 2 * np.sin(angle)])
@@ -75,7 +75,7 @@ def test_no_house_stands_on_a_road_and_every_house_faces_it():
             assert path.query((house.origin + along)[:, :2])[0].min() > 3.0, "a car is half as wide as 2 m"
             middle = house.origin + house.along / 2
             nearest = sequence.ground_truth.positions[path.query(middle[:2])[1]]
-            if np.linalg.norm(nearest - middle) < 2 * ASIDE:
+            if np.linalg.norm(nearest - middle) < ASIDE + 1:
                 assert (nearest - middle) @ house.normal > 0
 
 
