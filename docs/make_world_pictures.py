@@ -20,7 +20,9 @@ PICTURES = {
     "box": ("", (10, 120, 220, 360)),
     "boxes": ("", (60, 200, 330)),
     "street": ("", (10, 125, 190)),
+    "town": ("cars=other", (150, 870, 1200)),
 }
+WIDE = ("street", "town")  #: worlds whose images are wide
 HEIGHT = 300  #: of a frame in a picture [px]
 FAULTS = ("black=0", "bright=0", "blur=0", "burst=0", "hand=0", "shutter=1")
 
@@ -39,7 +41,7 @@ def main() -> None:
 
 def large(name: str, query: str) -> WorldSequence:
     """A world in colour, larger than it is by default where that is small."""
-    size = "" if name == "street" else "&width=640&height=480"
+    size = "" if name in WIDE else "&width=640&height=480"
     return open_world(f"{name}?colour=1{size}" + (f"&{query}" if query else ""))
 
 
@@ -68,7 +70,7 @@ def object_picture(sequence: WorldSequence, frame: int) -> np.ndarray:
 def save(name: str, images: list[np.ndarray]) -> None:
     """Write images side by side, three in a row at most where there are more than four."""
     rows = [images[:3], images[3:]] if len(images) > 4 else [images]
-    if name == "street":
+    if name in WIDE:
         rows = [[image] for image in images]
     gap = 6
     lines = [np.hstack([np.pad(i, ((0, gap), (0, gap), (0, 0)), constant_values=255) for i in row]) for row in rows]

@@ -27,6 +27,7 @@ OBSERVED = {
     "box?frames=80&sigma=0.7": 0.030,
     "boxes?frames=80&sigma=0.7": 0.040,
     "street?frames=30&sigma=0.7": 0.060,
+    "town?frames=30&sigma=0.7": 0.060,
 }
 RENDERED = {"aisle?frames=20": 0.005, "desk?frames=20": 0.005, "box?frames=20": 0.015, "street?frames=8": 0.06}
 

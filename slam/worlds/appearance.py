@@ -13,6 +13,7 @@ from slam.data import IdArray
 from slam.geometry.se3 import Array
 from slam.worlds.world import World
 
+_VISIT = 60.0  # landmarks that change do so after as long a time [s]
 _POOL = 4096  # errors of descriptors that are drawn beforehand
 _COMMON = 1.2  # what all descriptors have in common, over what is each one's own
 _DIRECTIONS = 6.0  # each further direction of descriptors that drift varies less, by 1 / e over so many
@@ -31,6 +32,7 @@ class ObservationModel:
         descriptor: length of descriptors.
         descriptor_noise: typical length of the error of a unit descriptor.
         descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
+        change: share of landmarks that look different when the camera comes back after a minute.
         clutter: share of features that are points of the world, but never detected again.
         confusion: share of landmarks that look nearly like another one.
     """
@@ -42,6 +44,7 @@ class ObservationModel:
     descriptor: int
     descriptor_noise: float
     descriptor_drift: float
+    change: float
     clutter: float
     confusion: float
 
@@ -63,7 +66,8 @@ class Appearance:
         errors: a pool of errors of descriptors (E, D) float32, of which every feature gets one.
         common, spread: mean of all descriptors, and standard deviations of each one's own part (D,).
         waves: a pool of what descriptors change by with the direction of view (E, 3, D) float32; none without drift.
-        pace: how fast they do [rad/rad].
+        directions: along which the direction of view matters for each of the three, and how much (E, 3, 3) [rad/rad].
+        change: share of landmarks that look different when the camera comes back.
     """
 
     descriptors: NDArray[np.float32]
@@ -74,27 +78,46 @@ class Appearance:
     common: Array
     spread: Array
     waves: NDArray[np.float32]
-    pace: float
+    directions: Array
+    change: float
 
     @property
     def drifting(self) -> bool:
         """Whether descriptors change with the direction of view."""
         return len(self.waves) > 0
 
-    def describe(self, landmark: IdArray, views: Array | None, rng: np.random.Generator) -> NDArray[np.float32]:
+    def describe(
+        self, landmark: IdArray, views: Array | None, time: float, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
         """Descriptors (N, D) of landmarks, with noise, not of unit length.
 
         Args:
             landmark: which ones (N,).
             views: unit vectors (N, 3) to the camera in axes along, down and out of their surfaces; where they drift.
+            time: of the frame [s].
             rng: of the noise.
         """
-        clean = self.descriptors[landmark]
+        visit = self._visit(landmark, time) if self.change > 0 else None
+        like = landmark
+        if visit is not None:
+            changed = visit % 10_000 < 10_000 * (1 - np.sqrt(1 - self.change))  # at each of two visits
+            like = np.where(changed, visit // 10_000 % len(self.descriptors), landmark)
+        clean = self.descriptors[like]
         if views is not None:
-            phase = self.phase[landmark]
-            swing = np.sin(self.pace * views + phase[:, None] * (1.0, 2.0, 3.0)).astype(np.float32)
+            phase = self.phase[like]
+            seen = np.einsum("nij,nj->ni", self.directions[phase % _POOL], views)
+            swing = np.sin(seen + phase[:, None]).astype(np.float32)
             clean = unit(clean + np.einsum("ni,nid->nd", swing, self.waves[phase % _POOL]))
+        if visit is not None:
+            clean = clean + self.errors[visit % _POOL]
         return clean + self.errors[rng.integers(0, _POOL, len(landmark))]
+
+    def _visit(self, landmark: IdArray, time: float) -> IdArray:
+        """Numbers (N,) drawn anew for each landmark about once a minute, each at a time of its own."""
+        own = landmark.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        minute = (time / _VISIT + (own >> np.uint64(40)).astype(float) / 2**24).astype(np.uint64)
+        mixed = (own ^ (minute * np.uint64(0xC2B2AE3D27D4EB4F))) * np.uint64(0xFF51AFD7ED558CCD)
+        return (mixed >> np.uint64(20)).astype(np.int64)
 
     def of_nothing(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Descriptors (count, D) of features that are no landmarks."""
@@ -128,19 +151,20 @@ def appearance(world: World, model: ObservationModel, layout: int) -> Appearance
     laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
     errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
     response = np.exp(rng.normal(6.5, 1.0, count))
-    waves = np.zeros((0, 3, size))
+    waves, directions = np.zeros((0, 3, size)), np.zeros((0, 3, 3))
     if drifts:
+        directions = _pace(model.descriptor_drift) * rng.standard_normal((_POOL, 3, 3))
         waves = rng.standard_normal((_POOL, 3, size)) * (spread * np.sqrt(_DRIFTING * 2 / 3))
     looks = world.landmarks.looks
     return Appearance(
         descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
-        errors.astype(np.float32), common, spread, waves.astype(np.float32), _pace(model.descriptor_drift),
+        errors.astype(np.float32), common, spread, waves.astype(np.float32), directions, model.change,
     )  # fmt: skip
 
 
 def _pace(drift: float) -> float:
     """Pace of the waves [rad/rad] whose sum changes a descriptor by `drift` per radian, while that is little."""
-    return float(drift * np.sqrt(3 * (_COMMON**2 + 1) / _DRIFTING))
+    return float(drift * np.sqrt((_COMMON**2 + 1) / _DRIFTING))
 
 
 def unit(rows: Array) -> Array:

@@ -64,15 +64,18 @@ def _require_drive(file: Path, path: Trajectory) -> None:
     wrong |= np.linalg.det(R) < 0
     if wrong.any():
         raise SequenceError(f"{file}: the pose of row {int(np.argmax(wrong))} has no rotation")
-    if not _SHORTEST <= path.length <= _LONGEST:
+    down = path.poses[:, :3, 1].mean(axis=0)
+    if np.linalg.norm(down) < 0.5 or abs(path.poses[0, :3, 2] @ down) > 0.9 * np.linalg.norm(down):
+        raise SequenceError(f"{file}: no path of a vehicle: the camera's y axis must point downwards")
+    steps = np.diff(path.positions, axis=0)
+    long = np.linalg.norm(steps, axis=1)
+    length = float(np.linalg.norm((steps @ level(path).T)[:, :2], axis=1).sum())
+    if not _SHORTEST <= length <= _LONGEST:
         limits = f"{_SHORTEST:.0f} m to {_LONGEST / 1000:.0f} km"
-        raise SequenceError(f"{file}: a path of {path.length:.1f} m in {len(path)} poses; a drive needs {limits}")
-    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
-    if steps.max() > _LONGEST_STEP:
-        row = int(np.argmax(steps)) + 1
-        raise SequenceError(f"{file}: row {row} is {steps.max():.0f} m from the one before: no path of a vehicle")
-    if np.linalg.norm(path.poses[:, :3, 1].mean(axis=0)) < 0.5:
-        raise SequenceError(f"{file}: the camera's y axes point in all directions, downwards was expected")
+        raise SequenceError(f"{file}: a path of {length:.1f} m in {len(path)} poses; a drive needs {limits}")
+    if long.max() > _LONGEST_STEP:
+        row = int(np.argmax(long)) + 1
+        raise SequenceError(f"{file}: row {row} is {long.max():.0f} m from the one before: no path of a vehicle")
 
 
 def sampled(path: Trajectory, values: Mapping[str, Any]) -> Trajectory:

@@ -187,7 +187,8 @@ def _features(
     false = np.flatnonzero(ids == _FALSE)
     landmark = ids.copy()
     landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
-    descriptors = looks.describe(landmark, _views(world, frame, seen, source) if looks.drifting else None, rng)
+    views = _views(world, frame, seen, source) if looks.drifting else None
+    descriptors = looks.describe(landmark, views, float(world.stamps[frame]), rng)
     descriptors[false] = looks.of_nothing(len(false), rng)
     descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]

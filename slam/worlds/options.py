@@ -81,6 +81,7 @@ OBSERVATION = (
     Option("descriptor", 64, "length of descriptors", 4, 256),
     Option("descriptor_noise", 0.12, "typical length of the error of a unit descriptor", 0, 10),
     Option("descriptor_drift", 0.0, "change of a unit descriptor as the direction of view turns, per radian", 0, 10),
+    Option("change", 0.0, "share of landmarks that look different when the camera comes back after a minute", 0, 1),
     Option("clutter", 0.0, "share of features that are points of the world, but never detected again", 0, 0.9),
     Option("confusion", 0.1, "share of landmarks that look nearly like another one", 0, 1),
 )

@@ -18,6 +18,7 @@ from slam.worlds.raster import draw
 from slam.worlds.textures.ripmap import Ripmap
 from slam.worlds.world import World
 
+_PAINTED = 1500  # textures that are kept
 _EXPOSURES = 6  # pictures averaged where the shutter is open for a while
 
 
@@ -63,9 +64,11 @@ class Recorder:
         T = _between(self._world.T_world_left, frame, ahead)
         bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
         channels = 3 if self._model.colour else 1
+        rows = self._world.drawn_there(frame)
         samples = draw(
-            self._world.drawn_arrays, self._ripmap, bodies, T @ T_left_camera, lens.view, self._world.sky, channels
-        )
+            self._world.drawn_arrays.select(rows), lambda row: self._ripmap(int(rows[row])), bodies, T @ T_left_camera,
+            lens.view, self._world.sky, channels,
+        )  # fmt: skip
         return lens.expose(samples)
 
     @cached_property
@@ -80,14 +83,17 @@ class Recorder:
         return self._model.shading(self._world.rig.width, self._world.rig.height)
 
     def _ripmap(self, rectangle: int) -> Ripmap:
-        """The texture of a rectangle drawn, painted when first seen and kept with the world."""
+        """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""
         texture = self._world.drawn[rectangle].texture
         key = (texture, self._model.colour)
-        found: Ripmap | None = self._world.painted.get(key)
+        painted = self._world.painted
+        found: Ripmap | None = painted.pop(key, None)
         if found is None:
             picture = texture.paint(self._world.texels)
             found = Ripmap(picture if self._model.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-            self._world.painted[key] = found
+            if len(painted) >= _PAINTED:
+                del painted[next(iter(painted))]
+        painted[key] = found  # at the end: what has not been seen for the longest time comes first
         return found
 
 

@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from slam.data import BoolArray
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import RectangleArrays
 from slam.worlds.world import World
 
 _NEAR = 0.02
+_WIDER = 1.4  # lens distortion may widen the view by less than this factor
 
 
 class TruthImages(NamedTuple):
@@ -34,11 +36,23 @@ def truth_images(world: World, frame: int) -> TruthImages:
     rays = pixel_rays(camera)
     nearness = np.zeros((camera.height, camera.width))
     objects = np.zeros((camera.height, camera.width), np.int32)
-    for row in np.flatnonzero(((placed.origin - T[:3, 3]) * placed.normal).sum(axis=1) < -1e-9):
+    facing = ((placed.origin - T[:3, 3]) * placed.normal).sum(axis=1) < -1e-9
+    rows = np.flatnonzero(facing & _may_be_seen(placed, T, camera))
+    for row in rows[world.there(rows, frame)]:
         _cast(placed, int(row), T, camera, rays, nearness, objects)
     with np.errstate(divide="ignore"):
         depth = np.where(nearness > 0, 1 / nearness, 0.0)
     return TruthImages(depth.astype(np.float32), objects)
+
+
+def _may_be_seen(placed: RectangleArrays, T_world_camera: Array, camera: PinholeCamera) -> BoolArray:
+    """Rectangles whose surrounding sphere reaches into a pyramid somewhat wider than the view."""
+    middle = (placed.middle - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    x = _WIDER * max(camera.u0, camera.width - camera.u0) / camera.fu
+    y = _WIDER * max(camera.v0, camera.height - camera.v0) / camera.fv
+    walls = np.array([[1, 0, x], [-1, 0, x], [0, 1, y], [0, -1, y]])
+    walls /= np.linalg.norm(walls, axis=1, keepdims=True)  # inward normals
+    return np.asarray((middle @ walls.T > -placed.radius[:, None]).all(axis=1) & (middle[:, 2] > -placed.radius))
 
 
 def pixel_rays(camera: PinholeCamera) -> Array:

@@ -87,6 +87,16 @@ class World:
         """`drawn` as arrays."""
         return RectangleArrays.of(self.drawn)
 
+    def drawn_there(self, frame: int) -> IdArray:
+        """Indices in `drawn` of what is there in a frame."""
+        return self._drawn_source[1][self.there(self._drawn_source[0], frame)]
+
+    @cached_property
+    def _drawn_source(self) -> tuple[IdArray, IdArray]:
+        """The rectangle that each of `drawn` is a part of, and their indices."""
+        source = np.repeat(np.arange(len(self.rectangles)), [len(in_parts(r)) for r in self.rectangles])
+        return source, np.arange(len(source))
+
     @cached_property
     def occluders(self) -> RectangleArrays:
         """The rectangles that may hide others."""
@@ -100,7 +110,7 @@ class World:
         else:
             sight = self.reach[1] * _to_corner(self.rig)
             rows = self._landmark_places.within(self.T_world_left[frame, :3, 3], sight)
-        return rows if self.lasting is None else rows[self._there(self.landmarks.surface[rows], frame)]
+        return rows if self.lasting is None else rows[self.there(self.landmarks.surface[rows], frame)]
 
     def occluders_near(self, frame: int) -> RectangleArrays:
         """The rectangles that may hide landmarks within reach in a frame; in a small world all that may hide any."""
@@ -108,9 +118,9 @@ class World:
             return self.occluders
         sight = self.reach[1] * _to_corner(self.rig)
         rows = self._occluder_places.within(self.T_world_left[frame, :3, 3], sight)
-        return self.occluders.select(rows[self._there(self._occluding[rows], frame)])
+        return self.occluders.select(rows[self.there(self._occluding[rows], frame)])
 
-    def _there(self, rectangles: IdArray, frame: int) -> BoolArray:
+    def there(self, rectangles: IdArray, frame: int) -> BoolArray:
         """Which of these rectangles are there in a frame."""
         if self.lasting is None:
             return np.ones(len(rectangles), bool)

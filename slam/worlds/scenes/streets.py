@@ -15,7 +15,7 @@ from slam.geometry.se3 import Array, pose
 from slam.worlds.drives import SAME_ROAD, STEP, Road
 from slam.worlds.geometry import Rectangle, rectangle
 from slam.worlds.paths import yaw_pitch_roll
-from slam.worlds.scenes.roadside import cabinet, car, trunk
+from slam.worlds.scenes.roadside import cabinet, trunk
 from slam.worlds.textures.surfaces import Facade, Material
 
 EYE = 1.65  #: height of the camera above the ground [m]
@@ -24,11 +24,16 @@ STRETCH = 48.0  #: streets are built in stretches of this length [m], so that on
 
 _HOUSES = 4  # on each side of a stretch
 _NARROWEST = 3.0  # of a house front [m]
+_BENT = 0.5  # most that the road turns along one front [rad]
 _FOUNDATION = 0.3  # of house fronts below the lowest ground before them [m]
+_EVEN = 0.2  # a town with no greater differences in height is level [m]
 _TREES, _CARS, _CABINETS = 4, 5, 2  # on each side of a stretch
-_CAR_ASIDE, _TREE_ASIDE, _CABINET_ASIDE = 6.2, 7.6, 8.3  # from a road's middle [m]
+_CAR_ASIDE, _TREE_ASIDE, _CABINET_ASIDE = 6.2, 7.6, 8.2  # from a road's middle [m]
 _CLEAR = 2.6  # nothing stands so near to where the camera drives [m]
-_TILE = 16.0  # edges of the ground's parts [m]
+_AROUND = 16  # samples ahead and behind between which a road is straight where something stands at its side
+_TILE = 12.0  # edges of the ground's parts [m]
+_LAP = 0.3  # by which these overlap where the ground is not level [m]
+_SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
 
 
 @dataclass(frozen=True)
@@ -55,10 +60,11 @@ def _plan(layout: int, stretch: int, side: int) -> Plan:
     rng = np.random.default_rng([layout, 51, stretch, side + 1])
     cuts = (np.arange(1, _HOUSES) + rng.uniform(-0.2, 0.2, _HOUSES - 1)) * STRETCH / _HOUSES
     edges = np.concatenate([[0.0], np.round(cuts, 2), [STRETCH]])
-    even = (np.arange(_CARS) + rng.uniform(0.3, 0.7, _CARS)) * STRETCH / _CARS
+    cars, posts = ((np.arange(n) + rng.uniform(0.3, 0.7, n)) * STRETCH / n for n in (_CARS, _TREES + _CABINETS))
+    posts = rng.permutation(posts)
     return Plan(
-        np.diff(edges), np.round(rng.uniform(7, 12, _HOUSES), 2), rng.uniform(0, STRETCH, _TREES),
-        even[rng.random(_CARS) < 0.7], rng.uniform(0, STRETCH, _CABINETS), int(rng.integers(1 << 24)) * 100,
+        np.diff(edges), np.round(rng.uniform(7, 12, _HOUSES), 2), posts[:_TREES],
+        cars[rng.random(_CARS) < 0.7], posts[_TREES:], int(rng.integers(1 << 24)) * 100,
     )  # fmt: skip
 
 
@@ -80,6 +86,10 @@ class Streets:
         heights = road.drives[:, 2] - EYE
         self._low = np.array([heights[rows].min() for rows in near])
         self._high = np.array([heights[rows].max() for rows in near])
+        self._foundation = _FOUNDATION
+        if self._high.max() - self._low.min() < _EVEN:
+            self._low = self._high = np.full(len(near), np.median(heights))
+            self._foundation = 0.0
         self._stretch = np.floor((road.way - road.way[0]) / STRETCH).astype(int)
         self._source = _sources(int(self._stretch[-1]) + 1, alike, layout)
 
@@ -92,7 +102,7 @@ class Streets:
     def _runs(self, side: int) -> Iterator[IdArray]:
         """Successive samples of the road with a house front beside them: no road runs there."""
         edge = self._road.xy + side * ASIDE * self._road.left
-        free = self._tree.query(edge)[0] > ASIDE - 0.1
+        free = self._tree.query(edge)[0] > ASIDE - 0.02
         rows = np.flatnonzero(free)
         step = np.linalg.norm(np.diff(edge[rows], axis=0), axis=1)
         apart = (np.diff(self._road.way[rows]) > 1.5 * STEP) | (step > 4 * STEP)
@@ -102,7 +112,7 @@ class Streets:
         """The house fronts of one run, a house each."""
         way = self._road.way[run]
         edge = self._road.xy[run] + side * ASIDE * self._road.left[run]
-        for a, b in pairwise(self._edges(way[0], way[-1], side)):
+        for a, b, part in self._pieces(way[0], way[-1], side):
             ends = np.array([[np.interp(w, way, x) for x in edge.T] for w in (a, b)])
             before = run[(way >= a) & (way <= b)]
             if not len(before):
@@ -113,10 +123,18 @@ class Streets:
                 width = float(plan.widths[house])  # as it is wherever the same house stands
             spread = float((self._high - self._low)[before].max())
             height = float(plan.heights[house]) + (float(np.ceil(spread)) if spread > 0.5 else 0.0)
-            facade = Facade(round(width, 2), height, plan.seed + house)
+            facade = Facade(round(width, 2), height, plan.seed + house + 4 * part)
             start, end = ends if side > 0 else ends[::-1]
-            top = float(self._low[before].min()) - _FOUNDATION + height
+            top = float(self._low[before].min()) - self._foundation + height
             yield rectangle(facade, (*start, top), (*(end - start), 0), (0, 0, -1), occludes=True)
+
+    def _pieces(self, first: float, last: float, side: int) -> Iterator[tuple[float, float, int]]:
+        """From where to where each house front reaches [m along the path], and its number where a house is bent."""
+        for a, b in pairwise(self._edges(first, last, side).tolist()):
+            start, end = (self._road.left[np.abs(self._road.way - w).argmin()] for w in (a, b))
+            parts = int(np.ceil(np.arccos(np.clip(start @ end, -1, 1)) / _BENT + 1e-9))
+            cuts = np.linspace(a, b, parts + 1).tolist()
+            yield from ((c, d, part) for part, (c, d) in enumerate(pairwise(cuts)))
 
     def _edges(self, first: float, last: float, side: int) -> Array:
         """Where house fronts begin and end between two distances along the path (N,) [m]."""
@@ -150,7 +168,7 @@ class Streets:
             plan = self._plan(int(self._stretch[row]), 1)
             facade = Facade(2 * ASIDE, float(plan.heights[0]), plan.seed + 50 + row)
             start = middle - to_left * ASIDE * left
-            top = float(self._low[row]) - _FOUNDATION + facade.height
+            top = float(self._low[row]) - self._foundation + facade.height
             out.append(rectangle(facade, (*start, top), (*(to_left * left), 0), (0, 0, -1), occludes=True))
         return out
 
@@ -172,10 +190,6 @@ class Streets:
             if T is not None:
                 yield T, plan.seed + 30 + number
 
-    def parked_cars(self) -> list[Rectangle]:
-        """Parked cars, the same ones at all times."""
-        return [part for T, seed in self.parking() for part in car(T, seed)]
-
     def _places(self, what: str) -> Iterator[tuple[float, int, Plan, int]]:
         """Distance along the path, side, plan and number of everything of one kind."""
         for stretch in np.unique(self._stretch).tolist():
@@ -192,30 +206,42 @@ class Streets:
         left = self._road.left[row]
         along = np.array([left[1], -left[0]])
         xy = self._road.xy[row] + (way - self._road.way[row]) * along + side * aside * left
-        if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR:
+        if self._tree.query(xy)[0] < aside - 0.3 or self._drives.query(xy)[0] < _CLEAR or self._bends(row):
             return None
         heading = float(np.arctan2(-along[0], along[1])) + (np.pi if side > 0 else 0.0)
         return pose(yaw_pitch_roll(heading, 0, 0), np.array([*xy, self._low[row]]))
 
+    def _bends(self, row: int) -> bool:
+        """Whether a road turns by more than 15° around a sample."""
+        ahead, behind = min(row + _AROUND, len(self._road.left) - 1), max(row - _AROUND, 0)
+        return float(self._road.left[ahead] @ self._road.left[behind]) < 0.97
+
     def ground(self) -> list[Rectangle]:
-        """Square parts of the ground under all roads, as steep as the roads there."""
+        """Square parts of the ground under all roads, as high and as steep as the roads there."""
         around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)]) * ASIDE
         cells = np.unique(np.floor((self._road.xy[:, None] + around) / _TILE).reshape(-1, 2).astype(int), axis=0)
-        return [self._tile(cell, number) for number, cell in enumerate(cells)]
+        corners = cells[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+        used, which = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+        heights = np.array([self._height(xy) for xy in used * _TILE])[which].reshape(-1, 4)
+        return [self._tile(cell, height, number) for number, (cell, height) in enumerate(zip(cells, heights))]
 
-    def _tile(self, cell: IdArray, number: int) -> Rectangle:
-        """One part of the ground: the plane that fits the roads around it best."""
-        middle = (cell + 0.5) * _TILE
-        rows = np.array(self._tree.query_ball_point(middle, 1.5 * _TILE))
-        x, y = (self._road.xy[rows] - middle).T
-        slope_x, slope_y, height = np.linalg.lstsq(
-            np.column_stack([x, y, np.ones(len(rows))]), self._low[rows], rcond=1e-3
-        )[0]
-        corner = np.array([-_TILE / 2, _TILE / 2])
-        origin = (*(middle + corner), height + corner @ (slope_x, slope_y))
-        texture = Material(_TILE, _TILE, "road", 100 * self._layout + number, 0.3, (0.05, 0.3))
-        along, down = np.array([_TILE, 0, _TILE * slope_x]), np.array([0, -_TILE, -_TILE * slope_y])
-        return Rectangle(np.array(origin), along, down, texture)
+    def _height(self, xy: Array) -> float:
+        """Height of the ground at a place (2,) [m]: the mean of the roads around it, near ones count most."""
+        rows = np.array(self._tree.query_ball_point(xy, 3 * _TILE))
+        distance = np.linalg.norm(self._road.xy[rows] - xy, axis=1)
+        weight = np.exp(-((distance / _SMOOTHED) ** 2) / 2) + 1e-9
+        return float(weight @ self._low[rows] / weight.sum())
+
+    def _tile(self, cell: IdArray, heights: Array, number: int) -> Rectangle:
+        """One part of the ground, from the heights (4,) of its corners; it overlaps its neighbours a little."""
+        slope_x = (heights[1] + heights[3] - heights[0] - heights[2]) / (2 * _TILE)
+        slope_y = (heights[2] + heights[3] - heights[0] - heights[1]) / (2 * _TILE)
+        edge = _TILE + 2 * _LAP * bool(np.ptp(heights) > 0)
+        xy = (cell + 0.5) * _TILE + np.array([-edge, edge]) / 2
+        height = heights.mean() + (slope_y - slope_x) * edge / 2
+        texture = Material(edge, edge, "asphalt", 100 * self._layout + number, 0.3, (0.05, 0.3))
+        along, down = np.array([1, 0, slope_x]) * edge, np.array([0, -1, -slope_y]) * edge
+        return Rectangle(np.array([*xy, height]), along, down, texture)
 
 
 def _sources(count: int, alike: float, layout: int) -> IdArray:

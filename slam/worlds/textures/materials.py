@@ -160,6 +160,7 @@ RECIPES = {
     "keyboard": Recipe(things.keyboard),
     "paper": Recipe(things.paper),
     "poster": Recipe(things.poster, _print),
+    "asphalt": Recipe(outdoors.asphalt, _fleck, 0.5),
     "road": Recipe(outdoors.road, _fleck),
     "road_across": Recipe(outdoors.road_across, _fleck),
     "car_side": Recipe(outdoors.car_side),

@@ -114,6 +114,12 @@ def road(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     return canvas
 
 
+def asphalt(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
+    """Asphalt with nothing on it."""
+    light = 1 + 0.05 * paint.clouds(size, rng, 2.0 * density, 4) + 0.06 * paint.clouds(size, rng, 2.0, 1)
+    return paint.tinted(light, (88.0, 86.0, 85.0))
+
+
 def road_across(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     """The same, running across the picture."""
     return np.ascontiguousarray(np.rot90(road((size[1], size[0]), rng, density)))

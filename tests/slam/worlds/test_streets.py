@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from slam.geometry.se3 import Array, inverse
+from slam.geometry.trajectory import Trajectory
+from slam.worlds import WorldSequence, open_world
+from slam.worlds.paths import camera_poses
+from slam.worlds.scenes import drive, town
+from slam.worlds.scenes.streets import ASIDE, STRETCH
+
+LAP = 450  # frames of a round in `loop`
+SMALL = "width=310&height=94"
+
+
+@pytest.fixture(scope="session")
+def loop(tmp_path_factory) -> Path:
+    """A file with two rounds of a circle of 450 m in KITTI's axes, on a slope; the second one repeats the first."""
+    angle = 2 * np.pi * np.arange(2 * LAP) / LAP
+    radius = LAP / (2 * np.pi)
+    positions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 2 * np.sin(angle)])
+    zero = np.zeros(2 * LAP)
+    poses = camera_poses(positions, angle, zero, zero)
+    file = tmp_path_factory.mktemp("paths") / "loop.txt"
+    Trajectory(np.arange(2.0 * LAP), inverse(poses[0]) @ poses).write_kitti(file)
+    return file
+
+
+def opened(loop: Path, query: str = "") -> WorldSequence:
+    return open_world(f"drive?path={loop}&{query}")
+
+
+def test_the_path_is_the_truth(loop):
+    sequence = opened(loop)
+    assert sequence.kind == "driving"
+    assert np.array_equal(sequence.ground_truth.poses, Trajectory.read_kitti(loop).poses)
+    assert len(opened(loop, "frames=7")) == 7
+
+
+def test_a_round_later_the_same_landmarks_are_seen(loop):
+    sequence = opened(loop, "change=0&outliers=0&clutter=0&detect=1&sigma=0&descriptor_noise=0")
+    for k in (0, 100):
+        first, later = (sequence.simulate(n) for n in (k, k + LAP))
+        assert len(first.ids) > 80
+        a, b = np.argsort(first.ids), np.argsort(later.ids)
+        assert np.array_equal(first.ids[a], later.ids[b])
+        assert np.allclose(first.features.uv_left[a], later.features.uv_left[b], atol=1e-4)
+        assert np.allclose(first.features.descriptors[a], later.features.descriptors[b], atol=1e-4)
+
+
+def test_features_lie_where_the_rays_say_and_corners_hide_what_is_behind_them(loop):
+    sequence = opened(loop, "sigma=0&outliers=0&clutter=0")
+    seen = sequence.simulate(30)
+    uv = np.rint(seen.features.uv_left).astype(int)
+    depth = sequence.depth(30)[uv[:, 1], uv[:, 0]]
+    T = inverse(sequence.ground_truth.poses[30])
+    true = sequence.landmarks.positions[seen.ids] @ T[2, :3] + T[2, 3]
+    assert np.mean(np.abs(depth - true) < 0.05 * true) > 0.9, "the others lie beside an edge"
+    everywhere = cKDTree(sequence.landmarks.positions).query_ball_point(sequence.ground_truth.positions[30], 60.0)
+    assert len(seen.ids) < 0.3 * len(everywhere)
+
+
+def test_no_house_stands_on_a_road_and_every_house_faces_it():
+    for query in ("town", "town?layout=3"):
+        sequence = open_world(query)
+        path = cKDTree(sequence.ground_truth.positions[:, :2])
+        houses = [r for r in sequence.world.rectangles if hasattr(r.texture, "windows")]
+        assert len(houses) > 60
+        for house in houses:
+            along = np.linspace(0, 1, 20)[:, None] * house.along
+            assert path.query((house.origin + along)[:, :2])[0].min() > 3.0, "a car is half as wide as 2 m"
+            middle = house.origin + house.along / 2
+            nearest = sequence.ground_truth.positions[path.query(middle[:2])[1]]
+            if np.linalg.norm(nearest - middle) < ASIDE + 1:
+                assert (nearest - middle) @ house.normal > 0
+
+
+def test_from_the_opposite_direction_descriptors_do_not_match():
+    sequence = open_world("town?change=0&confusion=0&descriptor_noise=0")
+    looks, rng = sequence._looks, np.random.default_rng(0)
+    some = np.arange(0, len(sequence.landmarks), 50)
+    views = np.array([[0.8, 0, 0.6], [0.75, 0, 0.66], [-0.8, 0, 0.6]])
+    seen = [_unit(looks.describe(some, np.tile(v, (len(some), 1)), 0.0, rng)) for v in views]
+    assert np.median(np.linalg.norm(seen[1] - seen[0], axis=1)) < 0.25
+    assert np.median(np.linalg.norm(seen[2] - seen[0], axis=1)) > 0.55
+
+
+def _unit(rows: Array) -> Array:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def test_as_many_landmarks_change_between_visits_as_asked_for():
+    sequence = open_world("town?change=0.3&descriptor_noise=0")
+    looks, rng = sequence._looks, np.random.default_rng(0)
+    every = np.arange(len(sequence.landmarks))
+    view = np.tile([0.0, 0, 1], (len(every), 1))
+    first, soon, later = (looks.describe(every, view, t, rng) for t in (10.0, 13.0, 100.0))
+    assert np.mean(np.any(first != soon, axis=1)) < 0.05
+    assert np.mean(np.any(first != later, axis=1)) == pytest.approx(0.3, abs=0.02)
+
+
+def test_streets_that_are_alike_show_the_same_landmarks_in_the_same_places():
+    sequence = open_world("town?alike=0.5&change=0&confusion=0")
+    looks = sequence.landmarks.looks
+    copies = np.flatnonzero(looks != np.arange(len(looks)))
+    share = len(copies) / len(looks)
+    assert 0.1 < share < 0.6
+    assert len(_copied_houses(open_world("town"))) == 0
+    assert len(_copied_houses(sequence)) > 20
+    descriptors = sequence._looks.descriptors
+    assert np.array_equal(descriptors[copies], descriptors[looks[copies]])
+    surface = sequence.landmarks.surface
+    of_copy = np.unique(surface[copies])[5]
+    rows = np.flatnonzero(surface == of_copy)
+    shape, like = (sequence.landmarks.positions[i] for i in (rows, looks[rows]))
+    assert np.allclose(np.linalg.norm(shape - shape[0], axis=1), np.linalg.norm(like - like[0], axis=1), atol=1e-9)
+    assert np.linalg.norm(shape[0] - like[0]) > STRETCH / 2
+
+
+def _copied_houses(sequence: WorldSequence) -> Array:
+    """House fronts that look like others."""
+    looks, surface = sequence.landmarks.looks, sequence.landmarks.surface
+    copies = np.unique(surface[looks != np.arange(len(looks))])
+    return np.array([r for r in copies if hasattr(sequence.world.rectangles[r].texture, "windows")])
+
+
+@pytest.mark.parametrize(("cars", "same"), [("same", True), ("other", False), ("none", True)])
+def test_a_round_later_images_are_the_same_but_for_other_cars(loop, cars, same):
+    sequence = opened(loop, f"{SMALL}&noise=0&supersample=1&cars={cars}")
+    first, later = sequence.frame(20).left.astype(int), sequence.frame(20 + LAP).left.astype(int)
+    differ = np.mean(np.abs(first - later) > 20)
+    assert differ < 1e-3 if same else 0.005 < differ < 0.3
+
+
+def test_other_cars_come_between_passes_and_not_while_they_are_seen():
+    passes = drive._passes(np.column_stack([np.r_[0:500, 500:0:-1], np.zeros(1000), np.zeros(1000)]), np.zeros(3))
+    assert passes == [(0, pytest.approx(500, abs=1)), (pytest.approx(500, abs=1), 1000)]
+
+
+def test_the_town_is_driven_again_in_both_directions():
+    sequence = open_world("town")
+    truth = sequence.ground_truth
+    assert len(sequence) >= 1000
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
+    rows, again = cKDTree(truth.positions).query_pairs(5.0, output_type="ndarray").T
+    far = way[again] - way[rows] > 400
+    cosine = (truth.poses[rows[far], :3, 2] * truth.poses[again[far], :3, 2]).sum(axis=1)
+    assert len(np.unique(again[far][cosine > 0.95])) > 150
+    assert len(np.unique(again[far][cosine < -0.95])) > 100
+    assert np.ptp(truth.positions[:, 2]) < 0.2
+    assert len(town.CORNERS) == 11
+
+
+def test_a_wrong_calibration_is_told_and_the_true_one_records():
+    right, wrong = open_world("town?sigma=0"), open_world("town?sigma=0&focal_error=0.005&turn_error=1")
+    assert wrong.rig is right.rig
+    assert wrong.world.rig.left.fu == pytest.approx(right.rig.left.fu / 1.005)
+    turned = wrong.world.rig.R @ right.rig.R.T
+    assert np.allclose([turned[2, 1], turned[0, 2], turned[1, 0]], 1e-3, atol=2e-6)
+    a, b = right.simulate(40), wrong.simulate(40)
+    ids, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+    still = ids >= 0
+    centre = right.rig.left.u0, right.rig.left.v0
+    ratio = (a.features.uv_left[i[still]] - centre) / (b.features.uv_left[j[still]] - centre)
+    assert np.allclose(np.median(ratio, axis=0), 1.005, atol=1e-4)
+
+
+def test_a_real_path_shows_as_many_features_as_a_real_drive(slam_data):
+    sequence = open_world(f"drive?path={slam_data / 'kitti_paths' / '07.txt'}")
+    assert len(sequence) == 1101
+    stereo = [int(sequence.observations(k).has_stereo.sum()) for k in range(0, 1101, 40)]
+    assert 250 < np.median(stereo) < 600
+    assert min(stereo) > 80
