@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, transform
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class LandmarkRows:
         feature_rows: NDArray[np.intp],
         camera: Array | None = None,
     ) -> LandmarkRows:
-        """The rows with new landmarks appended, seen from `camera` (3,); their ids must be larger than all others."""
+        """The rows with new landmarks, seen from `camera` (3,)."""
         once = np.ones(len(ids), np.int64)
         new = LandmarkRows(
             ids,
@@ -129,9 +129,17 @@ class LandmarkRows:
             once * frame,
             None if camera is None else np.tile(camera, (len(ids), 1)),  # type: ignore[arg-type]
         )
-        return LandmarkRows(
-            *(np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(LandmarkRows))
-        )
+        return self.joined(new)
+
+    def joined(self, other: LandmarkRows) -> LandmarkRows:
+        """These and others, ids ascending; none may be in both."""
+        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(LandmarkRows))
+        whole = LandmarkRows(*both)
+        return whole.select(np.argsort(whole.ids, kind="stable"))
+
+    def moved(self, T: Array) -> LandmarkRows:
+        """The same in another world; `T` (4, 4) takes coordinates there."""
+        return replace(self, seen_from=transform(T, self.seen_from))
 
     def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkRows:
         """Some of the rows, in order."""

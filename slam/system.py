@@ -19,7 +19,7 @@ from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
-from slam.mapping.mapper import MapChange, Mapper, Returned, Step
+from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
@@ -124,6 +124,7 @@ class StereoSlam:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
             self.landmarks = known_map.rows
+            self.atlas = Atlas.of_earlier_run(known_map.keyframes)
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
     def process(self, frame: StereoFrame) -> FrameResult:
@@ -180,7 +181,7 @@ class StereoSlam:
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
-            prediction, matches, seen_again = self._localize(prediction, landmarks, features, index)
+            landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
@@ -202,7 +203,7 @@ class StereoSlam:
         with stages.stage("atlas"):  # a place seen again corrects the path since
             step = replace(step, estimate=self._considered(estimate))
             atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path)
-            change = self._mapper.give_back(self.backend, change, step, returned or seen_again)
+            change = self._mapper.give_back(self.backend, change, step, returned)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
@@ -254,7 +255,9 @@ class StereoSlam:
             raise SlamError("there is no map yet: no frame was processed")
         from slam import __version__
 
-        return SavedMap.of(self.landmarks, estimate, self.frontend_name, self.world_frame, __version__)
+        rows = self.landmarks.moved(self.atlas.T_map_odom)
+        keyframes = self.atlas.in_map_as_keyframes()
+        return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, keyframes)
 
     @property
     def restarted(self) -> list[int]:
@@ -291,37 +294,43 @@ class StereoSlam:
         """Look for the camera in the map that the system was started with; where it is found, the back end starts."""
         search = self._relocalizer.search
         assert search is not None
-        T = search.locate(features, index)
+        T, found = search.locate(features, index), None
         if T is None:
-            return False
+            found = self._loop_closer.find(self.atlas, features, index)
+            if found is None:
+                return False
+            T = found.T_odom_left
         new = self._relocalizer.start(T)
         search.fill(new)
-        self._mapper.next_id = int(search.known.ids.max(initial=-1)) + 1
+        self._mapper.next_id = search.known.next_id
+        if found is not None:
+            self.landmarks = self._mapper.insert(new, search.known.rows, found.place)
         self.backend, self._given, self._relocalizer.search = new, self.calibration.applied, None
         return True
 
     def _localize(
         self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures, index: int
-    ) -> tuple[Prediction, LandmarkMatches, Returned | None]:
+    ) -> tuple[LandmarkRows, Prediction, LandmarkMatches]:
         """Landmarks in this frame; where the camera was kidnapped, a new back end's prediction with them.
 
-        Where it is in a place of the atlas that the back end's landmarks do not show, what it sees of that comes third.
+        Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
         positions, state = self.backend.positions(landmarks.ids), self._last.state
         found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
         elsewhere = None if found is None else found.T_odom_left
         matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)
         if not matches.kidnapped:
-            return prediction, matches, None
+            return landmarks, prediction, matches
         assert matches.T_world_left is not None
         if not self._relocalizer.can_restart(self.backend):
-            return prediction, LandmarkMatches.nothing(), None
+            return landmarks, prediction, LandmarkMatches.nothing()
         new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
+        if found is not None and matches.T_world_left is elsewhere:
+            landmarks = self._mapper.insert(new, landmarks, found.place)
+            positions = new.positions(landmarks.ids)
         prediction, r = new.predict(features.stamp), self._relocalizer
         self.backend, self._given, r.past, r.restarted = (
             new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
         self.objects.restart()
-        if found is not None and matches.T_world_left is elsewhere:
-            return prediction, LandmarkMatches.nothing(), found.returned
-        return prediction, self._localizer.match(prediction, landmarks, positions, features, index), None
+        return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)

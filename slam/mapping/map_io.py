@@ -23,6 +23,8 @@ from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
+from slam.mapping.atlas.keyframes import Keyframe
+from slam.mapping.atlas.saved import KEYFRAME_TYPES, from_arrays, to_arrays
 from slam.mapping.known_landmarks import require_known
 
 
@@ -35,7 +37,7 @@ class HasMap(Protocol):
 
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 2  # of the file's form
+_VERSION = 3  # of the file's form; version 2 has no keyframes
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.
@@ -69,6 +71,7 @@ class SavedMap:
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
+        keyframes: places that the camera has been to, with their poses in the map's world frame.
 
     Raises:
         SlamError: arrays that do not fit together, or landmarks that no back end would take.
@@ -86,6 +89,7 @@ class SavedMap:
     written_by: str = ""
     source: str = "the map"
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
+    keyframes: tuple[Keyframe, ...] = ()
 
     def __post_init__(self) -> None:
         if any(np.ndim(getattr(self, name)) == 0 for name in _TYPES if name != "seen_from"):
@@ -125,6 +129,11 @@ class SavedMap:
         return self.descriptors.shape[1]
 
     @property
+    def next_id(self) -> int:
+        """The least id that no landmark has had, neither of the map nor of its keyframes."""
+        return 1 + max([int(ids.max(initial=-1)) for ids in (self.ids, *(k.landmarks for k in self.keyframes))])
+
+    @property
     def rows(self) -> LandmarkRows:
         """The map's bookkeeping at the start of a run, in which nothing has been seen yet."""
         none = np.zeros(len(self), np.int64)
@@ -133,13 +142,21 @@ class SavedMap:
         )  # fmt: skip
 
     @classmethod
-    def of(cls, landmarks: LandmarkRows, estimate: Estimate, frontend: str, world_frame: str, version: str) -> SavedMap:
-        """The map of a running system: its rows, its back end's estimate, and what they belong to."""
+    def of(
+        cls,
+        landmarks: LandmarkRows,
+        estimate: Estimate,
+        frontend: str,
+        world_frame: str,
+        version: str,
+        keyframes: tuple[Keyframe, ...] = (),
+    ) -> SavedMap:
+        """The map of a running system: its rows, its back end's estimate, what they belong to, and its keyframes."""
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
-            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from,
+            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from, keyframes=keyframes,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
@@ -185,9 +202,10 @@ def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
     header = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
-    for name in _TYPES:
+    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(saved.keyframes)
+    for name, values in arrays.items():
         buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, np.ascontiguousarray(getattr(saved, name)), (1, 0), allow_pickle=False)
+        np.lib.format.write_array(buffer, np.ascontiguousarray(values), (1, 0), allow_pickle=False)
         members[f"{name}.npy"] = buffer.getvalue()
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as file:
@@ -204,17 +222,18 @@ def decode(data: bytes, source: str) -> SavedMap:
     if not first.startswith(_MAGIC.encode()):
         raise SlamError(f"{source}: not a saved map")
     version = first[len(_MAGIC) :].decode("ascii", "replace")
-    if version != str(_VERSION):
-        raise SlamError(f"{source}: a map of version {version!r}; this program reads version {_VERSION}")
+    if version not in ("2", str(_VERSION)):
+        raise SlamError(f"{source}: a map of version {version!r}; this program reads versions 2 and {_VERSION}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    return SavedMap(**_members(body, source), source=source)
+    return SavedMap(**_members(body, source, version != "2"), source=source)
 
 
-def _members(body: bytes, source: str) -> dict[str, Any]:
+def _members(body: bytes, source: str, with_keyframes: bool) -> dict[str, Any]:
     """The attributes of `SavedMap` in an archive."""
     members = unpack(body, source)
-    missing = {"header.json", *(f"{name}.npy" for name in _TYPES)} - set(members)
+    kinds = _TYPES | (KEYFRAME_TYPES if with_keyframes else {})
+    missing = {"header.json", *(f"{name}.npy" for name in kinds)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
     header = json_text(members["header.json"], f"{source}: header.json")
@@ -222,8 +241,11 @@ def _members(body: bytes, source: str) -> dict[str, Any]:
     if not isinstance(header, dict) or any(not isinstance(header.get(name), str) for name in texts):
         raise SlamError(f"{source}: header.json must give {', '.join(texts)}")
     content: dict[str, Any] = {name: header[name] for name in texts}
-    for name, kind in _TYPES.items():
+    for name, kind in kinds.items():
         content[name] = found = array(members[f"{name}.npy"], name, source)
         if found.dtype != kind:  # of the other byte order, or of another kind
             raise SlamError(f"{source}: {name} must be of {np.dtype(kind)}")
+    if with_keyframes:
+        arrays = {name: content.pop(name) for name in KEYFRAME_TYPES}
+        content["keyframes"] = from_arrays(arrays, content["descriptors"].shape[1:], source)
     return content

@@ -86,6 +86,27 @@ class Returned:
     covariances: Array
 
 
+@dataclass(frozen=True)
+class KnownPlace:
+    """Landmarks of a place whose pose is known.
+
+    Attributes:
+        ids: that they had (M,), −1 for none.
+        positions: (M, 3) [m] in the back end's world.
+        covariances: theirs (M, 3, 3) [m²].
+        descriptors: theirs (M, D).
+        laplacian: signs of their Laplacians (M,).
+        seen_from: where the camera was when it saw them (3,) [m].
+    """
+
+    ids: IdArray
+    positions: Array
+    covariances: Array
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+    seen_from: Array
+
+
 class Mapper:
     """Keeps the map of a system; nothing else adds landmarks to a back end or removes them.
 
@@ -141,9 +162,21 @@ class Mapper:
         backend.place(ids, returned.local[free], returned.covariances[free])
         rows = returned.rows[free]
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, self._camera(backend))
-        order = np.argsort(landmarks.ids, kind="stable")
-        back = LandmarkMatches(ids, rows)
-        return replace(change, landmarks=landmarks.select(order), returned=back)
+        return replace(change, landmarks=landmarks, returned=LandmarkMatches(ids, rows))
+
+    def insert(self, backend: Backend, landmarks: LandmarkRows, place: KnownPlace) -> LandmarkRows:
+        """Let landmarks of a known place join the map, as those of a saved map; those that it has stay as they are."""
+        assert isinstance(backend, MapBackend)  # as those are that start in a map
+        new = np.flatnonzero(~np.isin(place.ids, landmarks.ids) | (place.ids < 0))
+        ids = place.ids[new]
+        ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
+        backend.insert(ids, place.positions[new], place.covariances[new])
+        once = np.ones(len(ids), np.int64)
+        seen_from = np.tile(place.seen_from, (len(ids), 1))
+        rows = LandmarkRows(
+            ids, place.descriptors[new], place.laplacian[new], once, once, 0 * once, 0 * once - 1, seen_from
+        )
+        return landmarks.joined(rows)
 
     def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
         """Let rows and back end agree after a step that was interrupted; what only one of both has leaves it.

@@ -7,6 +7,7 @@ the system reports are in the map.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ class Atlas:
         T_map_odom: pose (4, 4) of the back end's frame in the map.
         pending: the last loop that was seen, whether the pose graph holds it or not.
         confirmed: whether a keyframe just before it had seen the same return.
+        known: number of keyframes that are from an earlier run: the first ones, in the map that this run started in.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
@@ -45,9 +47,23 @@ class Atlas:
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     pending: Loop | None = None
     confirmed: bool = False
+    known: int = 0
 
     def __len__(self) -> int:
         return len(self.keyframes)
+
+    @classmethod
+    def of_earlier_run(cls, keyframes: Sequence[Keyframe]) -> Atlas:
+        """The places of a saved map; poses of its keyframes are in the map."""
+        index = PlaceIndex()
+        for keyframe in keyframes:
+            index = index.with_new(keyframe.descriptors.astype(np.float32))
+        poses = np.array([k.T_odom_left for k in keyframes]).reshape(-1, 4, 4)
+        return cls(tuple(replace(k, frame=-1) for k in keyframes), index, corrected=poses, known=len(keyframes))
+
+    def in_map_as_keyframes(self) -> tuple[Keyframe, ...]:
+        """The keyframes for a saved map, their poses in the map."""
+        return tuple(replace(k, T_odom_left=self.pose_in_map(i)) for i, k in enumerate(self.keyframes))
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops in the pose graph, and of sightings that contradicted the path."""
@@ -61,10 +77,10 @@ class Atlas:
 
     def chain(self, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now."""
-        poses = np.array([k.T_odom_left for k in self.keyframes])
+        poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
         if path is not None:
-            rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes])
-            poses = path.poses[rows]
+            rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
+            poses[self.known :] = path.poses[rows]
         return Chain(poses, np.array([k.step_covariance for k in self.keyframes]))
 
     def in_map(self, chain: Chain) -> Array:
@@ -107,7 +123,8 @@ class Atlas:
 
         chain = self.chain(path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
-        return Trajectory(path.stamps, _between_keyframes(path, np.array([k.stamp for k in self.keyframes]), moved))
+        stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
+        return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))
 
 
 def _between_keyframes(path: Trajectory, stamps: Array, moved: Array) -> Array:

@@ -18,7 +18,8 @@ from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed
 from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
 from slam.mapping.atlas.places import Vectors
-from slam.mapping.mapper import Returned, Step
+from slam.mapping.mapper import KnownPlace, Returned, Step
+from slam.mapping.relocalizer import POSITION_SIGMA, ROTATION_SIGMA
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
@@ -27,6 +28,7 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 _VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared in detail
 _PATIENCE = 3  # keyframes within which another one must see the same return
 _MINIMAL = 6  # features that give a pose with a covariance
+_UNKNOWN_WAY = 1000.0  # [m] between the end of an earlier run and the beginning of this one
 _HYPOTHESES = 300  # poses tried: one in a hundred places is missed where a quarter of its matches are right
 
 
@@ -36,11 +38,11 @@ class Found:
 
     Attributes:
         T_odom_left: its pose (4, 4) in the back end's frame.
-        returned: what it sees of the place.
+        place: landmarks of the place.
     """
 
     T_odom_left: Array
-    returned: Returned
+    place: KnownPlace
 
 
 class LoopCloser:
@@ -106,9 +108,23 @@ class LoopCloser:
         best = self._best_sighting(atlas, self._ranked(atlas, likely, features), features, seed)
         if best is None:
             return None
-        loop, seen = best
-        T = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first) @ loop.T_first_second
-        return Found(T, self._returned(atlas.keyframes[loop.first], seen))
+        loop, _ = best
+        T_odom_keyframe = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
+        return Found(T_odom_keyframe @ loop.T_first_second, self._place(atlas.keyframes[loop.first], T_odom_keyframe))
+
+    def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
+        """A keyframe's features as landmarks, where its pose is (4, 4)."""
+        points, T = keyframe.points.astype(float), T_odom_left @ self._rectified.T_left_rectified
+        P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
+        descriptors = keyframe.descriptors.astype(np.float32)
+        return KnownPlace(
+            keyframe.landmarks,
+            transform(T, points),
+            0.5 * (P + np.swapaxes(P, 1, 2)),
+            descriptors,
+            keyframe.laplacian,
+            T[:3, 3],
+        )
 
     def _rectify(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified rig."""
@@ -139,8 +155,11 @@ class LoopCloser:
             return None
         T, P = step.estimate.T_world_left, step.estimate.covariance
         travelled = 0.0
-        added: Array = np.zeros((6, 6))
+        added: Array = np.diag(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3) ** 2)
         if len(atlas):
+            last = atlas.keyframes[-1]
+            travelled = last.travelled + _UNKNOWN_WAY
+        if len(atlas) > atlas.known:
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
             z, _ = self._rig.project_stereo(points, jacobian=False)
