@@ -92,6 +92,7 @@ EXPERIMENTS = (
     ),
     Experiment("faults", "Blackout, dropped frames, a camera that is carried off"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
+    Experiment("loops", "Long drives that come back: loops closed"),
     Experiment(
         "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
         arguments=("--wrong", "0", "0.05", "0.1", "0.2"),

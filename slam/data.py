@@ -270,6 +270,7 @@ class FrameResult:
             before the first loop.
         loop: index of the frame whose place this one shows again, where that closed a loop; else None.
         keyframe: whether the frame has become a keyframe.
+        returned: ids of landmarks of that place that came back into the map.
     """
 
     index: int
@@ -293,3 +294,4 @@ class FrameResult:
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     loop: int | None = None
     keyframe: bool = False
+    returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))

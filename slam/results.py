@@ -56,6 +56,7 @@ def frame_result(
         T_map_odom=atlas.T_map_odom,
         loop=atlas.closed_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
+        returned=change.returned.ids,
     )
 
 

@@ -35,6 +35,9 @@ COMPLETED = "completed"
 #: Settings under which a front end has one thread; what it finds does not depend on it.
 _ONE_THREAD = {"surf": ["frontend.threads=1"]}
 
+#: Settings without which a run could not be recorded: landmarks that return are no observations.
+_RECORDED = ["atlas.give_back=false"]
+
 
 def run_trial(trial: Trial, recording: bytes | None = None) -> Files:
     """Run a trial on one thread; its files come back, `RESULT` among them.
@@ -82,7 +85,8 @@ def config_of(trial: Trial, sequence: Sequence) -> SystemConfig:
     first = _ONE_THREAD.get(name, [])
     if name == SIMULATED and isinstance(sequence, WorldSequence):  # the noise of these features is known
         first = [f"models.pixel_sigma={sequence.values['sigma']}"] if sequence.values["sigma"] else []
-    return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings([*first, *trial.variant.settings])
+    settings = [*_RECORDED, *first, *trial.variant.settings]
+    return SystemConfig.for_kind(sequence.kind, name, trial.backend).with_settings(settings)
 
 
 def frontend_of(trial: Trial, sequence: Sequence) -> Frontend | None:

@@ -24,7 +24,6 @@ from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.landmarks import LandmarkRows
-from slam.mapping.map_io import SavedMap
 from slam.tracking.association import match_everywhere, pairs_in_boxes
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.visibility import MapView
@@ -299,9 +298,17 @@ class MonocularDepth:
 
 
 def find_pose(
-    rig: StereoRig, known: SavedMap, features: StereoFeatures, localizer: Localizer, seed: int
+    rig: StereoRig, landmarks: LandmarkRows, positions: Array, features: StereoFeatures, localizer: Localizer, seed: int
 ) -> Array | None:
     """The camera's pose (4, 4) in a map from left pixels alone: three points at a time, the pose most agree with.
+
+    Args:
+        rig: the cameras.
+        landmarks: the map (N rows).
+        positions: theirs (N, 3) [m].
+        features: of the frame.
+        localizer: its settings are used.
+        seed: of the random choice of points.
 
     Returns:
         the pose, or None where too few landmarks agree on one.
@@ -309,10 +316,10 @@ def find_pose(
     import cv2
 
     config = localizer.config
-    matches = match_everywhere(known.descriptors, known.laplacian, features, config)
+    matches = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, config)
     if len(matches) < config.minimum_consistent:
         return None
-    points, uv = known.positions[matches.landmarks], features.uv_left[matches.features]
+    points, uv = positions[matches.landmarks], features.uv_left[matches.features]
     bearings = rig.left.normalise(uv)
     rng = np.random.default_rng(seed)
     poses = []

@@ -138,7 +138,7 @@ class MapSearch:
         if not features.has_stereo.any():
             from slam.mapping.monocular import find_pose
 
-            found = find_pose(self._rig, self.known, features, self._localizer, seed)
+            found = find_pose(self._rig, self.known.rows, self.known.positions, features, self._localizer, seed)
             if found is None:
                 return None
             guess = found

@@ -86,12 +86,15 @@ class RunRecord:
     times: list[float] = field(default_factory=list)  # of the clock at the end of each frame [s]
     rejected: int = 0
     used: int = 0
+    returned: int | None = None  # the first frame in which landmarks of an old place came back
     nis: float = 0.0
     nis_dof: int = 0
 
     def add(self, number: int, result: FrameResult) -> None:
         """Take in one frame, `number` in its sequence."""
         self.numbers.append(number)
+        if len(result.returned) and self.returned is None:
+            self.returned = number
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(time.perf_counter())
@@ -233,20 +236,29 @@ def _write_copies(
     """The recording and the map, where they were asked for."""
     if options.record is not None:
         with last.each():
-            save_recording(_recording(sequence, options, system, tape), options.record)
+            save_recording(_recording(sequence, options, system, record, tape), options.record)
     if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
         with last.each():
             save_map(options.save_map, system)
 
 
 def _recording(
-    sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed, tape: list[RecordedFrame]
+    sequence: Sequence | Recording,
+    options: RunOptions,
+    system: StereoSlam | _Replayed,
+    record: RunRecord,
+    tape: list[RecordedFrame],
 ) -> Recording:
     """What was given to the back end of a run.
 
     Raises:
-        SlamError: it was given to more than one.
+        SlamError: it was given to more than one, or it was given landmarks back, which are no observations.
     """
+    if record.returned is not None:
+        raise SlamError(
+            f"{options.record}: not written: landmarks came back into the map in frame {record.returned}, and a "
+            "recording holds observations alone: use atlas.give_back=false"
+        )
     if isinstance(system, StereoSlam) and system.restarted:
         raise SlamError(
             f"{options.record}: not written: the camera was moved while it saw nothing, and a new back end took over "

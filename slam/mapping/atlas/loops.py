@@ -13,9 +13,10 @@ from slam.geometry.se3 import Array, exp, hat, inverse, transform
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
+from slam.mapping.monocular import find_pose
 from slam.mapping.relocalizer import nowhere
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere
-from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.localizer import Localizer
 
 #: What descriptors find slides over the surface when it is seen from elsewhere, all features of a place alike [px].
 _SLIDE = 1.0
@@ -69,7 +70,6 @@ def sighting(
     localizer: Localizer,
     config: AtlasConfig,
     seed: int,
-    guess: Array | None = None,
 ) -> Sighting | None:
     """The present camera's pose before a keyframe, or None where too few features agree on one, or all in one spot.
 
@@ -80,15 +80,15 @@ def sighting(
         localizer: finds features without a prediction, and those that agree.
         config: settings.
         seed: of the random choice in the geometric check.
-        guess: where the present camera may be in the keyframe's coordinates (4, 4); tried first.
     """
     points = keyframe.points.astype(float)
+    landmarks = _rows(keyframe)
+    guess = None if features.has_stereo.any() else find_pose(rig, landmarks, points, features, localizer, seed)
     prediction = nowhere(features.stamp, np.eye(4) if guess is None else guess)
-    found = localizer.match(prediction, _rows(keyframe), points, features, seed)
-    rows = _with_depth(found, features)
-    if found.T_world_left is None or len(rows) < config.inliers:
+    found = localizer.match(prediction, landmarks, points, features, seed)
+    if found.T_world_left is None or len(found) < config.inliers:
         return None
-    ids, seen = found.ids[rows], found.rows[rows]
+    ids, seen = found.ids, found.rows
     across = np.linalg.eigvalsh(np.cov(features.uv_left[seen].T))[-1]
     if np.sqrt(across) < config.spread * rig.width:
         return None
@@ -109,31 +109,30 @@ def refined_pose(
     Args:
         rig: the cameras.
         points: in the earlier camera's coordinates (M, 3) [m].
-        measured: (uL, vL, uR) (M, 3) [px] in the present frame, all finite.
+        measured: (uL, vL, uR) (M, 3) [px] in the present frame; uR NaN where there is no right pixel.
         T_world_left: first guess of the present camera in the earlier one's coordinates (4, 4).
         pixel_sigma: noise of uL, vL, uR [px].
     """
     P = rig.triangulation_covariance(points, pixel_sigma)
     T, normal = T_world_left, np.eye(6)
+    missing = np.isnan(measured[:, 2])
     for _ in range(_ROUNDS):
         local = transform(inverse(T), points)
         z, H = rig.project_stereo(local)
         J = H @ np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
         HR = H @ T[:3, :3].T
-        W = np.linalg.inv(pixel_sigma**2 * np.eye(3) + HR @ P @ np.swapaxes(HR, 1, 2))
+        S, error = pixel_sigma**2 * np.eye(3) + HR @ P @ np.swapaxes(HR, 1, 2), measured - z
+        J[missing, 2] = error[missing, 2] = 0
+        S[missing, 2, :] = S[missing, :, 2] = [0, 0, 1]
+        W = np.linalg.inv(S)
         good = np.isfinite(z).all(axis=1)
         JW = np.swapaxes(J, 1, 2)[good] @ W[good]
         normal = (JW @ J[good]).sum(axis=0)
-        step = np.linalg.solve(normal, (JW @ (measured - z)[good][:, :, None]).sum(axis=0)[:, 0])
+        step = np.linalg.solve(normal, (JW @ error[good][:, :, None]).sum(axis=0)[:, 0])
         T = T @ exp(step)
         if np.abs(step).max() < _CONVERGED:
             break
     return T, np.linalg.inv(normal)
-
-
-def _with_depth(found: LandmarkMatches, features: StereoFeatures) -> np.ndarray:
-    """Rows of the matches whose features have a right pixel."""
-    return np.flatnonzero(features.has_stereo[found.rows])
 
 
 def _rows(keyframe: Keyframe) -> LandmarkRows:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam.errors import SlamError
-from slam.geometry.se3 import nearest_rotation, pose
+from slam.geometry.se3 import nearest_rotation
 from slam.mapping.atlas.keyframes import Keyframe
 
 #: Arrays of a file: numbers of each keyframe (K,), then features, those of one keyframe after those of another.
@@ -22,7 +22,7 @@ KEYFRAME_TYPES = {
 _FARTHEST = 1e8  # coordinate [m]
 _LARGEST = 1e12  # entry of a covariance [rad², m²]
 _MOST_ID = 2**53  # of a landmark
-_TURNED = 1e-3  # by which a rotation matrix may be none
+_TURNED = 1e-6  # by which a rotation matrix may be none
 
 
 def to_arrays(keyframes: Sequence[Keyframe]) -> dict[str, np.ndarray]:
@@ -69,14 +69,13 @@ def from_arrays(arrays: Mapping[str, np.ndarray], width: tuple[int, ...], source
         raise SlamError(f"{source}: a feature of a keyframe is not finite, or far too large")
     if any(_no_covariance(P) for P in (*covariances, *steps)):
         raise SlamError(f"{source}: the covariance of a keyframe is none")
-    rotations = [nearest_rotation(T[:3, :3]) for T in poses]
-    if any(np.abs(R - T[:3, :3]).max() > _TURNED for R, T in zip(rotations, poses)):
+    if any(np.abs(nearest_rotation(T[:3, :3]) - T[:3, :3]).max() > _TURNED for T in poses):
         raise SlamError(f"{source}: the pose of a keyframe is none")
     begin = np.concatenate([[0], np.cumsum(count)]).astype(int)
     parts = [slice(a, b) for a, b in pairwise(begin)]
     return tuple(
         Keyframe(
-            -1, float(stamps[i]), pose(rotations[i], poses[i, :3, 3]), covariances[i], steps[i], float(travelled[i]),
+            -1, float(stamps[i]), poses[i], covariances[i], steps[i], float(travelled[i]),
             float(depths[i]), points[s], descriptors[s], laplacian[s], landmarks[s],
         )
         for i, s in enumerate(parts)

@@ -94,11 +94,11 @@ def test_the_pose_in_a_map_from_left_pixels_alone():
     features, _ = cloud.features(T, 0.0, 0.3)
     localizer = Localizer(RIG, SystemConfig().association, EstimatorModels(pixel_sigma=0.5))
     left = replace(features, uv_right=features.uv_right * np.nan)
-    found = find_pose(RIG, known, left, localizer, seed=0)
+    found = find_pose(RIG, known.rows, known.positions, left, localizer, seed=0)
     # from three points alone; least squares on all follow elsewhere
     assert np.linalg.norm(se3.log(se3.inverse(T) @ found)[3:]) < 0.15
     other, _ = Cloud(120, seed=5).features(T, 0.0)
-    assert find_pose(RIG, known, other, localizer, seed=0) is None
+    assert find_pose(RIG, known.rows, known.positions, other, localizer, seed=0) is None
 
 
 def map_of(cloud, rows=slice(None)):

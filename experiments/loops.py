@@ -1,0 +1,213 @@
+"""What closing loops gives on long drives that come back: the path's error with and without, and how sure it is.
+
+    SLAM_DATA=/path/to/data python experiments/loops.py [--quick] [--paths 00 05 …] [--backend ekf smoother]
+        [--set KEY=VALUE …] [--option KEY=VALUE …] [--out DIR]
+
+Features of streets along true roads (``kitti_paths`` of the data folder), or of the built-in town where there is no
+such folder. The system is told a focal length that is 0.5 % too long, so that the path drifts. Prints a Markdown table
+and draws the paths. A loop is false where its two frames are farther apart than it may see (``_FAR``), or its pose is
+wrong by more than a tenth of that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tracemalloc
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
+from slam.config import SystemConfig
+from slam.data import FrameResult
+from slam.geometry.alignment import align_positions
+from slam.geometry.se3 import inverse, log
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.atlas import Atlas
+from slam.sequences import open_sequence
+from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "smoother")
+HEADER = (
+    "path", "back end", "frames", "keyframes", "loops", "false", "refused", "places found again [%]",
+    "ATE without [m]", "online [m]", "final [m]", "error at the last loop [m]", "its 3σ [m]",
+    "NEES after it", "ms a keyframe, most", "memory [kB a frame]",
+)  # fmt: skip
+
+_FAR = 40.0  # from which a place can be seen again, at most [m]
+_NEAR, _TURN = 5.0, np.deg2rad(20.0)  # within which a place counts as driven again
+_AWAY = 100  # frames that lie between both times at least
+
+
+@dataclass
+class Drive:
+    """One drive with one back end.
+
+    Attributes:
+        results: of the frames, without their features.
+        atlas: at the end.
+        final: the last word on the path.
+        truth: in the axes of its first pose (F, 4, 4).
+        memory: bytes that each frame leaves for good.
+    """
+
+    results: list[FrameResult] = field(default_factory=list)
+    atlas: Atlas = field(default_factory=Atlas)
+    final: Trajectory = field(default_factory=Trajectory.empty)
+    truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    memory: float = 0.0
+
+    @property
+    def online(self) -> np.ndarray:
+        """Poses (F, 4, 4) as they were reported."""
+        return np.array([r.estimate.T_world_left for r in self.results])
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """Poses (F, 4, 4) as the back end had them, which knows of no loop."""
+        return np.array([inverse(r.T_map_odom) @ r.estimate.T_world_left for r in self.results])
+
+
+def drive(name: str, backend: str, settings: list[str]) -> Drive:
+    """Drive along a world's path, from its features."""
+    sequence = open_sequence(name)
+    config = SystemConfig.for_kind(sequence.kind, None, backend).with_settings(settings)
+    system = StereoSlam(sequence.rig, None, backend, config=config)
+    out, count = Drive(), len(sequence)
+    tracemalloc.start()
+    begin = 0
+    for k in range(count):
+        result = system.process_features(sequence.observations(k))
+        out.results.append(_light(result))
+        if k == count // 10:
+            begin = tracemalloc.get_traced_memory()[0]
+    out.memory = (tracemalloc.get_traced_memory()[0] - begin) / max(count - count // 10, 1)
+    tracemalloc.stop()
+    assert sequence.ground_truth is not None
+    truth = sequence.ground_truth.poses[:count]
+    out.atlas, out.final, out.truth = system.atlas, system.trajectory(), inverse(truth[0]) @ truth
+    return out
+
+
+def _light(result: FrameResult) -> FrameResult:
+    """A result without what takes memory."""
+    none = result.features.empty(result.features.stamp, 16)
+    return replace(result, features=none, matched=result.matched[:0], matched_features=result.matched_features[:0])
+
+
+def ate(poses: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square error of the positions after alignment [m]."""
+    p, q = poses[:, :3, 3], truth[:, :3, 3]
+    error = align_positions(p, q).apply(p) - q
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def false_loops(run: Drive) -> int:
+    """Loops between places that are not the same, or with a pose that is far off."""
+    count = 0
+    for loop in run.atlas.loops:
+        a, b = (run.atlas.keyframes[k].frame for k in (loop.first, loop.second))
+        true = inverse(run.truth[a]) @ run.truth[b]
+        error = log(inverse(true) @ loop.T_first_second)
+        count += bool(np.linalg.norm(true[:3, 3]) > _FAR or np.linalg.norm(error[3:]) > 0.1 * _FAR)
+    return count
+
+
+def found_again(run: Drive) -> float:
+    """Share of the places driven again, in stretches, that a loop holds on to [%]; NaN where there are none."""
+    frames = np.array([k.frame for k in run.atlas.keyframes])
+    T = run.truth[frames]
+    again = np.zeros(len(frames), bool)
+    for i, k in enumerate(frames):
+        old = frames < k - _AWAY
+        near = np.linalg.norm(T[old, :3, 3] - T[i, :3, 3], axis=1) < _NEAR
+        facing = np.arccos(np.clip(0.5 * (np.einsum("nij,ij->n", T[old, :3, :3], T[i, :3, :3]) - 1), -1, 1)) < _TURN
+        again[i] = (near & facing).any()
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], again.astype(int), [0]])))
+    stretches = [(a, b) for a, b in zip(edges[::2], edges[1::2]) if b - a >= 3]
+    closed = np.array([loop.second for loop in run.atlas.loops], int)
+    held = [b - a for a, b in stretches if ((closed >= a - 3) & (closed < b + 3)).any()]
+    whole = sum(b - a for a, b in stretches)
+    return 100.0 * sum(held) / whole if whole else float("nan")
+
+
+def row(name: str, backend: str, run: Drive) -> list[str]:
+    """One row of the table."""
+    closed = [r.index for r in run.results if r.loop is not None]
+    last = closed[-1] if closed else len(run.results) - 1
+    e = run.results[last].estimate
+    error = log(inverse(e.T_world_left) @ run.truth[last])
+    later = [r.estimate for r in run.results[last:]]
+    errors = [log(inverse(x.T_world_left) @ run.truth[last + i]) for i, x in enumerate(later)]
+    nees = np.mean([x @ np.linalg.solve(y.covariance, x) for x, y in zip(errors, later)])
+    sigma = 3 * np.sqrt(np.trace(e.covariance[3:, 3:]))
+    figures = [ate(run.odometry, run.truth), ate(run.online, run.truth), ate(run.final.poses, run.truth)]
+    slowest = max(r.milliseconds["atlas"] for r in run.results)
+    s = run.atlas.summary()
+    return [
+        name, backend, str(len(run.results)), str(s["keyframes"]), str(s["closed"]), str(false_loops(run)),
+        str(s["refused"]), f"{found_again(run):.0f}", *(f"{x:.2f}" for x in figures),
+        f"{np.linalg.norm(error[3:]):.2f}", f"{sigma:.2f}", f"{nees:.1f}", f"{slowest:.0f}", f"{run.memory / 1e3:.1f}",
+    ]  # fmt: skip
+
+
+def worlds(given: argparse.Namespace) -> dict[str, str]:
+    """Names of the drives, and the sequences."""
+    extra = "".join(f"&{option}" for option in given.option)
+    if given.quick:
+        return {"town": f"synthetic:town?descriptor=16&focal_error=0.005&speed=2&frames=420{extra}"}
+    folder = Path(os.environ.get("SLAM_DATA", "")) / "kitti_paths"
+    found = {
+        n: folder / f"{n}.txt" for n in given.paths if "SLAM_DATA" in os.environ and (folder / f"{n}.txt").exists()
+    }
+    options = f"descriptor=16&focal_error=0.005{extra}"
+    return {n: f"synthetic:drive?path={f}&{options}" for n, f in found.items()} or {"town": f"synthetic:town?{options}"}
+
+
+def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
+    """The paths from above: true, without loops, and the last word; loops as circles."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(runs), figsize=(5 * len(runs), 5), squeeze=False, layout="constrained")
+    for axis, ((name, backend), run) in zip(axes[0], runs.items()):
+        for poses, style, label in (
+            (run.truth, "k--", "true"), (run.odometry, "C1-", "without loops"), (run.final.poses, "C0-", "with loops"),
+        ):  # fmt: skip
+            axis.plot(*poses[:, [0, 2], 3].T, style, lw=1.2, label=label)
+        at = [run.atlas.keyframes[loop.second].frame for loop in run.atlas.loops]
+        axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=5, label="loops closed")
+        axis.set(title=f"{name}, {backend}", aspect="equal", xlabel="right [m]", ylabel="forward [m]")
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(out / "loops.png", dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--paths", nargs="*", default=["06", "07"])
+    parser.add_argument("--backend", nargs="*", default=list(BACKENDS))
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--option", nargs="*", default=[])
+    parser.add_argument("--out", type=Path, default=Path("results/loops"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    quick = ["map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off"] if given.quick else []
+    runs = {
+        (name, backend): drive(sequence, backend, [*quick, *given.set])
+        for name, sequence in worlds(given).items()
+        for backend in (given.backend[:1] if given.quick else given.backend)
+    }
+    rows = [row(name, backend, run) for (name, backend), run in runs.items()]
+    print("Features of streets along true roads; the focal length that the system is told is 0.5 % too long.\n")
+    print(markdown(HEADER, rows, texts=2))
+    write_json(given.out / "loops.json", HEADER, rows)
+    draw(runs, given.out)
+
+
+if __name__ == "__main__":
+    main()
