@@ -196,7 +196,7 @@ def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
     class Stop(BaseException):
         pass
 
-    with pytest.raises(Stop), disk_of(3500):
+    with pytest.raises(Stop), disk_of(5000):
         run(tmp_path, error=Stop("stop"), at=2, record=tmp_path / "a.npz")
     assert any("cannot be written" in line for line in caplog.messages)
 

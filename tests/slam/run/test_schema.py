@@ -42,8 +42,8 @@ def done(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     write = RunFiles.write_frame
 
-    def write_frame(files, number, result):
-        write(files, number, replace(result, objects=BODIES.get(number, ())))
+    def write_frame(files, number, result, loop=None):
+        write(files, number, replace(result, objects=BODIES.get(number, ())), loop)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunFiles, "write_frame", write_frame)
