@@ -385,6 +385,7 @@ def test_what_is_brought_up_to_date_later_is_exact(monkeypatch):
 def test_landmarks_come_and_go():
     rng = np.random.default_rng(12)
     covariance, dense = grown(300, rng)
+    covariance.full()
     largest = covariance.capacity
     order = list(range(300))  # which landmark each slot holds
     for count in (1, 7, 100, 1, 150, 0, 1):
