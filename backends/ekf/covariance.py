@@ -165,12 +165,13 @@ class Covariance:
         out[self._own_rows()] = s @ self._local[g]
         return np.asarray(out)
 
-    def subtract(self, slots: SlotArray, B: Array) -> None:
-        """``P ← P − W Wᵀ`` with ``W = P[:, g] B``, g as above; B (6 + 3M, K)."""
+    def subtract(self, slots: SlotArray, whitened: Callable[[Array], Array]) -> None:
+        """``P ← P − Wᵀ W`` with ``W = B P[g, :]``, g as above; `whitened` gives ``B X`` (K, N) for X (6 + 3M, N)."""
         g = self._rows(slots)
-        W, V = B.T @ self._local[g], B.T @ self._Phi[g]  # transposed
+        W = whitened(self._local[g])
         reduction = W.T @ W
-        if V.size:
+        if self._Phi.size:
+            V = whitened(self._Phi[g])
             self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=self._Phi.T, trans_b=1, overwrite_c=self._mine).T
             self._Psi = self._Psi + V.T @ V
         self._local, self._mine = np.subtract(self._local, reduction, out=reduction), True

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from backends.ekf.jacobian import Displacement, Jacobian
@@ -116,9 +117,14 @@ class Solution:
 
     @cached_property
     def B(self) -> Array:
-        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``."""
+        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the same as `whitened` of the identity, transposed."""
         B = self.H.transposed_times(self.inverse.T)
         return B if self.measured.all() else B[:, self.measured]
+
+    def whitened(self, X: Array) -> Array:
+        """``L⁻¹ H X`` (K, N) for X (6 + 3M, N): the covariance shrinks by WᵀW, where W is this of ``P[g, :]``."""
+        W = dtrmm(1.0, self.inverse, self.H.times(X).T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        return np.asarray(W if self.measured.all() else W[self.measured])
 
 
 @dataclass(frozen=True)
@@ -136,13 +142,20 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _System:
-    """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S, S = L Lᵀ."""
+    """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S."""
 
     rows: BoolArray
     H: Jacobian
     nu: Array
     S: Array
-    L: Array
+
+    @cached_property
+    def L(self) -> Array:
+        """The lower triangular L with ``L Lᵀ = S``."""
+        L, info = dpotrf(self.S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return np.asarray(L)
 
     def only(self, rows: BoolArray, sigma: float) -> _System:
         """With fewer rows (mask (M, 3))."""
@@ -151,7 +164,7 @@ class _System:
         kept = rows.reshape(-1)
         S = np.where(kept[:, None] & kept, self.S, 0.0)
         S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
-        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S, _factor(S))
+        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S)
 
 
 @dataclass(frozen=True)
@@ -195,7 +208,7 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils its neighbours' judgement, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees.
+    the worst one, until all that is left agrees. A round begins where the one before has linearised last.
 
     Returns:
         the solution, or None where no observation is left.
@@ -203,9 +216,9 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
     """
-    used = gated.used
+    used, start, system = gated.used, gated.start, gated.system
     while used.any():
-        solution = _iterate(problem, used, gated.start, gated.system)
+        solution, start, system = _iterate(problem, used, start, system, system is gated.system)
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
@@ -215,12 +228,24 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     return None
 
 
-def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System) -> Solution:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
+def _iterate(
+    problem: Problem, used: BoolArray, start: _Iterate, first: _System, fresh: bool
+) -> tuple[Solution, _Iterate, _System]:
+    """Update by the measurements of the landmarks `used` (M,); `first` is the system of more of them at the start.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
+
+    Args:
+        problem: the update.
+        used: which landmarks take part.
+        start: where it begins.
+        first: the linear update there.
+        fresh: whether that is the prior or the guess, so that there must be a step that lowers the cost.
+
+    Returns:
+        the solution, and where it was linearised.
     """
     rows = first.rows & used[:, None]
     now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
@@ -241,7 +266,7 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
         if iteration == 1 and problem.guess is not None:
             at_guess = _visit(problem, rows, _towards_guess(problem))
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
-        if following is now and iteration == 1:
+        if following is now and iteration == 1 and fresh:
             raise UnsolvableError("no step towards the solution lowers the cost")
         s = following.s
         if iteration == problem.iterations or following is now:
@@ -249,13 +274,13 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
         now, system = following, _system(problem, rows, following)
     inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
     distances = _conditional_distances(inverse, y)
-    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances)
+    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances), now, system
 
 
 def _require_positive(problem: Problem, solution: Solution) -> None:
     """Raise where rounding leaves a variance of the pose that is not positive."""
-    reduction = problem.covariance[:6] @ solution.B
-    if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
+    W = solution.whitened(problem.covariance[:, :6])
+    if not (problem.covariance.diagonal()[:6] > (W * W).sum(axis=0)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
 
 
@@ -312,15 +337,7 @@ def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisatio
         nu += H.times(now.change[:, None])[:, 0]
     S = H.sandwich(problem.covariance)
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    return _System(rows, H, nu, S, _factor(S))
-
-
-def _factor(S: Array) -> Array:
-    """The lower triangular L with ``L Lᵀ = S``."""
-    L, info = dpotrf(S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
-    if info != 0:
-        raise UnsolvableError("the innovation covariance is not positive definite")
-    return np.asarray(L)
+    return _System(rows, H, nu, S)
 
 
 def _conditional_distances(inverse: Array, y: Array) -> Array:
