@@ -209,4 +209,3 @@ class Mapper:
     def _camera(backend: Backend) -> np.ndarray:
         """The camera's position (3,)."""
         return backend.estimate(landmarks=False).T_world_left[:3, 3]
-
