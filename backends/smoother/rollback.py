@@ -24,10 +24,10 @@ def snapshot(measurement_log: MeasurementLog) -> Callable[[], None]:
     def restore() -> None:
         for part, state in zip(parts, states):
             _put_back(part, state)
-        for track, count, *state in tracks.values():
-            track.rows, track.points, track.keys = (x[:count] for x in state[:3])
-            track.stereo, track.factor = state[3:]
-        measurement_log.landmarks.tracks = {slot: track for slot, (track, *_) in tracks.items()}
+        for track, count, rows, points, keys, stereo, factor in tracks.values():
+            track.rows, track.points, track.keys = rows[:count], points[:count], keys[:count]
+            track.stereo, track.factor = stereo, factor
+        measurement_log.landmarks.tracks = {slot: entry[0] for slot, entry in tracks.items()}
 
     return restore
 
