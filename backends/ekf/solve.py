@@ -208,7 +208,7 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
     A wrong match spoils its neighbours' judgement, so a round takes out only landmarks at least half as far off as
-    the worst one, until all that is left agrees. A round begins where the one before has linearised last.
+    the worst one, until all that is left agrees.
 
     Returns:
         the solution, or None where no observation is left.
@@ -216,9 +216,9 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
     """
-    used, start, system = gated.used, gated.start, gated.system
+    used = gated.used
     while used.any():
-        solution, start, system = _iterate(problem, used, start, system, system is gated.system)
+        solution = _iterate(problem, used, gated.start, gated.system)
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
@@ -228,24 +228,12 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     return None
 
 
-def _iterate(
-    problem: Problem, used: BoolArray, start: _Iterate, first: _System, fresh: bool
-) -> tuple[Solution, _Iterate, _System]:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system of more of them at the start.
+def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System) -> Solution:
+    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
-
-    Args:
-        problem: the update.
-        used: which landmarks take part.
-        start: where it begins.
-        first: the linear update there.
-        fresh: whether that is the prior or the guess, so that there must be a step that lowers the cost.
-
-    Returns:
-        the solution, and where it was linearised.
     """
     rows = first.rows & used[:, None]
     now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
@@ -266,7 +254,7 @@ def _iterate(
         if iteration == 1 and problem.guess is not None:
             at_guess = _visit(problem, rows, _towards_guess(problem))
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
-        if following is now and iteration == 1 and fresh:
+        if following is now and iteration == 1:
             raise UnsolvableError("no step towards the solution lowers the cost")
         s = following.s
         if iteration == problem.iterations or following is now:
@@ -274,7 +262,7 @@ def _iterate(
         now, system = following, _system(problem, rows, following)
     inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
     distances = _conditional_distances(inverse, y)
-    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances), now, system
+    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances)
 
 
 def _require_positive(problem: Problem, solution: Solution) -> None:
