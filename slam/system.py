@@ -24,6 +24,7 @@ from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
+from slam.runtime.blas import one_blas_thread
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
 from slam.tracking.localizer import LandmarkMatches, Localizer
@@ -149,6 +150,7 @@ class StereoSlam:
             result = self.process_features(features)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
+    @one_blas_thread
     def _extract(self, frame: StereoFrame) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
         """A frame, its features, and how long these took [ms]."""
         if self.frontend is None:
@@ -158,6 +160,7 @@ class StereoSlam:
             features = self.frontend.extract(frame)
         return frame, features, stages.milliseconds
 
+    @one_blas_thread
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 

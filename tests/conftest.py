@@ -47,7 +47,7 @@ def slam_command(capfd, monkeypatch) -> Callable[..., subprocess.CompletedProces
         with _log_and_signals_of_its_own(), pytest.raises(SystemExit) as end:
             main()
         output, errors = capfd.readouterr()
-        lines = [line for line in errors.splitlines(keepends=True) if not line.startswith("WARNING: compiling ")]
+        lines = [line for line in errors.splitlines(keepends=True) if not line.startswith("INFO: compiling ")]
         return subprocess.CompletedProcess(words, end.value.code or 0, output, "".join(lines))
 
     return run

@@ -33,10 +33,11 @@ MAY_IMPORT = {
         "evaluation",
         "data",
         "geometry",
+        "runtime",
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
     "testing": {"system", "worlds", "data", "geometry"},
-    "commands": {"compare", "run", "system", "sequences", "worlds", "evaluation", "data", "geometry"},
+    "commands": {"compare", "run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime"},
 }
 
 #: The root's modules that make up the room "system"; all others belong to "data", what everybody needs.

@@ -33,6 +33,8 @@ POSE = 6  #: its part [r, φ] that measurements depend on
 SlotArray = NDArray[np.intp]
 
 _LOCAL = 150  # rows of the local part that are never too many
+_WHOLE = 2.5  # all are local where the state has at most so many times the rows of what is measured,
+_WHOLE_STILL = 4  # and stay so up to here
 _THREE = np.arange(3)
 _LATER = np.maximum(_THREE[:, None], _THREE)  # row of an entry in the lower triangle of a symmetric block
 _EARLIER = np.minimum(_THREE[:, None], _THREE)
@@ -81,6 +83,11 @@ class Covariance:
         return len(self._P)
 
     @property
+    def _rest(self) -> bool:
+        """Whether there are landmarks that are not local."""
+        return len(self._slots) < self.count
+
+    @property
     def camera(self) -> Array:
         """The camera's block (12, 12)."""
         return self._local[:CAMERA, :CAMERA].copy()
@@ -120,16 +127,23 @@ class Covariance:
         return self._slots
 
     def make_local(self, slots: SlotArray) -> SlotArray:
-        """Let landmarks join the local part, which is stored first where it gets too large; returns who has joined."""
-        far = slots[self._place[slots] < 0]
-        most = max(_LOCAL, self.size // 8, 3 * (CAMERA + 3 * len(slots)) // 2)
-        if len(self._local) + 3 * len(far) > most:
+        """Let landmarks join the local part, which is stored first where it gets too large; returns who has joined.
+
+        Where a good part of all is measured, all become local: that costs less than to carry the rest along.
+        """
+        far, needed = slots[self._place[slots] < 0], CAMERA + 3 * len(slots)
+        whole = self.size <= _WHOLE * needed
+        most = _WHOLE_STILL * needed if not self._rest else max(_LOCAL, self.size // 8, 3 * needed // 2)
+        if whole and self._rest:
+            far = np.concatenate([far, np.setdiff1d(np.flatnonzero(self._place < 0), far)])
+        elif len(self._local) + 3 * len(far) > most:
             self._store()
             far = slots
         if len(far):
             self._fetch(far)
-        if len(self._slots) == self.count:  # there is no rest
-            self._X, self._Phi, self._Psi = self._X[:, :0], self._Phi[:, :0], self._Psi[:0, :0]
+        if not self._rest:
+            self._P, self._X = np.zeros((0, 0), order="F"), np.zeros((self.size, 0))
+            self._Phi, self._Psi = self._Phi[:, :0], self._Psi[:0, :0]
         return far
 
     def marginal(self, slots: SlotArray) -> Array:
@@ -148,18 +162,19 @@ class Covariance:
         """``P[:, g] s`` (size,), g as above."""
         g = self._rows(slots)
         out = self._X[: self.size] @ (s @ self._Phi[g])
-        out[self._own_rows()] = self._local[:, g] @ s
+        out[self._own_rows()] = s @ self._local[g]
         return np.asarray(out)
 
-    def subtract(self, slots: SlotArray, B: Array) -> None:
-        """``P ← P − W Wᵀ`` with ``W = P[:, g] B``, g as above; B (6 + 3M, K)."""
+    def subtract(self, slots: SlotArray, whitened: Callable[[Array], Array]) -> None:
+        """``P ← P − Wᵀ W`` with ``W = B P[g, :]``, g as above; `whitened` gives ``B X`` (K, N) for X (6 + 3M, N)."""
         g = self._rows(slots)
-        W, V = B.T @ self._local[g], B.T @ self._Phi[g]  # transposed
-        P, Phi = self._own()
-        P -= W.T @ W
-        if V.size:
-            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=Phi.T, trans_b=1, overwrite_c=1).T
+        W = whitened(self._local[g])
+        reduction = W.T @ W
+        if self._Phi.size:
+            V = whitened(self._Phi[g])
+            self._Phi = dgemm(-1.0, V.T, W.T, beta=1.0, c=self._Phi.T, trans_b=1, overwrite_c=self._mine).T
             self._Psi = self._Psi + V.T @ V
+        self._local, self._mine = np.subtract(self._local, reduction, out=reduction), True
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
@@ -181,8 +196,11 @@ class Covariance:
         """``Y ← Y + K [r, φ]`` for a change of coordinates of those landmarks that became local last; K (M, 3, 6)."""
         by_pose, (P, Phi) = K.reshape(-1, POSE), self._own()
         rows = slice(len(P) - len(by_pose), len(P))
-        P[rows] += by_pose @ P[:POSE]
-        P[:, rows] += P[:, :POSE] @ by_pose.T
+        own = np.zeros((POSE, len(P)))
+        own[:, rows] = by_pose.T
+        half = P[:POSE] + 0.5 * P[:POSE, :POSE] @ own  # P + ownᵀ half + halfᵀ own, in one product and in place
+        both, other = np.concatenate([own, half]), np.concatenate([half, own])
+        dgemm(1.0, both.T, other.T, beta=1.0, c=P.T, trans_b=1, overwrite_c=1)
         Phi[rows] += by_pose @ Phi[:POSE]
 
     def append(self, J: Array, noise: Array) -> None:
@@ -197,9 +215,12 @@ class Covariance:
         own = cross[:, :POSE] @ by_pose.T
         for i, block in enumerate(noise):
             own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
+        rest = self._rest
         self._place = np.concatenate([self._place, np.zeros(len(J), np.intp)])
         self.count += len(J)
-        if self.size > len(self._P):
+        if not rest:
+            self._X = np.zeros((self.size, self._X.shape[1]))
+        elif self.size > len(self._P):
             self._resize()
         self._join(new, cross, own, by_pose @ self._Phi[:POSE])
 
@@ -218,11 +239,12 @@ class Covariance:
         holes, movers = np.flatnonzero(gone[:left]), left + np.flatnonzero(~gone[left:])
         stay = ~gone[self._slots]
         if not stay.all():
-            rows = np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)])
-            self._local, self._Phi = self._local[np.ix_(rows, rows)], self._Phi[rows]
+            rows = np.flatnonzero(np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)]))
+            self._local, self._Phi = self._local[rows].take(rows, axis=1), self._Phi[rows]
             self._slots = self._slots[stay]
         for hole, mover in zip(holes.tolist(), movers.tolist()):
-            self._move(CAMERA + 3 * hole, CAMERA + 3 * mover)
+            if self._place[mover] < 0:  # what is stored of local ones does not count
+                self._move(CAMERA + 3 * hole, CAMERA + 3 * mover)
         mine, tail = self._slots.copy(), slice(CAMERA + 3 * left, self.size)
         mine[mine >= left] = holes[np.searchsorted(movers, mine[mine >= left])]
         self._slots = mine
@@ -265,7 +287,11 @@ class Covariance:
 
     def _join(self, slots: SlotArray, cross: Array, own: Array, Phi: Array) -> None:
         """Enlarge the local part by landmarks with covariances `cross` with it and `own`."""
-        self._local = np.block([[self._local, cross.T], [cross, _symmetric(own)]])
+        old = len(self._local)
+        larger = np.empty((old + len(own), old + len(own)))
+        larger[:old, :old], larger[:old, old:] = self._local, cross.T
+        larger[old:, :old], larger[old:, old:] = cross, _symmetric(own)
+        self._local = larger
         self._Phi = np.concatenate([self._Phi, Phi])
         self._place = self._place.copy()
         self._place[slots] = len(self._slots) + np.arange(len(slots))
@@ -273,6 +299,8 @@ class Covariance:
 
     def _store(self) -> None:
         """Bring P⁰ up to date. Only the camera stays local."""
+        if not len(self._P) == len(self._X) >= self.size:
+            self._resize()
         mine, P = self._own_rows(), self._P
         C = _square_root(self._Psi)
         X = self._X.copy()

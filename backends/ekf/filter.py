@@ -420,7 +420,7 @@ class EkfBackend:
             covariance.move_camera(0.0, found.noise)
         if self._objects.count:
             self._correct_objects(slots, solution)
-        covariance.subtract(slots, solution.B)
+        covariance.subtract(slots, solution.whitened)
         before = self._camera
         self._camera = self._camera + change[:CAMERA]
         self._landmarks.move(change[CAMERA:].reshape(-1, 3))
@@ -432,7 +432,7 @@ class EkfBackend:
     def _correct_objects(self, slots: SlotArray, solution: Solution) -> None:
         """The bodies' part of a correction, before that of the filter's own state."""
         columns = self._covariance.columns(slots)
-        W = columns @ solution.B
+        W = solution.whitened(columns.T).T
         T = self._poses[-1]
         by_state = pose_jacobian(T[:3, :3], self._camera[3:6])
         camera = CameraBelief(T, by_state, columns[:, :POSE] - W @ W[:POSE].T)

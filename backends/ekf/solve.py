@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from backends.ekf.jacobian import Displacement, Jacobian
@@ -116,9 +117,14 @@ class Solution:
 
     @cached_property
     def B(self) -> Array:
-        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the covariance shrinks by ``(P[:, g] B)(P[:, g] B)ᵀ``."""
+        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the same as `whitened` of the identity, transposed."""
         B = self.H.transposed_times(self.inverse.T)
         return B if self.measured.all() else B[:, self.measured]
+
+    def whitened(self, X: Array) -> Array:
+        """``L⁻¹ H X`` (K, N) for X (6 + 3M, N): the covariance shrinks by WᵀW, where W is this of ``P[g, :]``."""
+        W = dtrmm(1.0, self.inverse, self.H.times(X).T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        return np.asarray(W if self.measured.all() else W[self.measured])
 
 
 @dataclass(frozen=True)
@@ -136,13 +142,20 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _System:
-    """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S, S = L Lᵀ."""
+    """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S."""
 
     rows: BoolArray
     H: Jacobian
     nu: Array
     S: Array
-    L: Array
+
+    @cached_property
+    def L(self) -> Array:
+        """The lower triangular L with ``L Lᵀ = S``."""
+        L, info = dpotrf(self.S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return np.asarray(L)
 
     def only(self, rows: BoolArray, sigma: float) -> _System:
         """With fewer rows (mask (M, 3))."""
@@ -151,7 +164,7 @@ class _System:
         kept = rows.reshape(-1)
         S = np.where(kept[:, None] & kept, self.S, 0.0)
         S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
-        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S, _factor(S))
+        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S)
 
 
 @dataclass(frozen=True)
@@ -254,8 +267,8 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
 
 def _require_positive(problem: Problem, solution: Solution) -> None:
     """Raise where rounding leaves a variance of the pose that is not positive."""
-    reduction = problem.covariance[:6] @ solution.B
-    if not (problem.covariance.diagonal()[:6] > (reduction * reduction).sum(axis=1)).all():
+    W = solution.whitened(problem.covariance[:, :6])
+    if not (problem.covariance.diagonal()[:6] > (W * W).sum(axis=0)).all():
         raise UnsolvableError("the pose's variances would not stay positive")
 
 
@@ -312,15 +325,7 @@ def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisatio
         nu += H.times(now.change[:, None])[:, 0]
     S = H.sandwich(problem.covariance)
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    return _System(rows, H, nu, S, _factor(S))
-
-
-def _factor(S: Array) -> Array:
-    """The lower triangular L with ``L Lᵀ = S``."""
-    L, info = dpotrf(S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
-    if info != 0:
-        raise UnsolvableError("the innovation covariance is not positive definite")
-    return np.asarray(L)
+    return _System(rows, H, nu, S)
 
 
 def _conditional_distances(inverse: Array, y: Array) -> Array:

@@ -40,7 +40,6 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.runtime.compilation import announce_compilation
 
 
 class SmootherBackend:
@@ -59,7 +58,6 @@ class SmootherBackend:
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
-        announce_compilation("backends.smoother", "the smoother's kernels: some ten seconds")
         self.rig = rig
         self.models = models
         self.config = from_options(SmootherConfig, "smoother", options)

@@ -21,8 +21,10 @@ def _residual(camera, R_left, point, z, T, r, J):
     c = T[0, 2] * x + T[1, 2] * y + T[2, 2] * depth
     q = R_left[2, 0] * a + R_left[2, 1] * b + R_left[2, 2] * c
     if not q >= _NEAREST:
-        r[:] = np.nan
-        J[:] = 0.0
+        for i in range(3):
+            r[i] = np.nan
+            for k in range(6):
+                J[i, k] = 0.0
         return
     w = 1 / q
     scale = f * w
@@ -112,35 +114,61 @@ def gauss_newton(camera, R_left, points, z, whitener, used, information, prior, 
         steps: at most so many.
         enough: steps that are smaller are the last [rad, m].
     """
-    T, prior = start.copy(), prior.copy()
+    T, off = start.copy(), prior.copy()
     r, J, white, G = np.empty(3), np.empty((3, 6)), np.empty(3), np.empty((3, 6))
+    H, step = np.empty((6, 6)), np.empty(6)
     for _ in range(steps):
-        H, g = information.copy(), np.zeros(6)
         for i in range(6):
+            step[i] = 0.0
             for j in range(6):
-                g[i] -= information[i, j] * prior[j]
+                H[i, j] = information[i, j]
+                step[i] -= information[i, j] * off[j]
         for m in range(len(points)):
-            if not used[m]:
-                continue
-            _residual(camera, R_left, points[m], z[m], T, r, J)
-            for i in range(3):
-                if np.isnan(r[i]):
-                    r[i] = 0.0
-                    J[i] = 0.0
-            for i in range(3):
-                W = whitener[m, i]
-                white[i] = W[0] * r[0] + W[1] * r[1] + W[2] * r[2]
-                for j in range(6):
-                    G[i, j] = W[0] * J[0, j] + W[1] * J[1, j] + W[2] * J[2, j]
-            size = np.sqrt(white[0] * white[0] + white[1] * white[1] + white[2] * white[2])
-            weight = 1.0 if size <= huber else huber / size
-            for i in range(6):
-                g[i] += weight * (G[0, i] * white[0] + G[1, i] * white[1] + G[2, i] * white[2])
-                for j in range(6):
-                    H[i, j] += weight * (G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j])
-        step = np.linalg.solve(H, g)
+            if used[m]:
+                _residual(camera, R_left, points[m], z[m], T, r, J)
+                _whiten(whitener, m, r, J, white, G)
+                size = np.sqrt(white[0] * white[0] + white[1] * white[1] + white[2] * white[2])
+                weight = 1.0 if size <= huber else huber / size
+                for i in range(6):
+                    step[i] += weight * (G[0, i] * white[0] + G[1, i] * white[1] + G[2, i] * white[2])
+                    for j in range(i + 1):
+                        H[i, j] += weight * (G[0, i] * G[0, j] + G[1, i] * G[1, j] + G[2, i] * G[2, j])
+        _solve(H, step)
         _move(T, step)
-        prior += step  # exact to first order: enough for a prior that only keeps few measurements in bounds
-        if np.abs(step).max() < enough:
+        largest = 0.0
+        for i in range(6):
+            off[i] += step[i]  # exact to first order: enough for a prior that only keeps few measurements in bounds
+            largest = max(largest, abs(step[i]))
+        if largest < enough:
             break
     return T
+
+
+@helper
+def _whiten(whitener, m, r, J, white, G):
+    """Residual and derivatives of measurement m times its whitener; components that are missing count for nothing."""
+    for i in range(3):
+        white[i] = 0.0
+        for j in range(6):
+            G[i, j] = 0.0
+        for k in range(3):
+            if not np.isnan(r[k]):
+                white[i] += whitener[m, i, k] * r[k]
+                for j in range(6):
+                    G[i, j] += whitener[m, i, k] * J[k, j]
+
+
+@helper
+def _solve(M, v):
+    """``M⁻¹ v`` into v (6,) by M = L D Lᵀ, which overwrites the lower triangle of M (6, 6)."""
+    for i in range(6):
+        for j in range(i + 1):
+            for h in range(j):
+                M[i, j] -= M[i, h] * M[j, h] * M[h, h]
+            if j < i:
+                M[i, j] /= M[j, j]
+                v[i] -= M[i, j] * v[j]
+    for i in range(5, -1, -1):
+        v[i] /= M[i, i]
+        for h in range(i + 1, 6):
+            v[i] -= M[h, i] * v[h]

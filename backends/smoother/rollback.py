@@ -12,23 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from backends.smoother.measurement_log import MeasurementLog
+from backends.smoother.measurement_log import MeasurementLog, Track
 
 
 def snapshot(measurement_log: MeasurementLog) -> Callable[[], None]:
     """What puts the measurement_log back to how they are now."""
     parts = (measurement_log.path, measurement_log.measurements, measurement_log.landmarks, measurement_log.history)
     states = [_state(part) for part in parts]
-    tracks = {slot: (track, _state(track)) for slot, track in measurement_log.landmarks.tracks.items()}
+    tracks = {slot: (track, *_of_track(track)) for slot, track in measurement_log.landmarks.tracks.items()}
 
     def restore() -> None:
         for part, state in zip(parts, states):
             _put_back(part, state)
-        for track, state in tracks.values():
-            _put_back(track, state)
-        measurement_log.landmarks.tracks = {slot: track for slot, (track, _) in tracks.items()}
+        for track, count, rows, points, keys, stereo, factor in tracks.values():
+            track.rows, track.points, track.keys = rows[:count], points[:count], keys[:count]
+            track.stereo, track.factor = stereo, factor
+        measurement_log.landmarks.tracks = {slot: entry[0] for slot, entry in tracks.items()}
 
     return restore
+
+
+def _of_track(track: Track) -> tuple[int, list[int], list[Any], list[int], int, int]:
+    """What may change of a track: the length of its lists, these, and the rest; there are hundreds, in every call."""
+    return len(track.rows), track.rows, track.points, track.keys, track.stereo, track.factor
 
 
 #: Arrays that only grow, and are revised in place: poses and measurements.

@@ -20,7 +20,6 @@ from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
 from frontends.surf.workers import SHARES, Workers
 from slam.errors import ConfigurationError
-from slam.runtime.compilation import announce_compilation
 
 if TYPE_CHECKING:
     import cv2
@@ -97,7 +96,6 @@ class Surf:
             raise ConfigurationError(f"descriptor: must be 16 or 64, not {descriptor}")
         if not isinstance(threads, int) or threads < 1:
             raise ConfigurationError(f"threads: must be a whole number of at least 1, not {threads}")
-        announce_compilation("frontends.surf", "the SURF kernels: some ten seconds")
         self.threshold = float(threshold)
         self.octaves = octaves
         self.layers = layers

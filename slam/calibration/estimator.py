@@ -114,22 +114,23 @@ class SelfCalibration:
             self._update()
 
     def _compare(self, view: View) -> None:
-        """Compare a view with the earlier ones that wait for a partner."""
+        """Compare a view with the earlier ones that wait for a partner, the oldest first, until one goes on waiting."""
         c, self._open = self.config, None
-        common = [len(match(first, view)[0]) for first in self._waiting]
-        shares = [n / len(first) for n, first in zip(common, self._waiting)]
-        done = [n <= max(c.kept_share * len(first), c.minimum_common) for n, first in zip(common, self._waiting)]
-        apart = not self._waiting or shares[-1] < 1 - _SPACING * (1 - c.kept_share)
-        for first, n, ends in zip(self._waiting, common, done):
-            if ends and n >= c.minimum_common:
-                evidence = self._evidence(first, view)
-                if evidence is not None:
-                    self._motion.add(evidence)
-        if self._waiting and not done[0] and self.pairs < _FEW:
-            self._open = self._evidence(self._waiting[0], view)
-        self._waiting = [first for first, ends in zip(self._waiting, done) if not ends]
-        if apart:
-            self._waiting.append(view)
+        waiting = self._waiting
+        common = len(match(waiting[-1], view)[0]) if waiting else 0
+        apart = not waiting or common < (1 - _SPACING * (1 - c.kept_share)) * len(waiting[-1])
+        ended = 0
+        for first in waiting:
+            n = common if first is waiting[-1] else len(match(first, view)[0])
+            if n > max(c.kept_share * len(first), c.minimum_common):
+                break
+            ended += 1
+            evidence = self._evidence(first, view) if n >= c.minimum_common else None
+            if evidence is not None:
+                self._motion.add(evidence)
+        if waiting and not ended and self.pairs < _FEW:
+            self._open = self._evidence(waiting[0], view)
+        self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
     def summary(self) -> dict[str, Any]:
         """What has been found, as plain types."""

@@ -110,20 +110,17 @@ def solve(prior: Array, offset: Array, residual: float, evidence: Sequence[Evide
     whole = evidence[0]
     for more in evidence[1:]:
         whole += more
-    logs, means, covariances, scales = [], [], [], []
     spread, drift = np.linalg.inv(prior), np.outer(offset, offset)
-    for scale, turned in product(_SCALES, _OFFSETS):
-        information = np.linalg.inv(scale**2 * spread + turned**2 * drift)
-        scales.append(scale)
-        total = information + whole.S
-        covariance = np.linalg.inv(total)
-        mean = covariance @ whole.e
-        logs.append(0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + mean @ whole.e))
-        means.append(mean)
-        covariances.append(covariance)
-    weights = np.exp(np.array(logs) - max(logs))
+    scales, turned = np.array(list(product(_SCALES, _OFFSETS))).T[:, :, None, None]
+    information = np.linalg.inv(scales**2 * spread + turned**2 * drift)  # of each pair of scales (K, n, n)
+    total = information + whole.S
+    covariances = np.linalg.inv(total)
+    means = covariances @ whole.e
+    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + means @ whole.e)
+    weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    mean = np.asarray(sum(w * m for w, m in zip(weights, means)))
-    inner = np.asarray(sum(w * (C + np.outer(m - mean, m - mean)) for w, m, C in zip(weights, means, covariances)))
-    moved = sum(w * scale * C for w, scale, C in zip(weights, scales, covariances)) @ whole.cross
+    mean = weights @ means
+    off = means - mean
+    inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
+    moved = np.tensordot(weights * scales[:, 0, 0], covariances, axes=1) @ whole.cross
     return Solution(mean, inner, inner + residual * moved @ moved.T)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,12 @@ class View:
     def __len__(self) -> int:
         return len(self.points)
 
+    @cached_property
+    def by_sign(self) -> dict[int, tuple[NDArray[np.intp], NDArray[np.float32]]]:
+        """Rows and descriptors of the features with each sign of the Laplacian."""
+        rows = {int(sign): np.flatnonzero(self.laplacian == sign) for sign in np.unique(self.laplacian)}
+        return {sign: (of_sign, self.descriptors[of_sign]) for sign, of_sign in rows.items()}
+
     @classmethod
     def of(cls, model: RigModel, features: StereoFeatures, T_world_left: Array, most: int) -> View:
         """Of the strongest features as measured, `most` at the most, at a pose (4, 4) of the left camera."""
@@ -69,12 +76,28 @@ def match(first: View, second: View) -> tuple[NDArray[np.intp], NDArray[np.intp]
     """Rows of features that look alike in two views: each the other's nearest, and clearly nearer than the next."""
     if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    likeness = first.descriptors @ second.descriptors.T
-    likeness[first.laplacian[:, None] != second.laplacian] = -1.0
-    best, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
-    two = np.partition(likeness, -2, axis=1)[:, -2:]
-    clear = 1 - two[:, 1] < _RATIO**2 * (1 - two[:, 0])  # of unit vectors, |a - b|² = 2 (1 - a·b)
-    rows = np.flatnonzero((back[best] == np.arange(len(first))) & clear)
+    found = [
+        (rows[i], others[j])
+        for sign, (rows, descriptors) in first.by_sign.items()
+        if sign in second.by_sign
+        for others, other_descriptors in (second.by_sign[sign],)
+        for i, j in (_nearest(descriptors, other_descriptors),)
+    ]
+    a, b = (np.concatenate([pair[k] for pair in found] or [np.zeros(0, np.intp)]) for k in (0, 1))
+    order = np.argsort(a)
+    return a[order], b[order]
+
+
+def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """`match` of descriptors (N, D) and (M, D), unit vectors that may all be compared."""
+    likeness = first @ second.T
+    every, best = np.arange(len(first)), likeness.argmax(axis=1)
+    nearest, most = likeness[every, best], likeness.max(axis=0)
+    likeness[every, best] = -1.0
+    clear = 1 - nearest < _RATIO**2 * (1 - likeness.max(axis=1))  # of unit vectors, |a - b|² = 2 (1 - a·b)
+    rows = np.flatnonzero((nearest == most[best]) & clear)
+    once = np.unique(best[rows], return_index=True)[1]  # of two that are equally near the first
+    rows = rows[np.sort(once)]
     return rows, best[rows]
 
 

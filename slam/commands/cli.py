@@ -63,6 +63,7 @@ class _Stopped(BaseException):
 def main() -> None:
     """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
     for name in _SIGNALS:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
@@ -352,6 +353,16 @@ def list_command() -> None:
     from slam.commands.display import print_listing
 
     print_listing()
+
+
+@app.command("warm-up", short_help="Compile all kernels beforehand.")
+def warm_up_command(quiet: QuietOption = False) -> None:
+    """Compile all kernels, so that no run has to: for images of containers, and after an update."""
+    from slam.commands.warm_up import warm_up
+
+    seconds = warm_up()
+    if not quiet:
+        print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")
 
 
 @app.command("demo", short_help="Try both back ends on a built-in scene.")

@@ -16,8 +16,10 @@ from rich.table import Table
 
 from slam.data import FrameResult
 from slam.evaluation.consistency import verdict
+from slam.runtime.compile_clock import working_time
 
 _console = Console()
+_COMPILED = 0.05  # compile times below this [s] are not worth a row
 
 
 class Progress:
@@ -41,6 +43,7 @@ class Progress:
             TimeRemainingColumn(),
             console=Console(stderr=True),
             disable=quiet,
+            get_time=working_time,
         )
         self.last: FrameResult | None = None
         self._task = self._bar.add_task(title, total=total, rate="", status="")
@@ -117,6 +120,9 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
             rows.append((name, [_figure(s.get("consistency", {}).get(key)) for s in summaries]))
     rows.append(("median per frame [ms]", [_figure(s.get("milliseconds", {}).get("median_total")) for s in summaries]))
     rows.append(("frames per second", [_figure(s.get("frames_per_second")) for s in summaries]))
+    if any(s.get("compile_seconds", 0.0) > _COMPILED for s in summaries):
+        name = "kernels compiled, once, not in the times above [s]"
+        rows.append((name, [_figure(s.get("compile_seconds")) for s in summaries]))
     return rows
 
 

@@ -139,10 +139,13 @@ class Mapper:
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
-        landmarks, erased = _erase(backend, landmarks, bad)
+        erased, landmarks = landmarks.ids[bad], landmarks.select(~bad)
         landmarks, added = self._add(backend, landmarks, step, known)
-        landmarks, surplus = _erase(backend, landmarks, surplus_landmarks(landmarks, self.config))
-        return MapChange(landmarks, added, np.concatenate([erased, surplus]))
+        surplus = surplus_landmarks(landmarks, self.config)
+        erased, landmarks = np.concatenate([erased, landmarks.ids[surplus]]), landmarks.select(~surplus)
+        if len(erased):  # once a frame: it costs a filter a copy of its covariance
+            backend.remove(erased)
+        return MapChange(landmarks, added, erased)
 
     def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned | None) -> MapChange:
         """Let landmarks of a place seen again rejoin the map, where the back end can place them.
@@ -282,12 +285,3 @@ class Mapper:
     def _camera(backend: Backend) -> np.ndarray:
         """The camera's position (3,)."""
         return backend.estimate(landmarks=False).T_world_left[:3, 3]
-
-
-def _erase(backend: Backend, landmarks: LandmarkRows, rows: BoolArray) -> tuple[LandmarkRows, IdArray]:
-    """Remove landmarks from the map and from the back end."""
-    erased = landmarks.ids[rows]
-    if len(erased):
-        backend.remove(erased)
-        landmarks = landmarks.select(~rows)
-    return landmarks, erased

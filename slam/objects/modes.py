@@ -72,7 +72,5 @@ def detector_for(rig: StereoRig, config: ObjectsConfig, models: EstimatorModels)
 
         return Procedure1Detector(rig, config, models)
     from slam.objects.detector import MovingObjectDetector
-    from slam.runtime.compilation import announce_compilation  # brings Numba, as the detector does
 
-    announce_compilation("slam.", "the kernels for cameras and moving objects: some twenty seconds")
     return MovingObjectDetector(rig, config, models)

@@ -29,6 +29,7 @@ from slam.run.repeat import portable, versions
 from slam.run.replay import RecordedFrame, Recording, replay
 from slam.run.schema import STAGES, schema
 from slam.run.settings_reference import in_force
+from slam.runtime.compile_clock import compile_clock, working_time
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
@@ -83,7 +84,8 @@ class RunRecord:
     covariances: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)  # of the clock at the end of each frame [s]
+    times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
+    compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -97,7 +99,7 @@ class RunRecord:
             self.returned = number
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
-        self.times.append(time.perf_counter())
+        self.times.append(working_time())
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)
@@ -389,11 +391,14 @@ def _results(
         found["loops"] = system.atlas.summary()
     if score is not None:
         found["objects"] = score.summary()
-    return {**found, "milliseconds": _timings(record), "frames_per_second": _rate(record)}
+    compiled = compile_clock.seconds() - record.compiled_before
+    return {
+        **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
+    }  # fmt: skip
 
 
 def _rate(record: RunRecord) -> float | None:
-    """Frames per second over all frames but the first, which may wait for compilers; None for a single frame."""
+    """Frames per second over all frames but the first, compiling left out; None for a single frame."""
     seconds = record.times[-1] - record.times[0]
     return (len(record.times) - 1) / seconds if seconds > 0 else None
 

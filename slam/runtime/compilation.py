@@ -1,4 +1,4 @@
-"""How functions are compiled by Numba, and the notice that it is being done: once on a machine, then they are loaded.
+"""How functions are compiled by Numba, once on a machine, then they are loaded; how long it takes is counted.
 
 Kernels are called from Python: they let go of the global lock and are cached on disk, in their package's folder or,
 where that is read-only, in the user's cache. Helpers are called from kernels of the same file alone, because Numba
@@ -10,13 +10,15 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 from numba import njit
 from numba.core import event
 
+from slam.runtime.compile_clock import compile_clock
+
 _LOG = logging.getLogger(__name__)
+_ROOMS = ("slam.", "frontends.", "backends.")
 _NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no exception
 _INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -35,45 +37,32 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 class _Notice(event.Listener):
-    """Says once that a package's kernels are being compiled, and keeps the garbage collector from slowing it."""
+    """Says once that kernels are being compiled, takes the time, and keeps the garbage collector from slowing it."""
 
-    def __init__(self, package: str, what: str) -> None:
-        self._package = package
-        self._what = what
+    def __init__(self) -> None:
         self._said = False
-        self._under_way = 0  # compilations nest
         self._collects = False
 
     def on_start(self, event: Any) -> None:
-        if not self._is_own(event):
+        if not _is_own(event):
             return
+        first = compile_clock.start()
         if not self._said:
             self._said = True
-            _LOG.warning("compiling %s, once; later runs load them from the cache", self._what)
-        if not self._under_way:
+            _LOG.info("compiling kernels, about half a minute, once; `slam warm-up` does that beforehand")
+        if first:
             self._collects = gc.isenabled()
             gc.disable()
-        self._under_way += 1
 
     def on_end(self, event: Any) -> None:
-        if not self._is_own(event):
-            return
-        self._under_way -= 1
-        if not self._under_way and self._collects:
+        if _is_own(event) and compile_clock.stop() and self._collects:
             gc.enable()
 
-    def _is_own(self, event: Any) -> bool:
-        """A compilation of a function of the package?"""
-        function = getattr(event.data["dispatcher"], "py_func", None)
-        return getattr(function, "__module__", "").startswith(self._package)
+
+def _is_own(event: Any) -> bool:
+    """A compilation of a kernel or helper of this project?"""
+    function = getattr(event.data["dispatcher"], "py_func", None)
+    return getattr(function, "__module__", "").startswith(_ROOMS)
 
 
-@cache
-def announce_compilation(package: str, what: str) -> None:
-    """From now on, log a warning when a kernel of a package has to be compiled.
-
-    Args:
-        package: its name.
-        what: the kernels, and how long they take.
-    """
-    event.register("numba:compile", _Notice(package, what))
+event.register("numba:compile", _Notice())

@@ -1,10 +1,11 @@
-"""The stages of a step: which one is in work, and the wall time that each took."""
+"""The stages of a step: which one is in work, and the wall time that each took, compiling left out."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from slam.runtime.compile_clock import working_time
 
 
 class Stages:
@@ -12,7 +13,7 @@ class Stages:
 
     Attributes:
         current: the stage entered last; after an exception, the one that it ended. None before the first.
-        milliseconds: wall time of each stage that was completed [ms].
+        milliseconds: wall time of each stage that was completed [ms], without that in which kernels were compiled.
     """
 
     def __init__(self) -> None:
@@ -23,6 +24,6 @@ class Stages:
     def stage(self, name: str) -> Iterator[None]:
         """Enter a stage; its time is taken where no exception ends it."""
         self.current = name
-        start = time.perf_counter()
+        start = working_time()
         yield
-        self.milliseconds[name] = 1e3 * (time.perf_counter() - start)
+        self.milliseconds[name] = 1e3 * (working_time() - start)

@@ -1,0 +1,191 @@
+"""What a whole frame costs, next to what others take for it on the same machine at the same time.
+
+    python benchmarks/frame.py [--quick] [--orbslam3 PYTHON] [--out DIR]
+
+Three image sizes, both back ends, detector of moving objects on, reading and overlap left out. Frame by frame, in
+turns: each back end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then, with
+``--orbslam3``, ORB-SLAM3 on the same images as fast as it goes; PYTHON is the interpreter of an environment in which
+``orbslam3-python`` is installed (``python -m venv E && E/bin/pip install orbslam3-python``), which is never imported
+here. Median times; compare the ratios, not the milliseconds. Its vocabulary is a small one of rendered images, good
+for tracking.
+
+The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the same size rendered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.orb_odometry import OrbOdometry
+from benchmarks.orb_vocabulary import write_vocabulary
+from experiments.tables import markdown, write_json
+from slam.data import FrameStatus, StereoFrame
+from slam.errors import SlamError
+from slam.evaluation.metrics import absolute_errors, associate
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.sequences import Sequence, open_sequence
+from slam.system import StereoSlam
+
+KITTI = "kitti_odometry/sequences/06"
+BACKENDS = ("ekf", "smoother")
+HEADER = ("images", "what", "wall [ms]", "CPU [ms]", "wall / SIFT", "CPU / SIFT", "wall / ORB-SLAM3", "CPU / ORB-SLAM3",
+          "frames lost", "ATE [m]")  # fmt: skip
+SIFT, ORB, ORBSLAM3 = "cv2.SIFT, 800 features, left", "cv2.ORB and PnP", "ORB-SLAM3"
+_SEEN = (FrameStatus.STARTED, FrameStatus.TRACKED)
+
+
+@dataclass(frozen=True)
+class Size:
+    """A recording, frames whose times do not count, frames that do, and features for ORB."""
+
+    name: str
+    sequence: str
+    skipped: int
+    counted: int
+    features: int
+
+
+@dataclass
+class Times:
+    """Wall and CPU time of each frame [ms], its pose (None where it was lost)."""
+
+    wall: list[float]
+    cpu: list[float]
+    poses: list[Array | None]
+
+    @classmethod
+    def none(cls) -> Times:
+        """Of no frame yet."""
+        return cls([], [], [])
+
+    def take(self, call: Callable[[], Array | None]) -> None:
+        """Time one frame."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        pose = call()
+        self.cpu.append(1e3 * (time.process_time() - cpu))
+        self.wall.append(1e3 * (time.perf_counter() - wall))
+        self.poses.append(pose)
+
+
+def sizes(quick: bool) -> list[Size]:
+    """The three sizes."""
+    data = Path(os.environ.get("SLAM_DATA", ""), KITTI)
+    kitti = str(data) if data.is_dir() else "synthetic:street?width=1226&height=370&frames=51"
+    skipped, counted = (3, 5) if quick else (15, 36)
+    return [
+        Size("KITTI 06, 1226x370" if data.is_dir() else "street, 1226x370", kitti, skipped, counted, 2000),
+        Size("desk, 752x480", "synthetic:desk?width=752&height=480&frames=60", skipped, counted, 1200),
+        Size("aisle, 320x240", "synthetic:aisle?frames=60", skipped, counted, 1000),
+    ]
+
+
+def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
+    """Everybody's times on one recording."""
+    sequence = open_sequence(size.sequence)
+    frames = list(sequence.frames(0, size.skipped + size.counted))
+    systems = {name: StereoSlam(sequence.rig, backend=name, kind=sequence.kind) for name in BACKENDS}
+    sift, odometry = cv2.SIFT_create(800), OrbOdometry(sequence.rig, size.features)
+    times = {name: Times.none() for name in (*BACKENDS, SIFT, ORB)}
+
+    def tracked(system: StereoSlam, frame: StereoFrame) -> Array | None:
+        result = system.process(frame)
+        return result.estimate.T_world_left if result.status in _SEEN else None
+
+    for frame in frames:
+        for name, system in systems.items():
+            times[name].take(lambda s=system, f=frame: tracked(s, f))
+        times[SIFT].take(lambda f=frame: sift.detectAndCompute(f.left, None) and None)
+        times[ORB].take(lambda f=frame: odometry.process(f.left, f.right).copy())
+    if orbslam3 is not None:
+        times[ORBSLAM3] = with_orbslam3(orbslam3, sequence, frames, size.features)
+    return times
+
+
+def with_orbslam3(python: str, sequence: Sequence, frames: list[StereoFrame], features: int) -> Times:
+    """ORB-SLAM3's times, in a process of its own."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        images = {side: np.stack([getattr(f, side) for f in frames]) for side in ("left", "right")}
+        np.savez(folder / "frames.npz", **images, stamps=np.array([f.stamp for f in frames]))
+        scenes = ("synthetic:aisle?frames=60", "synthetic:desk?frames=60", "synthetic:street?frames=60")
+        training = (f.left for scene in scenes for f in list(open_sequence(scene).frames())[::4])
+        write_vocabulary(training, folder / "vocabulary.txt")
+        (folder / "settings.yaml").write_text(settings(sequence, frames, features), encoding="ascii")
+        worker = Path(__file__).with_name("orbslam3_worker.py")
+        done = subprocess.run([python, str(worker), str(folder)], capture_output=True, text=True)
+        if not (folder / "result.json").is_file():
+            raise SlamError(f"ORB-SLAM3 left no result: {(done.stderr or done.stdout).strip()[-300:]}")
+        found = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    poses = [np.array(p) if ok and p is not None else None for p, ok in zip(found["poses"], found["tracked"])]
+    return Times(found["wall"], found["cpu"], poses)
+
+
+def settings(sequence: Sequence, frames: list[StereoFrame], features: int) -> str:
+    """ORB-SLAM3's settings in their old form: real numbers have a point."""
+    camera, rig = sequence.rig.left, sequence.rig
+    rate = (len(frames) - 1) / (frames[-1].stamp - frames[0].stamp)
+    values = {
+        "Camera.type": '"PinHole"', "Camera.fx": camera.fu, "Camera.fy": camera.fv, "Camera.cx": camera.u0,
+        "Camera.cy": camera.v0, "Camera.k1": 0.0, "Camera.k2": 0.0, "Camera.p1": 0.0, "Camera.p2": 0.0,
+        "Camera.bf": camera.fu * rig.baseline, "Camera.width": rig.width, "Camera.height": rig.height,
+        "Camera.fps": float(rate), "Camera.RGB": 1, "ThDepth": 40.0, "ORBextractor.nFeatures": features,
+        "ORBextractor.scaleFactor": 1.2, "ORBextractor.nLevels": 8, "ORBextractor.iniThFAST": 20,
+        "ORBextractor.minThFAST": 7, "Viewer.KeyFrameSize": 0.05, "Viewer.KeyFrameLineWidth": 1.0,
+        "Viewer.GraphLineWidth": 0.9, "Viewer.PointSize": 2.0, "Viewer.CameraSize": 0.08,
+        "Viewer.CameraLineWidth": 3.0, "Viewer.ViewpointX": 0.0, "Viewer.ViewpointY": -0.7,
+        "Viewer.ViewpointZ": -1.8, "Viewer.ViewpointF": 500.0,
+    }  # fmt: skip
+    return "%YAML:1.0\n" + "".join(f"{key}: {float(v)!r}\n" if isinstance(v, float) else f"{key}: {v}\n"
+                                   for key, v in values.items())  # fmt: skip
+
+
+def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
+    """A row for each, medians over the frames that count."""
+    sequence, last = open_sequence(size.sequence), slice(size.skipped, None)
+    stamps = np.array([f.stamp for f in sequence.frames(0, size.skipped + size.counted)])
+    medians = {name: np.array([np.median(t.wall[last]), np.median(t.cpu[last])]) for name, t in times.items()}
+    for name, t in times.items():
+        ratios = [medians[name] / medians[other] if other in medians else None for other in (SIFT, ORBSLAM3)]
+        seen = np.array([p is not None for p in t.poses])
+        ate = "–"
+        if name != SIFT and seen.sum() > 2 and sequence.ground_truth is not None:
+            path = Trajectory(stamps[seen], np.array([p for p in t.poses if p is not None]))
+            own, true = associate(path, sequence.ground_truth, 0.02, interpolated=True)
+            ate = f"{absolute_errors(own, true).translation_statistics.rmse:.3f}"
+        figures = [f"{x:.2f}" for r in ratios for x in ((np.nan, np.nan) if r is None else r)]
+        lost = "–" if name == SIFT else str(int((~seen).sum()))
+        yield [size.name, name, *(f"{x:.0f}" for x in medians[name]), *figures, lost, ate]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a few frames of each: does it work?")
+    parser.add_argument("--orbslam3", metavar="PYTHON", help="interpreter that has orbslam3-python")
+    parser.add_argument("--out", type=Path, default=Path("results/frame"))
+    arguments = parser.parse_args()
+    table: list[list[str]] = []
+    for size in sizes(arguments.quick):
+        table += rows(size, measure(size, arguments.orbslam3))
+    print(markdown(HEADER, table, 2))
+    print(f"\nLoad of the machine, average of the last minute: {os.getloadavg()[0]:.1f}, of {os.cpu_count()} cores.")
+    write_json(arguments.out / "table.json", HEADER, table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

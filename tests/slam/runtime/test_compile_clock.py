@@ -1,0 +1,60 @@
+"""The time in which kernels are compiled is counted once, however compilations nest, and is in no other time."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+
+from slam.runtime.compile_clock import CompileClock, compile_clock, working_time
+from slam.runtime.stages import Stages
+
+
+def test_nested_compilations_count_once():
+    clock = CompileClock()
+    assert clock.start() and not clock.start()
+    time.sleep(0.02)
+    assert not clock.stop()
+    assert 0.02 <= clock.seconds() < 1.0, "one that is under way counts"
+    assert clock.stop()
+    total = clock.seconds()
+    time.sleep(0.01)
+    assert clock.seconds() == total
+
+
+def test_stages_leave_compiling_out():
+    stages = Stages()
+    with stages.stage("update"):
+        compile_clock.start()
+        time.sleep(0.05)
+        compile_clock.stop()
+    assert stages.milliseconds["update"] < 40
+
+
+def test_a_kernel_that_is_compiled_is_noticed_once(caplog, monkeypatch):
+    compilation = pytest.importorskip("slam.runtime.compilation")
+    monkeypatch.setattr(compilation, "_ROOMS", (__name__,))
+    caplog.set_level(logging.INFO, logger=compilation.__name__)
+    before, began = compile_clock.seconds(), working_time()
+    started = time.perf_counter()
+
+    def double(x):
+        return 2 * x
+
+    from numba import njit
+
+    for _ in range(2):
+        assert njit(double)(21) == 42
+    taken = time.perf_counter() - started
+    assert 0 < compile_clock.seconds() - before <= taken
+    assert working_time() - began < taken
+    assert len(caplog.messages) <= 1 and all("warm-up" in message for message in caplog.messages)
+
+
+@pytest.mark.slow
+def test_after_warming_up_nothing_is_left_to_compile():
+    from slam.commands.warm_up import warm_up
+
+    warm_up()
+    assert warm_up() == 0.0
