@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from slam.mapping.map_io import load_map as load_map
     from slam.mapping.map_io import save_map as save_map
     from slam.sequences import open_sequence as open_sequence
+    from slam.sequences.rigs import load_rig as load_rig
     from slam.system import StereoSlam as StereoSlam
 
 __version__ = "0.1.0"
@@ -34,6 +35,7 @@ _PUBLIC = {
     "StereoSlam": "slam.system",
     "Trajectory": "slam.geometry.trajectory",
     "load_map": "slam.mapping.map_io",
+    "load_rig": "slam.sequences.rigs",
     "open_sequence": "slam.sequences",
     "save_map": "slam.mapping.map_io",
 }

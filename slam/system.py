@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from slam import registry
 from slam.calibration import Revision, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
-from slam.errors import ConfigurationError, SlamError
+from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, RevisingBackend
@@ -122,11 +123,38 @@ class StereoSlam:
             self.landmarks = known_map.rows
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
-    def process(self, frame: StereoFrame) -> FrameResult:
-        """One step from a pair of images; see `process_features`."""
+    @overload
+    def process(self, frame: StereoFrame, /) -> FrameResult: ...
+    @overload
+    def process(self, left: np.ndarray, right: np.ndarray | None, stamp: float) -> FrameResult: ...
+    def process(
+        self, left: StereoFrame | np.ndarray, right: np.ndarray | None = None, stamp: float | None = None
+    ) -> FrameResult:
+        """One step from a pair of images, as a `StereoFrame` or as two arrays and their time; see `process_features`.
+
+        Args:
+            left: a frame; or the left image (H, W) or, in OpenCV's order of colours, (H, W, 3|4), uint8 or uint16.
+            right: the right image, None where there is none; not with a frame.
+            stamp: time [s]; not with a frame.
+
+        Raises:
+            MeasurementError: images without a stamp, or a frame with one; or as `process_features`.
+            SequenceError: the images are of another type or size than the rig's.
+        """
+        frame = self._frame(left, right, stamp)
         _, features, milliseconds = self._extract(frame)
         result = self.process_features(features)
         return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+
+    def _frame(self, left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None) -> StereoFrame:
+        """What `process` was given as a frame."""
+        if isinstance(left, StereoFrame):
+            if right is not None or stamp is not None:
+                raise MeasurementError("process: a frame has its right image and its stamp already")
+            return left
+        if stamp is None:
+            raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
+        return StereoFrame(self._last.index + 1, stamp, left, right)
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
