@@ -160,7 +160,7 @@ class StereoSlam:
         """Every frame with the result of its step.
 
         Args:
-            frames: a sequence, or frames in order of time.
+            frames: a sequence, or frames in order of time; `slam.LiveFrames` of them for those that are not too late.
             overlap: read the next frame and extract its features in a second thread meanwhile. The results are the same
                 to the byte; only the times differ.
 
@@ -168,7 +168,8 @@ class StereoSlam:
             As `process`, where the frame comes whose step fails.
         """
         extracted = map(self._extract, frames)
-        for frame, features, milliseconds in ahead(extracted) if overlap else extracted:
+        depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
+        for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
             result = self.process_features(features)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
 

@@ -1,4 +1,4 @@
-"""Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, and the synthetic worlds.
+"""Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, live cameras, and the synthetic worlds.
 
 `open_sequence` finds the format out by itself. Layouts, options and faults are described in
 ``docs/sequences.md``. May import `slam.worlds`, `slam.geometry` and the data.
@@ -16,11 +16,12 @@ from urllib.parse import parse_qsl
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, reason
 from slam.naming import suggestion, unknown
-from slam.sequences.base import RecordedSequence, Sequence
+from slam.sequences.base import RecordedSequence, Sequence, is_live
 
-__all__ = ["RecordedSequence", "Sequence", "formats", "open_sequence"]
+__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence"]
 
 _SYNTHETIC = "synthetic:"
+_CAMERA = "camera:"
 _KINDS = ("driving", "handheld")
 
 #: Formats on disk, in the order in which they are tried: module and description.
@@ -38,14 +39,16 @@ _COMMON_OPTIONS = frozenset({"kind"})
 def formats() -> dict[str, str]:
     """Names of the formats with a line on each."""
     known = {name: description for name, (_, description) in _FORMATS.items()}
-    return {**known, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
+    camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
+    return {**known, "camera": camera, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
 
 
 def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
     """Open a stereo sequence; nothing but the first pair of images is decoded yet.
 
     Args:
-        path: a folder, with options behind it as ``FOLDER?key=value&key=value``, or ``synthetic:NAME?key=value``.
+        path: a folder, with options behind it as ``FOLDER?key=value&key=value``; ``synthetic:NAME?key=value``; or
+            ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
             ``kind=driving`` or ``kind=handheld`` goes with every format on disk.
         format: one of `formats`; found out from the folder where it is None.
 
@@ -62,6 +65,10 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
         raise ConfigurationError(f"{text}: format {format!r} does not go with a synthetic world")
     if format == "synthetic" or text.startswith(_SYNTHETIC):
         return _open_world(text)
+    if text.startswith(_CAMERA) and format not in (None, "camera"):
+        raise ConfigurationError(f"{text}: format {format!r} does not go with a camera")
+    if format == "camera" or text.startswith(_CAMERA):
+        return _open_camera(text.removeprefix(_CAMERA))
     try:
         return _open_folder(text, format)
     except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
@@ -86,11 +93,29 @@ def _open_world(text: str) -> Sequence:
     return open_world(text)
 
 
+def _open_camera(text: str) -> Sequence:
+    """A camera by its text, ``camera:`` left out; a question mark may be part of an address in a network."""
+    from slam.sequences import camera
+
+    name, mark, query = text.rpartition("?")
+    known = camera.OPTIONS | _COMMON_OPTIONS
+    options = _options(query) if mark else {}
+    if not mark or ("://" in name and not set(options) <= known):
+        name, options = text, {}
+    _check_options("camera", options, camera.OPTIONS)
+    return camera.open_camera(name, options)
+
+
 def _split(text: str) -> tuple[Path, dict[str, str]]:
     """The path, ``~`` expanded, and the options behind the question mark."""
     name, mark, query = text.rpartition("?")
     if not mark or _exists(text):
         return expanded(text).absolute(), {}
+    return expanded(name).absolute(), _options(query)
+
+
+def _options(query: str) -> dict[str, str]:
+    """The options ``key=value&key=value`` behind a question mark."""
     try:
         options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
     except ValueError:
@@ -98,7 +123,7 @@ def _split(text: str) -> tuple[Path, dict[str, str]]:
     for key, value in options.items():
         if "\0" in value:
             raise ConfigurationError(f"option {key!r} holds a NUL")
-    return expanded(name).absolute(), options
+    return options
 
 
 def _exists(text: str) -> bool:
