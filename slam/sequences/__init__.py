@@ -1,4 +1,4 @@
-"""Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, live cameras, and the synthetic worlds.
+"""Stereo sequences: EuRoC, KITTI, ROS recordings, two folders or videos, live cameras, and the synthetic worlds.
 
 `open_sequence` finds the format out by itself. Layouts, options and faults are described in
 ``docs/sequences.md``. May import `slam.worlds`, `slam.geometry` and the data.
@@ -29,6 +29,7 @@ _FORMATS = {
     "euroc": ("slam.sequences.euroc", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
     "kitti-raw": ("slam.sequences.kitti_raw", "KITTI raw drives: image_00/data, image_01/data"),
     "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
+    "ros": ("slam.sequences.ros", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
     "folders": ("slam.sequences.folders", "two folders or videos (left, right) with an OpenCV or Kalibr calibration"),
 }
 _MOST_OPTIONS = 100
@@ -47,9 +48,9 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
     """Open a stereo sequence; nothing but the first pair of images is decoded yet.
 
     Args:
-        path: a folder, with options behind it as ``FOLDER?key=value&key=value``; ``synthetic:NAME?key=value``; or
-            ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
-            ``kind=driving`` or ``kind=handheld`` goes with every format on disk.
+        path: a folder or a ROS recording, with options behind it as ``PATH?key=value&key=value``;
+            ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`. ``kind=driving``
+            or ``kind=handheld`` goes with every format but the synthetic worlds.
         format: one of `formats`; found out from the folder where it is None.
 
     Raises:
@@ -78,7 +79,7 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 def _open_folder(text: str, format: str | None) -> RecordedSequence:
     """A sequence on disk."""
     folder, options = _split(text)
-    _require_folder(folder, text)
+    _require_recording(folder, text)
     name = _detect(folder, options) if format is None else _known(format)
     module = import_module(_FORMATS[name][0])
     _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
@@ -134,8 +135,10 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _require_folder(folder: Path, text: str) -> None:
-    """Refuse what is no folder with something in it; `text` is what was asked for."""
+def _require_recording(folder: Path, text: str) -> None:
+    """Refuse what is neither a folder with something in it nor a ROS recording; `text` is what was asked for."""
+    if _is_ros(folder):
+        return
     if not folder.exists():
         raise SequenceError(f"{folder}: there is no such folder{_world_meant(text)}")
     if not folder.is_dir():
@@ -154,6 +157,8 @@ def _world_meant(text: str) -> str:
 
 def _detect(folder: Path, options: dict[str, str]) -> str:
     """The first format that the folder looks like; told where left and right are, it needs not look."""
+    if _is_ros(folder):
+        return "ros"
     if "left" in options or "right" in options:
         return "folders"
     name = _format_of(folder)
@@ -163,6 +168,11 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
         hint = f"; below it are {names}" if below else ""
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     return name
+
+
+def _is_ros(path: Path) -> bool:
+    """Whether a path is a ROS recording, which may be a file."""
+    return bool(import_module(_FORMATS["ros"][0]).matches(path))
 
 
 def _sequences_below(folder: Path) -> list[Path]:
