@@ -49,8 +49,8 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 
     Args:
         path: a folder or a ROS recording, with options behind it as ``PATH?key=value&key=value``;
-            ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`. ``kind=driving``
-            or ``kind=handheld`` goes with every format but the synthetic worlds.
+            ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
+            ``kind=driving`` or ``kind=handheld`` goes with all of them but the synthetic worlds.
         format: one of `formats`; found out from the folder where it is None.
 
     Raises:
