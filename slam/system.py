@@ -25,11 +25,15 @@ from slam.results import frame_result
 from slam.runtime.ahead import ahead
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
+from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
 
 #: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
 _REVISION = 0.5
+
+#: How far from its row a front end looks for a feature's partner, where it does not say [px].
+_ROWS = 1.5
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,8 @@ class StereoSlam:
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
+        rows = getattr(getattr(self.frontend, "config", None), "epipolar", _ROWS)
+        self._input_warnings = InputWarnings(rig, c.models, rows)
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._given = self.calibration.applied  # the correction of all that the back end was given
         self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
@@ -180,6 +186,7 @@ class StereoSlam:
         stages = Stages()
         with stages.stage("extract"):
             features = self.frontend.extract(frame)
+        self._input_warnings.look(frame, features)
         return frame, features, stages.milliseconds
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
@@ -269,6 +276,11 @@ class StereoSlam:
         from slam import __version__
 
         return SavedMap.of(self.landmarks, estimate, self.frontend_name, self.world_frame, __version__)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What looked wrong with the images and their times, a line each (see `slam.tracking.input_warnings`)."""
+        return list(self._input_warnings.lines)
 
     @property
     def restarted(self) -> list[int]:

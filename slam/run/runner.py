@@ -348,7 +348,7 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "warnings": list(sequence.warnings),
+        "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
     }
     if live is not None:
         summary["live"] = _live(live, record)

@@ -23,7 +23,7 @@ T0 = 1_520_530_308_199_447_626
 
 
 def fisheye_view(camera: PinholeCamera) -> np.ndarray:
-    """Where each pixel (SIZE, SIZE, 2) of the fisheye lies in a pinhole image; outside of it where that sees nothing."""
+    """Where each pixel (SIZE, SIZE, 2) of the fisheye lies in a pinhole image; outside where that sees nothing."""
     v, u = np.mgrid[:SIZE, :SIZE]
     xy = CAMERA.normalise(np.stack([u.ravel(), v.ravel()], axis=1).astype(float))
     uv = camera.project(np.concatenate([xy, np.ones((len(xy), 1))], axis=1))
