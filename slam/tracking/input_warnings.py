@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from numbers import Real
 
 import numpy as np
 
@@ -45,9 +46,11 @@ class InputWarnings:
         self._pair_is_known = self._texture_is_known = False
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
-        """Look at a frame and what the front end found in it."""
-        if len(self._stamps) <= _INTERVALS:
-            self._stamps.append(frame.stamp)
+        """Look at a frame and what the front end found in it; what is no frame is for others to refuse."""
+        if not isinstance(frame, StereoFrame) or not isinstance(features, StereoFeatures):
+            return
+        if len(self._stamps) <= _INTERVALS and isinstance(frame.stamp, Real):
+            self._stamps.append(float(frame.stamp))
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_is_known:

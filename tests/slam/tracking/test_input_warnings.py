@@ -24,7 +24,12 @@ RIG = SEQUENCE.rig
 def lines(frames, features=200, rig=RIG, kind="handheld"):
     """What is said of frames in which the front end found so many features."""
     watch = InputWarnings(rig, models_for(kind), 1.5)
-    found = [StereoFeatures.empty(0.0)] * features
+    image = np.zeros((features, 2))
+    found = replace(
+        StereoFeatures.empty(0.0),
+        **{name: image for name in ("uv_left", "uv_right", "descriptors")},
+        **{name: image[:, 0] for name in ("scale", "angle", "response", "laplacian")},
+    )
     for frame in frames:
         watch.look(frame, found)
     return watch.lines
