@@ -181,7 +181,7 @@ def _sequences_below(folder: Path) -> list[Path]:
     with suppress(OSError):
         for path in islice(chain(folder.glob("*"), folder.glob("*/*")), _LOOKED_AT):
             with suppress(OSError):
-                if path.is_dir() and _format_of(path):
+                if (path.is_dir() or _is_ros(path)) and _format_of(path):
                     found.append(path)
     return sorted(found)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError, one_line
+from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
@@ -24,7 +24,7 @@ from slam.sequences.calibration import naming
 from slam.sequences.camera_info import rig_from_camera_infos
 from slam.sequences.faults import FaultLog
 from slam.sequences.images import Size
-from slam.sequences.ros_images import grey_image
+from slam.sequences.ros_images import grey_image, naming_recording
 from slam.sequences.ros_topics import Topics, choose_topics
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
 
@@ -149,7 +149,7 @@ class RosPairs:
         for number, (_, kind, raw) in enumerate(bag.messages([messages.topic], since), start=first):
             if number == row:
                 try:
-                    yield grey_image(bag.message(raw, kind), kind, f"{messages.topic}, message {row}", self.size)
+                    yield bag.image(raw, kind, f"{messages.topic}, message {row}", self.size)
                 except SequenceError as error:
                     yield error
                 row = next(wanted, -1)
@@ -169,7 +169,7 @@ class Bag:
         connections = [c for c in self._reader.connections if c.topic in topics]
         messages = iter(self._reader.messages(connections, start=since)) if connections else iter(())
         while True:
-            with _naming(self.path):
+            with naming_recording(self.path):
                 found = next(messages, None)
             if found is None:
                 return
@@ -177,8 +177,13 @@ class Bag:
 
     def message(self, raw: bytes, kind: str) -> Any:
         """A message of its bytes."""
-        with _naming(self.path):
+        with naming_recording(self.path):
             return self._reader.deserialize(raw, kind)
+
+    def image(self, raw: bytes, kind: str, what: str, size: Size | None = None) -> np.ndarray:
+        """The image (H, W) of a message's bytes, see `grey_image`."""
+        with naming_recording(self.path):
+            return grey_image(self._reader.deserialize(raw, kind), kind, what, size)
 
     def first(self, topic: str) -> Any:
         """The first message of a topic; None where there is none."""
@@ -202,29 +207,20 @@ def open_bag(path: Path) -> Iterator[Bag]:
             f"{path}: ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
         ) from None
     with ExitStack() as stack:
-        with _naming(path):
+        with naming_recording(path):
             reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             stack.enter_context(reader)
             bag = Bag(path, reader)
         yield bag
 
 
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Whatever the libraries below say of a damaged recording as one error with its name."""
-    try:
-        yield
-    except Exception as error:  # they raise their own kinds, and those of every decoder that they use
-        text = one_line(str(error), 200) or type(error).__name__
-        raise SequenceError(f"{path}: cannot be read as a ROS recording: {text}") from error
-
-
 def _listing(bag: Bag, topic: str, faults: FaultLog) -> Messages:
     """Stamps of all messages of a topic; where their headers hold none, when they were recorded."""
     stamps, recorded = [], []
     for time, kind, raw in bag.messages([topic]):
-        stamp = bag.message(raw, kind).header.stamp
-        stamps.append(int(stamp.sec) * 10**9 + int(stamp.nanosec))
+        message = bag.message(raw, kind)
+        with naming_recording(bag.path):
+            stamps.append(int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec))
         recorded.append(time)
     if not stamps:
         raise SequenceError(f"{bag.path}: topic {topic} has no messages")
@@ -239,7 +235,7 @@ def _first_size(bag: Bag, topic: str) -> Size:
     reason = "no messages"
     for _, kind, raw in bag.messages([topic]):
         try:
-            image = grey_image(bag.message(raw, kind), kind, topic)
+            image = bag.image(raw, kind, topic)
         except SequenceError as error:
             reason = str(error)
             continue

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from slam.errors import SequenceError
+from slam.errors import SequenceError, SlamError, one_line
 from slam.sequences.images import MOST_PIXELS, Size, decode_image, size_text
 
 #: Types of messages that hold an image.
@@ -32,6 +35,22 @@ for _bits in (8, 16):
         _ENCODINGS[f"{_order}{_bits}"] = (_bits, _channels, f"COLOR_{_order.upper()}2GRAY")
     for _order, _name in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
         _ENCODINGS[f"bayer_{_order}{_bits}"] = (_bits, 1, f"COLOR_Bayer{_name}2GRAY")
+
+
+@contextmanager
+def naming_recording(path: Path) -> Iterator[None]:
+    """Whatever goes wrong with a damaged recording as one error with its name.
+
+    Raises:
+        SequenceError: something did.
+    """
+    try:
+        yield
+    except SlamError:
+        raise
+    except Exception as error:  # of rosbags, of the decoders that it uses, or of messages that are not what they say
+        text = one_line(str(error), 200) or type(error).__name__
+        raise SequenceError(f"{path}: cannot be read as a ROS recording: {text}") from error
 
 
 def grey_image(message: Any, kind: str, what: str, size: Size | None = None) -> np.ndarray:

@@ -11,7 +11,7 @@ from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.naming import suggestion
 from slam.sequences.calibration import naming
 from slam.sequences.camera_info import CameraInfo
-from slam.sequences.ros_images import COMPRESSED, DEPTH, RAW
+from slam.sequences.ros_images import COMPRESSED, DEPTH, RAW, naming_recording
 
 _INFO = "sensor_msgs/msg/CameraInfo"
 _NAMES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
@@ -153,7 +153,7 @@ def _info(recording: Recording, topic: str) -> CameraInfo:
     message = recording.first(topic)
     if message is None:
         raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
-    with naming(Path(topic)):
+    with naming_recording(recording.path), naming(Path(topic)):
         return CameraInfo.of(message)
 
 
@@ -166,7 +166,8 @@ def _is_depth(recording: Recording, topic: str) -> bool:
     message = recording.first(topic)
     if message is None or recording.kinds[topic] == COMPRESSED:
         return message is None or "compressedDepth" in topic
-    return message.encoding in DEPTH
+    with naming_recording(recording.path):
+        return message.encoding in DEPTH
 
 
 def _preference(recording: Recording) -> Any:
