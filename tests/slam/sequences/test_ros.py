@@ -334,6 +334,12 @@ def test_cameras_that_are_not_calibrated(change: dict, words: str, tmp_path: Pat
 # ------------------------------------------------------------------------------------------------ faults
 
 
+def test_a_folder_above_names_the_recordings_in_it(bag: Path) -> None:
+    (bag.parent / "notes.txt").write_text("x")
+    with pytest.raises(SequenceError, match=r"below it are walk\.bag"):
+        slam.open_sequence(bag.parent)
+
+
 def test_without_the_package_the_line_says_how_to_install_it(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(SequenceError, match=r"pip install 'surf-stereo-slam\[ros\]'"):
