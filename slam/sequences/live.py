@@ -49,7 +49,8 @@ class LiveFrames:
         self.clock_waited = 0.0
         self._frames = frames
         self._paced = not is_live(frames) if paced is None else paced
-        self._until = until or threading.Event()
+        self._until = until or threading.Event()  # only read: it is the caller's
+        self._closed = False
         self._changed = threading.Condition()
         self._newest: StereoFrame | None = None
         self._since = 0.0  # when the newest came, by the clock of `time.monotonic`
@@ -66,7 +67,7 @@ class LiveFrames:
             if self._error is not None:
                 raise self._error
         finally:
-            self._until.set()
+            self._closed = True
             thread.join(_PARTING)
 
     @property
@@ -100,12 +101,10 @@ class LiveFrames:
                 if self._paced:
                     now = time.monotonic()
                     origin = now - frame.stamp if origin is None else origin
-                    late = now - (origin + frame.stamp)
-                    if late < 0 and self._until.wait(-late):
-                        break
-                    if late > 0:
-                        origin, self.clock_waited = origin + late, self.clock_waited + late
-                if self._until.is_set():
+                    late = max(0.0, now - (origin + frame.stamp))
+                    origin, self.clock_waited = origin + late, self.clock_waited + late
+                    self._wait_until(origin + frame.stamp)
+                if self._closed or self._until.is_set():
                     break
                 self._put(frame)
         except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
@@ -117,6 +116,11 @@ class LiveFrames:
             with self._changed:
                 self._over = True
                 self._changed.notify_all()
+
+    def _wait_until(self, due: float) -> None:
+        """Wait for a time of the clock, or for the end."""
+        while (rest := due - time.monotonic()) > 0 and not (self._closed or self._until.is_set()):
+            time.sleep(min(rest, _LOOK))
 
     def _put(self, frame: StereoFrame) -> None:
         with self._changed:
