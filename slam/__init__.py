@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from slam.mapping.map_io import load_map as load_map
     from slam.mapping.map_io import save_map as save_map
     from slam.sequences import open_sequence as open_sequence
+    from slam.sequences.live import LiveFrames as LiveFrames
+    from slam.sequences.rigs import load_rig as load_rig
     from slam.system import StereoSlam as StereoSlam
 
 __version__ = "0.1.0"
@@ -24,6 +26,7 @@ _PUBLIC = {
     "EstimatorModels": "slam.models",
     "Estimate": "slam.data",
     "FrameResult": "slam.data",
+    "LiveFrames": "slam.sequences.live",
     "Observations": "slam.data",
     "PinholeCamera": "slam.geometry.camera",
     "SavedMap": "slam.mapping.map_io",
@@ -34,6 +37,7 @@ _PUBLIC = {
     "StereoSlam": "slam.system",
     "Trajectory": "slam.geometry.trajectory",
     "load_map": "slam.mapping.map_io",
+    "load_rig": "slam.sequences.rigs",
     "open_sequence": "slam.sequences",
     "save_map": "slam.mapping.map_io",
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from slam import registry
 from slam.calibration import Revision, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
-from slam.errors import ConfigurationError, SlamError
+from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, RevisingBackend
@@ -27,11 +28,15 @@ from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
+from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
 
 #: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
 _REVISION = 0.5
+
+#: How far from its row a front end looks for a feature's partner, where it does not say [px].
+_ROWS = 1.5
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,8 @@ class StereoSlam:
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
+        rows = getattr(getattr(self.frontend, "config", None), "epipolar", _ROWS)
+        self._input_warnings = InputWarnings(rig, c.models, rows)
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._given = self.calibration.applied  # the correction of all that the back end was given
         self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
@@ -128,17 +135,44 @@ class StereoSlam:
             self.atlas = Atlas.of_earlier_run(known_map.keyframes)
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
-    def process(self, frame: StereoFrame) -> FrameResult:
-        """One step from a pair of images; see `process_features`."""
+    @overload
+    def process(self, frame: StereoFrame, /) -> FrameResult: ...
+    @overload
+    def process(self, left: np.ndarray, right: np.ndarray | None, stamp: float) -> FrameResult: ...
+    def process(
+        self, left: StereoFrame | np.ndarray, right: np.ndarray | None = None, stamp: float | None = None
+    ) -> FrameResult:
+        """One step from a pair of images, as a `StereoFrame` or as two arrays and their time; see `process_features`.
+
+        Args:
+            left: a frame; or the left image (H, W) or, in OpenCV's order of colours, (H, W, 3|4), uint8 or uint16.
+            right: the right image, None where there is none; not with a frame.
+            stamp: time [s]; not with a frame.
+
+        Raises:
+            MeasurementError: images without a stamp, or a frame with one; or as `process_features`.
+            SequenceError: the images are of another type or size than the rig's.
+        """
+        frame = self._frame(left, right, stamp)
         _, features, milliseconds = self._extract(frame)
         result = self.process_features(features)
         return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+
+    def _frame(self, left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None) -> StereoFrame:
+        """What `process` was given as a frame."""
+        if isinstance(left, StereoFrame):
+            if right is not None or stamp is not None:
+                raise MeasurementError("process: a frame has its right image and its stamp already")
+            return left
+        if stamp is None:
+            raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
+        return StereoFrame(self._last.index + 1, stamp, left, right)
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
 
         Args:
-            frames: a sequence, or frames in order of time.
+            frames: a sequence, or frames in order of time; `slam.LiveFrames` of them for those that are not too late.
             overlap: read the next frame and extract its features in a second thread meanwhile. The results are the same
                 to the byte; only the times differ.
 
@@ -146,7 +180,8 @@ class StereoSlam:
             As `process`, where the frame comes whose step fails.
         """
         extracted = map(self._extract, frames)
-        for frame, features, milliseconds in ahead(extracted) if overlap else extracted:
+        depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
+        for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
             result = self.process_features(features)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
@@ -158,6 +193,7 @@ class StereoSlam:
         stages = Stages()
         with stages.stage("extract"):
             features = self.frontend.extract(frame)
+        self._input_warnings.look(frame, features)
         return frame, features, stages.milliseconds
 
     @one_blas_thread
@@ -261,6 +297,11 @@ class StereoSlam:
         rows = self.landmarks.moved(self.atlas.T_map_odom)
         keyframes = self.atlas.in_map_as_keyframes()
         return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, keyframes)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What looked wrong with the images and their times, a line each (see `slam.tracking.input_warnings`)."""
+        return list(self._input_warnings.lines)
 
     @property
     def restarted(self) -> list[int]:

@@ -69,6 +69,40 @@ def test_the_back_end_in_50_lines_keeps_the_map():
         backend.predict(0.0)
 
 
+def test_two_streams_of_arrays_are_followed(capsys):
+    spec = importlib.util.spec_from_file_location("two_streams", DOCS / "examples" / "two_streams.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    sequence = slam.open_sequence("synthetic:desk?frames=4&width=160&height=120")
+    lefts, rights, stamps = zip(*((frame.left, frame.right, frame.stamp) for frame in sequence))
+    path = module.follow(lefts, rights, stamps, sequence.rig.left.K, sequence.rig.baseline)
+    assert absolute_errors(path, sequence.ground_truth).translation_statistics.rmse < 0.01
+    assert capsys.readouterr().out.count("tracked") == 3
+
+
+def test_the_webcam_in_15_lines_writes_a_path(tmp_path, monkeypatch, capsys):
+    import cv2
+
+    text = (DOCS / "examples" / "webcam.py").read_text()
+    assert len([line for line in text.splitlines() if line.strip()]) <= 15
+    sequence = slam.open_sequence("synthetic:desk?frames=8&width=160&height=120")
+    K, T = sequence.rig.left.K, sequence.rig.R @ sequence.rig.b
+    file = cv2.FileStorage(str(tmp_path / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"K1": K, "K2": K, "R": np.eye(3), "T": T}.items():
+        file.write(name, value)
+    file.release()
+    video = cv2.VideoWriter(str(tmp_path / "both.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5.0, (320, 120))
+    for frame in sequence:
+        video.write(cv2.cvtColor(np.hstack([frame.left, frame.right]), cv2.COLOR_GRAY2BGR))
+    video.release()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["webcam.py", "camera:both.avi"])
+    exec(compile(text, "webcam.py", "exec"), {})
+    poses = len((tmp_path / "path.txt").read_text().splitlines())
+    assert 1 <= poses <= 7
+    assert capsys.readouterr().out.count(" m, ") == poses
+
+
 def test_a_recording_as_the_guide_has_it_opens(tmp_path):
     import cv2
 

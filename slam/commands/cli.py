@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -104,30 +105,47 @@ def _print_version(wanted: bool) -> None:
 
 _pending: list[int] = []  # a signal that waits for the end of a frame
 _in_frames = False
+_until: threading.Event | None = None  # ends the frames of a live run
 
 
 def _stop(number: int, frame: object) -> None:
-    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once."""
-    if not _in_frames or _pending:
+    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once.
+
+    Frames of a live run are not waited for any more; that is how one from a camera ends.
+    """
+    if not _in_frames or _pending or (_until is not None and _until.is_set()):
         raise _Stopped(number)
+    if _until is not None:
+        _until.set()
+        if number == signal.SIGINT:
+            return
     _pending.append(number)
 
 
 @contextmanager
-def _whole_frames(after_frame: Callable[[FrameResult], None]) -> Iterator[Callable[[FrameResult], None]]:
-    """A callback for the end of every frame, at which a signal that came meanwhile takes effect."""
-    global _in_frames
+def _whole_frames(
+    after_frame: Callable[[FrameResult], None], until: threading.Event | None = None
+) -> Iterator[Callable[[FrameResult], None]]:
+    """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
+
+    Args:
+        after_frame: is called, too.
+        until: set by a signal; its run then has no more frames, and Ctrl-C has no further effect.
+    """
+    global _in_frames, _until
 
     def end_of_frame(result: FrameResult) -> None:
         after_frame(result)
         if _pending:
             raise _Stopped(_pending.pop())
 
-    _in_frames = True
+    _in_frames, _until = True, until
     try:
         yield end_of_frame
+        if _pending:  # no frame came after it
+            raise _Stopped(_pending.pop())
     finally:
-        _in_frames = False
+        _in_frames, _until = False, None
 
 
 @app.callback()
@@ -167,6 +185,9 @@ def run_command(
     overlap: Annotated[
         bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
     ] = True,
+    live: Annotated[
+        bool, typer.Option("--live", help="Frames at their own rate; those that come too late are dropped.")
+    ] = False,
     picture: PictureOption = True,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -176,13 +197,14 @@ def run_command(
     from slam.commands.folders import run_folder
     from slam.commands.run import Wanted, prepare
     from slam.run.runner import run
+    from slam.sequences import is_live
 
     wanted = Wanted(sequence, config, backend, frontend, settings or (), frames, kind, format, known_map, mono)
     opened, options, origin = prepare(wanted)
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
-        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap)
+        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
         watches = []
         if viewer is not None:
@@ -193,8 +215,9 @@ def run_command(
             from slam.run.drawing import FramePictures
 
             watches.append(stack.enter_context(FramePictures(draw)).show)
-        end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame))
-        summary = run(opened, options, end_of_frame, watches=watches)
+        until = threading.Event() if live or is_live(opened) else None
+        end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame, until))
+        summary = run(opened, options, end_of_frame, watches=watches, until=until)
     _leave_picture(folder, picture)
     if not quiet:
         print_summary([summary], folder)
@@ -390,5 +413,10 @@ def _leave_picture(folder: Path, wanted: bool) -> None:
         leave_picture(folder)
 
 
-def _frame_count(sequence: Sequence, start: int, stop: int | None) -> int:
+def _frame_count(sequence: Sequence, start: int, stop: int | None) -> int | None:
+    """Number of frames in a range; None for those of a camera without an end."""
+    from slam.sequences import is_live
+
+    if is_live(sequence):
+        return None if stop is None else stop - start
     return len(range(start, len(sequence) if stop is None else min(stop, len(sequence))))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def sequences(incomplete: str) -> list[str]:
-    """Built-in worlds, and folders."""
+    """A camera, built-in worlds, and folders."""
     from slam import worlds
 
-    names = [f"synthetic:{name}" for name in worlds.names()]
+    names = ["camera:0", *(f"synthetic:{name}" for name in worlds.names())]
     return [*_starting(names, incomplete), *_folders(incomplete)]
 
 

@@ -26,7 +26,7 @@ class Progress:
     """A progress bar over frames; a context manager.
 
     Args:
-        total: number of frames.
+        total: number of frames; None where there is no end.
         title: shown before the bar.
         quiet: show nothing.
 
@@ -34,7 +34,7 @@ class Progress:
         last: the latest result; None before the first.
     """
 
-    def __init__(self, total: int, title: str, quiet: bool = False) -> None:
+    def __init__(self, total: int | None, title: str, quiet: bool = False) -> None:
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=10),  # all fits into 80 columns
@@ -67,7 +67,7 @@ class Progress:
 
 
 @contextmanager
-def counting(total: int, title: str, quiet: bool = False) -> Iterator[Callable[[int], None]]:
+def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Callable[[int], None]]:
     """A progress bar that is told how many frames are done."""
     bar = RichProgress(
         TextColumn("{task.description}"),
@@ -118,6 +118,13 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
         if any(key in s.get("consistency", {}) for s in summaries):
             name = f"{key} (6 is right)" if key.startswith("NEES") else key
             rows.append((name, [_figure(s.get("consistency", {}).get(key)) for s in summaries]))
+    if any("live" in s for s in summaries):
+        live = [s.get("live", {}) for s in summaries]
+        rows.append(("frames dropped", [_figure(one.get("frames dropped")) for one in live]))
+        behind = [one.get("milliseconds behind", {}) for one in live]
+        rows.append(
+            ("behind, median and most [ms]", [f"{_figure(b.get('median'))}, {_figure(b.get('max'))}" for b in behind])
+        )
     rows.append(("median per frame [ms]", [_figure(s.get("milliseconds", {}).get("median_total")) for s in summaries]))
     rows.append(("frames per second", [_figure(s.get("frames_per_second")) for s in summaries]))
     if any(s.get("compile_seconds", 0.0) > _COMPILED for s in summaries):

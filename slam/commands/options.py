@@ -46,7 +46,7 @@ OptionalSequence = Annotated[
     str | None,
     typer.Argument(
         metavar="SEQUENCE",
-        help="A folder, or synthetic:NAME?key=value; with --config the earlier one.",
+        help="A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
         show_default=False,
         autocompletion=completion.sequences,
     ),

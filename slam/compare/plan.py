@@ -75,6 +75,8 @@ class Plan:
         if self.trials > _MOST_TRIALS:
             raise ConfigurationError(f"comparison: at most {_MOST_TRIALS} trials, got {self.trials}")
         for sequence in self.sequences:
+            if sequence.startswith("camera:"):
+                raise ConfigurationError(f"{sequence}: a camera gives each back end other frames; compare recordings")
             if is_world(sequence) and re.search(r"[?&]seed=", sequence):
                 raise ConfigurationError(f"{sequence}: leave the seed out, the trials have seeds 0 to N − 1")
             if not is_world(sequence) and any(v.frontend == SIMULATED for v in self.variants):

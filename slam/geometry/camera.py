@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
@@ -67,6 +67,38 @@ class PinholeCamera:
                 f"distortion model {self.model!r} takes {DISTORTION_MODELS[self.model]} coefficients, "
                 f"got {len(self.distortion)}"
             )
+
+    @classmethod
+    def from_matrix(
+        cls, K: ArrayLike, D: ArrayLike | None, size: tuple[int, int], fisheye: bool = False
+    ) -> PinholeCamera:
+        """A camera by OpenCV's camera matrix and distortion coefficients.
+
+        Args:
+            K: camera matrix (3, 3) [px].
+            D: coefficients in OpenCV's order, as many as there are; None for none.
+            size: width and height [px].
+            fisheye: they are those of ``cv2.fisheye``.
+
+        Raises:
+            CalibrationError: K is no camera matrix, or there are coefficients that are not supported.
+        """
+        matrix, coefficients = _floats("camera matrix", K), _floats("distortion", D if D is not None else ()).ravel()
+        if matrix.shape != (3, 3):
+            raise CalibrationError(f"the camera matrix must be (3, 3), got {matrix.shape}")
+        values = coefficients.tolist()
+        while len(values) > 8 and values[-1] == 0:
+            values.pop()
+        if len(values) > 8:
+            raise CalibrationError(
+                f"{len(values)} distortion coefficients: thin prisms and tilted sensors are not supported"
+            )
+        values += [0.0] * (next(n for n in (0, 4, 5, 8) if n >= len(values)) - len(values))
+        model = "equidistant" if fisheye else "radtan" if any(values) else "none"
+        if fisheye and not values:
+            values = [0.0] * 4
+        distortion = () if model == "none" else tuple(values)
+        return cls(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, model, distortion)
 
     @property
     def K(self) -> Array:
@@ -149,6 +181,18 @@ class PinholeCamera:
         if self.model == "equidistant":
             return _undistort_equidistant(target, np.asarray(self.distortion))
         return _undistort_radtan(target, np.asarray(self.distortion), self._radius_limit)
+
+
+def _floats(what: str, values: ArrayLike) -> Array:
+    """An array of numbers.
+
+    Raises:
+        CalibrationError: the values are none.
+    """
+    try:
+        return np.array(values, float)
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationError(f"{what}: no numbers") from None
 
 
 def _without_tangential(coefficients: tuple[float, ...]) -> Array:

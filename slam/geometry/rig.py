@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
@@ -86,6 +87,57 @@ class StereoRig:
         left = PinholeCamera(f, f, u0, v0, width, height)
         right = PinholeCamera(f, f, u0 + doffs, v0, width, height)
         return cls(left, right, np.eye(3), np.array([-baseline, 0, 0]))
+
+    @classmethod
+    def from_pinhole(
+        cls,
+        K_left: ArrayLike,
+        K_right: ArrayLike | None = None,
+        *,
+        size: tuple[int, int],
+        baseline: float | None = None,
+        R: ArrayLike | None = None,
+        T: ArrayLike | None = None,
+        D_left: ArrayLike | None = None,
+        D_right: ArrayLike | None = None,
+        fisheye: bool = False,
+    ) -> StereoRig:
+        """A rig by camera matrices, as ``cv2.stereoCalibrate`` gives them, or by one matrix and a baseline.
+
+        Args:
+            K_left: camera matrix (3, 3) [px].
+            K_right: that of the right camera; without it the two cameras are equal.
+            size: width and height of the images [px].
+            baseline: distance of the cameras [m], where they stand exactly side by side; in place of T.
+            R: rotation (3, 3) in ``h_right = R h_left + T``; without it the cameras look the same way.
+            T: translation (3,) [m] in it.
+            D_left: distortion coefficients in OpenCV's order.
+            D_right: those of the right camera; not given for equal cameras.
+            fisheye: the coefficients are those of ``cv2.fisheye``.
+
+        Raises:
+            CalibrationError: neither or both of T and baseline are given, or a value is impossible.
+
+        Example:
+            >>> K = [[450, 0, 319.5], [0, 450, 239.5], [0, 0, 1]]
+            >>> StereoRig.from_pinhole(K, baseline=0.12, size=(640, 480)).baseline
+            0.12
+        """
+        if (T is None) == (baseline is None):
+            raise CalibrationError("give either T or baseline: how far the cameras are apart")
+        left = PinholeCamera.from_matrix(K_left, D_left, size, fisheye)
+        right = left
+        if K_right is not None or D_right is not None:
+            right = PinholeCamera.from_matrix(K_left if K_right is None else K_right, D_right, size, fisheye)
+        try:
+            rotation = np.eye(3) if R is None else np.array(R, float)
+            offset = np.array([-baseline, 0.0, 0.0] if T is None else T, float).reshape(-1)  # type: ignore[operator]
+        except (TypeError, ValueError, OverflowError):
+            raise CalibrationError("stereo extrinsics must be numbers") from None
+        if rotation.shape != (3, 3) or offset.shape != (3,):
+            raise CalibrationError("stereo extrinsics must be a (3, 3) rotation and a (3,) translation")
+        with np.errstate(all="ignore"):  # what is not finite is refused right away
+            return cls(left, right, rotation, rotation.T @ offset)
 
     @property
     def baseline(self) -> float:

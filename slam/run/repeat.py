@@ -16,7 +16,7 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 
 CONFIG = "config.json"
-_SYNTHETIC = "synthetic:"
+_NO_FILES = ("synthetic:", "camera:")
 _PACKAGES = ("surf-stereo-slam", "numpy", "scipy", "numba", "gtsam", "opencv-contrib-python-headless")
 
 
@@ -44,7 +44,7 @@ class Origin:
         """The tree for the ``config.json`` of a run in `folder`: files by absolute and by relative path."""
         return {
             "command": self.command,
-            "source": {"format": self.format, **_places(self.sequence, folder, self.format == "synthetic")},
+            "source": {"format": self.format, **_places(self.sequence, folder, self.format in ("synthetic", "camera"))},
             "kind": self.kind,
             "mono": self.mono,
             "known_map": None if self.known_map is None else _places(str(self.known_map), folder),
@@ -145,9 +145,9 @@ def _restored(tree: Any) -> Any:
     return float(tree) if tree in ("Infinity", "-Infinity") else tree
 
 
-def _places(text: str, folder: Path, synthetic: bool = False) -> dict[str, str]:
+def _places(text: str, folder: Path, no_file: bool = False) -> dict[str, str]:
     """Where a file is, options behind it included: as it was given, absolute, and as seen from `folder`."""
-    if synthetic or text.startswith(_SYNTHETIC):
+    if no_file or text.startswith(_NO_FILES):
         return {"given": text}
     name, mark, query = text.rpartition("?")
     if not mark or Path(text).expanduser().exists():

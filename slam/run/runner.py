@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -30,7 +31,8 @@ from slam.run.replay import RecordedFrame, Recording, replay
 from slam.run.schema import STAGES, schema
 from slam.run.settings_reference import in_force
 from slam.runtime.compile_clock import compile_clock, working_time
-from slam.sequences import Sequence
+from slam.sequences import Sequence, is_live
+from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 
 #: Frames whose pose was measured; accuracy is that of these alone.
@@ -56,6 +58,7 @@ class RunOptions:
         save_map: file for the map at the end; None for none.
         mono: use the left images alone.
         overlap: read and extract the next frame while the present one is estimated; the results are the same.
+        live: take frames at their own rate, and leave out those that come too late; of a camera always.
         origin: goes into ``config.json`` as it is: what else it takes to repeat the run, see `slam.run.repeat`.
     """
 
@@ -70,6 +73,7 @@ class RunOptions:
     save_map: Path | None = None
     mono: bool = False
     overlap: bool = True
+    live: bool = False
     origin: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -86,6 +90,7 @@ class RunRecord:
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
+    ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -124,6 +129,7 @@ def run(
     on_frame: Callable[[FrameResult], None] | None = None,
     frontend: Frontend | None = None,
     watches: Iterable[Watch] = (),
+    until: threading.Event | None = None,
 ) -> dict[str, Any]:
     """Run a sequence; returns the summary that is also written to ``summary.json``.
 
@@ -137,6 +143,7 @@ def run(
         on_frame: called after every frame, for a progress display.
         frontend: used in place of the one that the options name.
         watches: called after every step with its images, its result and the system, to show or to draw it.
+        until: ends a live run when it is set, as if there were no more frames.
 
     Raises:
         SlamError: bad input; one line says what and where.
@@ -151,15 +158,19 @@ def run(
     if options.config.map.monocular and options.record is not None:
         raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
     frames = sequence.frames(options.start, options.stop)
+    live = None
+    if options.live or is_live(sequence):
+        live = LiveFrames(frames, not is_live(sequence), until)
+        frames = iter(live)
     if options.mono:
         frames = (replace(frame, right=None) for frame in frames)
     known = None if options.known_map is None else load_map(options.known_map)
     system = StereoSlam(
         sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
     )
-    return _drive(
-        sequence, options, system, _processed(system, frames, tuple(watches), options.overlap), RunRecord(), on_frame
-    )
+    record = RunRecord()
+    results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
+    return _drive(sequence, options, system, results, record, on_frame, live)
 
 
 def run_recording(
@@ -189,6 +200,7 @@ def _drive(
     results: Iterable[tuple[int, FrameResult]],
     record: RunRecord,
     on_frame: Callable[[FrameResult], None] | None,
+    live: LiveFrames | None = None,
 ) -> dict[str, Any]:
     """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
 
@@ -217,7 +229,9 @@ def _drive(
             ended, stopped_by = f"stopped: {one_line(str(error)) or type(error).__name__}", error
             raise
         finally:
-            summary = _finish(sequence, options, system, record, files, ended, score, last)
+            if live is not None and live.ended_early and stopped_by is None:
+                ended = "ended by the user"
+            summary = _finish(sequence, options, system, record, files, ended, score, last, live)
             _write_copies(sequence, options, system, record, tape, last)
             if last.failures:
                 summary["failures"] = last.lines
@@ -271,12 +285,13 @@ def _recording(
 
 
 def _processed(
-    system: StereoSlam, frames: Iterator[StereoFrame], watches: tuple[Watch, ...], overlap: bool
+    system: StereoSlam, reading: _Reading, watches: tuple[Watch, ...], overlap: bool, record: RunRecord
 ) -> Iterator[tuple[int, FrameResult]]:
     """Each frame's number and what the system did with it."""
-    reading = _Reading(frames)
     for frame, result in system.run(reading, overlap):
         result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
+        if reading.live is not None:
+            record.ages.append(reading.live.age(frame))
         yield frame.index, result
         for watch in watches:
             watch(frame, result, system)
@@ -305,10 +320,16 @@ class _Replayed:
 
 
 class _Reading:
-    """Frames, and the wall time that reading each took [ms] by its index."""
+    """Frames, and the wall time that reading each took [ms] by its index; nothing in a live run, which waits for them.
 
-    def __init__(self, frames: Iterator[StereoFrame]) -> None:
+    Args:
+        frames: to be read.
+        live: where they come from in a live run; else None.
+    """
+
+    def __init__(self, frames: Iterator[StereoFrame], live: LiveFrames | None = None) -> None:
         self._frames = frames
+        self.live = live
         self.milliseconds: dict[int, float] = {}
 
     def __iter__(self) -> Iterator[StereoFrame]:
@@ -317,7 +338,7 @@ class _Reading:
             frame = next(self._frames, None)
             if frame is None:
                 return
-            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start)
+            self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
             yield frame
 
 
@@ -330,6 +351,7 @@ def _finish(
     ended: str,
     score: ObjectScore | None,
     last: LastFiles,
+    live: LiveFrames | None = None,
 ) -> dict[str, Any]:
     """Write the last files, each whether or not another fails, and return the summary."""
     summary: dict[str, Any] = {
@@ -340,8 +362,10 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "warnings": list(sequence.warnings),
+        "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
     }
+    if live is not None:
+        summary["live"] = _live(live, record)
     if record.stamps:
         final = Trajectory.empty()
         with last.each():
@@ -395,6 +419,16 @@ def _results(
     return {
         **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
     }  # fmt: skip
+
+
+def _live(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
+    """Frames that came too late, and how old frames were when they were done."""
+    later = 1e3 * np.array(record.ages[1:] or record.ages or [np.nan])  # the first may wait for compilers
+    return {
+        "frames dropped": live.dropped,
+        "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
+        "clock waited [s]": live.clock_waited,
+    }
 
 
 def _rate(record: RunRecord) -> float | None:

@@ -17,40 +17,35 @@ class _End:
         self.error = error
 
 
-def ahead(items: Iterable[T], depth: int = 1) -> Iterator[T]:
-    """The same items in the same order, made in a thread that is at most `depth` finished items ahead.
+def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """The same items in the same order, made in a thread that is at most `depth` items ahead of the one in use.
 
     An exception of the iterator is raised where its item would have come. The thread ends with the generator: after its
     last item, or when it is closed.
     """
-    ready: queue.Queue[T | _End] = queue.Queue(depth)
+    ready: queue.Queue[T | _End] = queue.Queue()
+    places = threading.Semaphore(depth)
     stopped = threading.Event()
-
-    def put(item: T | _End) -> bool:
-        while not stopped.is_set():
-            try:
-                ready.put(item, timeout=0.05)
-                return True
-            except queue.Full:
-                continue
-        return False
 
     def work() -> None:
         try:
-            for item in items:
-                if not put(item):
-                    return
-            put(_End())
+            iterator = iter(items)
+            while places.acquire() and not stopped.is_set():
+                ready.put(next(iterator))
+        except StopIteration:
+            ready.put(_End())
         except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
-            put(_End(error))
+            ready.put(_End(error))
 
     thread = threading.Thread(target=work, name="ahead", daemon=True)
     thread.start()
     try:
         while not isinstance(item := ready.get(), _End):
+            places.release()
             yield item
         if item.error is not None:
             raise item.error
     finally:
         stopped.set()
+        places.release()
         thread.join()

@@ -1,4 +1,4 @@
-"""Stereo sequences: EuRoC, KITTI odometry, KITTI raw, two folders or videos, and the synthetic worlds.
+"""Stereo sequences: EuRoC, KITTI, ROS recordings, two folders or videos, live cameras, and the synthetic worlds.
 
 `open_sequence` finds the format out by itself. Layouts, options and faults are described in
 ``docs/sequences.md``. May import `slam.worlds`, `slam.geometry` and the data.
@@ -16,11 +16,12 @@ from urllib.parse import parse_qsl
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, reason
 from slam.naming import suggestion, unknown
-from slam.sequences.base import RecordedSequence, Sequence
+from slam.sequences.base import RecordedSequence, Sequence, is_live
 
-__all__ = ["RecordedSequence", "Sequence", "formats", "open_sequence"]
+__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence"]
 
 _SYNTHETIC = "synthetic:"
+_CAMERA = "camera:"
 _KINDS = ("driving", "handheld")
 
 #: Formats on disk, in the order in which they are tried: module and description.
@@ -28,6 +29,7 @@ _FORMATS = {
     "euroc": ("slam.sequences.euroc", "EuRoC and other ASL folders: mav0/cam0, mav0/cam1"),
     "kitti-raw": ("slam.sequences.kitti_raw", "KITTI raw drives: image_00/data, image_01/data"),
     "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
+    "ros": ("slam.sequences.ros", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
     "folders": ("slam.sequences.folders", "two folders or videos (left, right) with an OpenCV or Kalibr calibration"),
 }
 _MOST_OPTIONS = 100
@@ -38,15 +40,17 @@ _COMMON_OPTIONS = frozenset({"kind"})
 def formats() -> dict[str, str]:
     """Names of the formats with a line on each."""
     known = {name: description for name, (_, description) in _FORMATS.items()}
-    return {**known, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
+    camera = "live cameras: camera:0 (both images side by side), camera:0,1, or addresses"
+    return {**known, "camera": camera, "synthetic": "built-in worlds: synthetic:NAME?key=value&key=value"}
 
 
 def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
     """Open a stereo sequence; nothing but the first pair of images is decoded yet.
 
     Args:
-        path: a folder, with options behind it as ``FOLDER?key=value&key=value``, or ``synthetic:NAME?key=value``.
-            ``kind=driving`` or ``kind=handheld`` goes with every format on disk.
+        path: a folder or a ROS recording, with options behind it as ``PATH?key=value&key=value``;
+            ``synthetic:NAME?key=value``; or ``camera:0?calibration=FILE``, see `slam.sequences.camera`.
+            ``kind=driving`` or ``kind=handheld`` goes with all of them but the synthetic worlds.
         format: one of `formats`; found out from the folder where it is None.
 
     Raises:
@@ -62,6 +66,10 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
         raise ConfigurationError(f"{text}: format {format!r} does not go with a synthetic world")
     if format == "synthetic" or text.startswith(_SYNTHETIC):
         return _open_world(text)
+    if text.startswith(_CAMERA) and format not in (None, "camera"):
+        raise ConfigurationError(f"{text}: format {format!r} does not go with a camera")
+    if format == "camera" or text.startswith(_CAMERA):
+        return _open_camera(text.removeprefix(_CAMERA))
     try:
         return _open_folder(text, format)
     except OSError as error:  # no permission, too long a name, a folder that is not what it seems (/proc)
@@ -71,7 +79,7 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 def _open_folder(text: str, format: str | None) -> RecordedSequence:
     """A sequence on disk."""
     folder, options = _split(text)
-    _require_folder(folder, text)
+    _require_recording(folder, text)
     name = _detect(folder, options) if format is None else _known(format)
     module = import_module(_FORMATS[name][0])
     _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
@@ -86,11 +94,29 @@ def _open_world(text: str) -> Sequence:
     return open_world(text)
 
 
+def _open_camera(text: str) -> Sequence:
+    """A camera by its text, ``camera:`` left out; a question mark may be part of an address in a network."""
+    from slam.sequences import camera
+
+    name, mark, query = text.rpartition("?")
+    known = camera.OPTIONS | _COMMON_OPTIONS
+    options = _options(query) if mark else {}
+    if not mark or ("://" in name and not set(options) <= known):
+        name, options = text, {}
+    _check_options("camera", options, camera.OPTIONS)
+    return camera.open_camera(name, options)
+
+
 def _split(text: str) -> tuple[Path, dict[str, str]]:
     """The path, ``~`` expanded, and the options behind the question mark."""
     name, mark, query = text.rpartition("?")
     if not mark or _exists(text):
         return expanded(text).absolute(), {}
+    return expanded(name).absolute(), _options(query)
+
+
+def _options(query: str) -> dict[str, str]:
+    """The options ``key=value&key=value`` behind a question mark."""
     try:
         options = dict(parse_qsl(query, keep_blank_values=True, max_num_fields=_MOST_OPTIONS))
     except ValueError:
@@ -98,7 +124,7 @@ def _split(text: str) -> tuple[Path, dict[str, str]]:
     for key, value in options.items():
         if "\0" in value:
             raise ConfigurationError(f"option {key!r} holds a NUL")
-    return expanded(name).absolute(), options
+    return options
 
 
 def _exists(text: str) -> bool:
@@ -109,8 +135,10 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _require_folder(folder: Path, text: str) -> None:
-    """Refuse what is no folder with something in it; `text` is what was asked for."""
+def _require_recording(folder: Path, text: str) -> None:
+    """Refuse what is neither a folder with something in it nor a ROS recording; `text` is what was asked for."""
+    if _is_ros(folder):
+        return
     if not folder.exists():
         raise SequenceError(f"{folder}: there is no such folder{_world_meant(text)}")
     if not folder.is_dir():
@@ -129,6 +157,8 @@ def _world_meant(text: str) -> str:
 
 def _detect(folder: Path, options: dict[str, str]) -> str:
     """The first format that the folder looks like; told where left and right are, it needs not look."""
+    if _is_ros(folder):
+        return "ros"
     if "left" in options or "right" in options:
         return "folders"
     name = _format_of(folder)
@@ -140,13 +170,18 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
     return name
 
 
+def _is_ros(path: Path) -> bool:
+    """Whether a path is a ROS recording, which may be a file."""
+    return bool(import_module(_FORMATS["ros"][0]).matches(path))
+
+
 def _sequences_below(folder: Path) -> list[Path]:
     """Sequences one or two folders further down, for a hint; what cannot be looked at is passed over."""
     found: list[Path] = []
     with suppress(OSError):
         for path in islice(chain(folder.glob("*"), folder.glob("*/*")), _LOOKED_AT):
             with suppress(OSError):
-                if path.is_dir() and _format_of(path):
+                if (path.is_dir() or _is_ros(path)) and _format_of(path):
                     found.append(path)
     return sorted(found)
 

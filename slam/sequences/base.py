@@ -68,6 +68,11 @@ class Sequence(Protocol):
         ...
 
 
+def is_live(frames: object) -> bool:
+    """Whether frames come from a camera, which waits for nobody, does not end, and has no number of frames."""
+    return bool(getattr(frames, "live", False))
+
+
 class FrameSource(Protocol):
     """Where a recorded sequence's images come from."""
 

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.errors import ConfigurationError, SequenceError
 from slam.files import expanded
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
+from slam.sequences import rigs
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import kalibr_cameras, rig_from_cameras
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import Size
-from slam.sequences.opencv_storage import opencv_rig
+from slam.sequences.rigs import calibration_files, read_rig, warn_of_unit
 from slam.sequences.source import (
     MOST_FRAMES,
     ImagePairs,
@@ -26,27 +24,19 @@ from slam.sequences.source import (
     in_order,
     in_seconds,
     pair_listings,
-    require_size,
     stamped,
 )
 from slam.sequences.tables import MOST_NANOSECONDS, read_rows, seconds
 from slam.sequences.videos import FASTEST, SLOWEST, VIDEO_SUFFIXES, VideoPairs, open_videos
-from slam.sequences.yaml_files import read_calibration
 
 #: Options of this format besides ``kind``.
-OPTIONS = frozenset({"left", "right", "calibration", "times", "fps", "unit", "rectified", "fisheye"})
+OPTIONS = frozenset({"left", "right", "times", "fps"}) | rigs.OPTIONS
 
 #: Frames per second of image folders that say nothing of time.
 RATE = 10.0
 
 _NAMES = (("left", "right"), ("image_left", "image_right"), ("cam0", "cam1"))
 _TIMES = ("times.txt", "timestamps.txt")
-_STORAGE_SUFFIXES = (".yaml", ".yml", ".xml", ".json")
-_CALIBRATIONS = tuple(stem + s for stem in ("calibration", "calib", "stereo", "camchain") for s in _STORAGE_SUFFIXES)
-_TWO_FILES = tuple((f"intrinsics{s}", f"extrinsics{s}") for s in _STORAGE_SUFFIXES)
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
-_LONG_BASELINE = 5.0  # [m]; more than that is more often a forgotten unit than a rig
 
 
 def matches(folder: Path) -> bool:
@@ -78,7 +68,9 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
             source = _image_pairs(folder, left, right, options, rate, faults)
             size = source.first_size()
             source = replace(source, size=size)
-        rig = _rig(folder, options, size, faults)
+        paths = calibration_files(folder, options)
+        rig = read_rig(paths, size, options)
+        warn_of_unit(rig, paths[0], options, faults)
     return RecordedSequence(folder.name, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
@@ -238,54 +230,3 @@ def _rate(options: dict[str, str]) -> float | None:
     if not SLOWEST <= rate <= FASTEST:
         raise ConfigurationError(f"fps must be a positive number ({SLOWEST:g} to {FASTEST:g}), got {options['fps']!r}")
     return rate
-
-
-# ------------------------------------------------------------------------------------------------ calibration
-
-
-def _rig(folder: Path, options: dict[str, str], size: Size, faults: FaultLog) -> StereoRig:
-    """The rig by the calibration file or files."""
-    paths = _calibration_files(folder, options)
-    unit = options.get("unit", "m")
-    if unit not in _UNITS:
-        raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
-    if len(paths) == 1 and _is_camchain(paths[0]):
-        foreign = sorted({"unit", "rectified", "fisheye"} & set(options))
-        if foreign:
-            raise ConfigurationError(f"option {foreign[0]!r} goes with OpenCV's files, {paths[0]} is Kalibr's")
-        cameras = kalibr_cameras(paths[0])
-        rig = rig_from_cameras(cameras[0], cameras[1], paths[0])
-        expected = (rig.width, rig.height)
-    else:
-        rig, expected = opencv_rig(paths, size, _UNITS[unit], _flag(options, "rectified"), _flag(options, "fisheye"))
-    require_size(size, expected, paths[0])
-    if rig.baseline > _LONG_BASELINE:
-        hint = "" if "unit" in options else "; if the calibration is in millimetres, add unit=mm"
-        faults.report("calibration", f"{paths[0]}: the cameras are {rig.baseline:g} m apart{hint}")
-    return rig
-
-
-def _calibration_files(folder: Path, options: dict[str, str]) -> list[Path]:
-    """The file, or the two files, by option (names joined by a comma) or by convention."""
-    if "calibration" in options:
-        return [folder / expanded(name, CalibrationError) for name in options["calibration"].split(",")]
-    for name in _CALIBRATIONS:
-        if (folder / name).is_file():
-            return [folder / name]
-    for names in _TWO_FILES:
-        if all((folder / name).is_file() for name in names):
-            return [folder / name for name in names]
-    raise CalibrationError(f"{folder}: the calibration is missing: calibration.yaml, or add calibration=FILE")
-
-
-def _is_camchain(path: Path) -> bool:
-    """Whether a calibration is Kalibr's: its cameras are called cam0, cam1."""
-    return re.search(r"^cam\d+:", read_calibration(path), re.MULTILINE) is not None
-
-
-def _flag(options: dict[str, str], name: str) -> bool:
-    """An option that is yes or no."""
-    text = options.get(name, "no").lower()
-    if text not in _YES:
-        raise ConfigurationError(f"{name} must be yes or no, got {text!r}")
-    return _YES[text]

@@ -36,24 +36,32 @@ def read_image(path: Path, size: Size | None = None) -> np.ndarray:
     Raises:
         SequenceError: the file is missing, cut off, damaged, or no image, or of another size; the message names it.
     """
+    return decode_image(read_bytes(path, _LARGEST), str(path), size)
+
+
+def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray:
+    """The image of the bytes of an image file, as `read_image`; `what` is named in errors.
+
+    Raises:
+        SequenceError: they are cut off, damaged, or no image, or of another size.
+    """
     import cv2
 
-    data = read_bytes(path, _LARGEST)
     fault = _fault(data, size)
     if fault:
-        raise SequenceError(f"{path}: {fault}")
+        raise SequenceError(f"{what}: {fault}")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     with quiet_libraries():
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except (cv2.error, SystemError, MemoryError) as error:
-            raise SequenceError(f"{path}: cannot be decoded") from error
+            raise SequenceError(f"{what}: cannot be decoded") from error
     if image is None:
-        raise SequenceError(f"{path}: not a readable image")
+        raise SequenceError(f"{what}: not a readable image")
     if size is not None and image.shape[1::-1] != size:
-        raise SequenceError(f"{path}: image is {size_text(image.shape[1::-1])}, not {size_text(size)}")
+        raise SequenceError(f"{what}: image is {size_text(image.shape[1::-1])}, not {size_text(size)}")
     if image.dtype not in (np.uint8, np.uint16):
-        raise SequenceError(f"{path}: pixels are {image.dtype}, not 8 or 16 bit")
+        raise SequenceError(f"{what}: pixels are {image.dtype}, not 8 or 16 bit")
     return image
 
 

@@ -41,7 +41,7 @@ _MODEL = ("distortionmodel", "cameramodel", "model")
 
 
 def opencv_rig(
-    paths: Sequence[Path], images: Size, unit: float = 1.0, rectified: bool = False, fisheye: bool = False
+    paths: Sequence[Path], images: Size | None, unit: float = 1.0, rectified: bool = False, fisheye: bool = False
 ) -> tuple[StereoRig, Size]:
     """The rig of one or more files (such as intrinsics.yml and extrinsics.yml), and the image size they are for.
 
@@ -50,7 +50,7 @@ def opencv_rig(
 
     Args:
         paths: the files.
-        images: width and height of the images, used where the files name none.
+        images: width and height of the images, used where the files name none; None where they are not known.
         unit: metres per unit of T and of the projections' last column.
         rectified: take the projection matrices, although camera matrices may be there too.
         fisheye: the distortion is ``cv2.fisheye``'s; also where the file names such a model.
@@ -63,6 +63,8 @@ def opencv_rig(
         entries.update(_read(path))
     with naming(paths[-1]):
         size = _size(entries) or images
+        if size is None:
+            raise CalibrationError("names no image size: give size=(width, height)")
         P = [_find(entries, _PROJECTION, side, (3, 4)) for side in (0, 1)]
         has_matrices = _find(entries, _MATRIX, 0, (3, 3)) is not None
         if rectified or (not has_matrices and P[0] is not None):
@@ -133,18 +135,7 @@ def _camera(entries: dict[str, Any], side: int, size: Size, fisheye: bool) -> Pi
     if K is None:
         names = ", ".join(sorted(entries)) or "nothing"
         raise CalibrationError(f"no camera matrix of the {('left', 'right')[side]} camera in it (K1, K2), but {names}")
-    D = _find(entries, _DISTORTION, side, None)
-    coefficients = [] if D is None else D.tolist()
-    while len(coefficients) > 8 and coefficients[-1] == 0:
-        coefficients.pop()
-    count = len(coefficients)
-    if count > 8:
-        raise CalibrationError(f"{count} distortion coefficients: thin prisms and tilted sensors are not supported")
-    count_allowed = next(n for n in (0, 4, 5, 8) if n >= count)
-    coefficients += [0.0] * (count_allowed - count)
-    model = "none" if not any(coefficients) and not fisheye else "equidistant" if fisheye else "radtan"
-    distortion = () if model == "none" else tuple(coefficients)
-    return PinholeCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size, model, distortion)
+    return PinholeCamera.from_matrix(K, _find(entries, _DISTORTION, side, None), size, fisheye)
 
 
 def _extrinsics(entries: dict[str, Any], unit: float) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 #: Stereo features with which a known place would be recognised.
-_ENOUGH_FEATURES = 20
+ENOUGH_FEATURES = 20
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TrackingState:
         if measured:
             return TrackingState()
         unmatched = self.unmatched + 1
-        enough = stereo_features >= _ENOUGH_FEATURES
+        enough = stereo_features >= ENOUGH_FEATURES
         lost = self.lost or (uncertain and unmatched >= lost_after)
         return TrackingState(unmatched, self.unknown + enough, lost, enough)
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
-from slam.errors import ConfigurationError, MeasurementError, UnknownNameError
+from slam.errors import ConfigurationError, MeasurementError, SequenceError, UnknownNameError
 from slam.geometry import se3
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
@@ -208,3 +209,22 @@ def test_a_frame_that_cannot_be_extracted_ends_a_run_after_the_frames_before_it(
     assert done == [0, 1, 2, 3, 4]
     later = replace(frames_without_images()[5], index=4)
     assert system.process(later).status is FrameStatus.TRACKED
+
+
+def test_two_arrays_and_a_time_are_a_frame():
+    sequence = slam.open_sequence("synthetic:desk?frames=3&width=160&height=120")
+    by_frames, by_arrays = (slam.StereoSlam(sequence.rig, backend="ekf") for _ in range(2))
+    for frame in sequence:
+        expected = by_frames.process(frame)
+        result = by_arrays.process(frame.left, frame.right, frame.stamp)
+        assert result.index == expected.index == frame.index
+        assert np.array_equal(result.estimate.T_world_left, expected.estimate.T_world_left)
+    assert by_arrays.process(frame.left, None, frame.stamp + 1).features.has_stereo.sum() == 0
+    with pytest.raises(MeasurementError, match="two images need their time"):
+        by_arrays.process(frame.left, frame.right)
+    with pytest.raises(MeasurementError, match="has its right image and its stamp already"):
+        by_arrays.process(frame, frame.right)
+    with pytest.raises(MeasurementError, match="stamp"):
+        by_arrays.process(frame.left, frame.right, "now")
+    with pytest.raises(SequenceError, match="calibration is for 160x120"):
+        by_arrays.process(frame.left[:60], frame.right, frame.stamp + 2)

@@ -1,0 +1,141 @@
+"""Cameras as OpenCV opens them: by number, by a GStreamer pipeline, by an address in a network, or a file played."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from slam.errors import SequenceError
+from slam.sequences.quiet import quiet_libraries
+from slam.sequences.videos import FASTEST, SLOWEST
+
+_TIMEOUT = 5000  # [ms] for an answer from the network
+
+
+class Device(Protocol):
+    """What a camera is asked for; ``cv2.VideoCapture`` is one."""
+
+    def grab(self) -> bool:
+        """Take the next image as soon as there is one; False where none comes."""
+        ...
+
+    def retrieve(self) -> tuple[bool, Any]:
+        """Whether there is a grabbed image, and the image (H, W) or (H, W, 3)."""
+        ...
+
+    def release(self) -> None:
+        """Close the camera."""
+        ...
+
+
+class PlayedFile:
+    """A video file in a device's part: its images come at the rate of the file.
+
+    Args:
+        capture: the file, a ``cv2.VideoCapture``.
+    """
+
+    def __init__(self, capture: Any) -> None:
+        import cv2
+
+        self._capture = capture
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        self._period = 1 / rate if SLOWEST <= rate <= FASTEST else 0.0
+        self._due = time.monotonic()
+
+    def grab(self) -> bool:
+        """The next image, when it is due."""
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        self._due = max(self._due, time.monotonic()) + self._period
+        return bool(self._capture.grab())
+
+    def retrieve(self) -> tuple[bool, Any]:
+        """The grabbed image."""
+        good, image = self._capture.retrieve()
+        return bool(good), image
+
+    def release(self) -> None:
+        """Close the file."""
+        self._capture.release()
+
+
+def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Device:
+    """Open a camera.
+
+    Args:
+        address: a number; a GStreamer pipeline that ends in ``appsink``; ``rtsp://…`` or another address of a
+            network; or a video file, which is played at its own rate.
+        width: asked of a camera with a number [px]; None for its own choice.
+        height: the same.
+        fps: the same [1/s].
+
+    Raises:
+        SequenceError: it cannot be opened.
+    """
+    import cv2
+
+    with quiet_libraries():
+        if address.isdecimal() and len(address) < 4:
+            capture = cv2.VideoCapture(int(address))
+        elif "!" in address:
+            capture = cv2.VideoCapture(address, cv2.CAP_GSTREAMER)
+        elif "://" in address:
+            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
+            capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+        else:
+            capture = cv2.VideoCapture(address)
+        if not capture.isOpened():
+            raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
+        if plays_a_file(address):
+            return PlayedFile(capture)
+        wanted = ((cv2.CAP_PROP_FRAME_WIDTH, width), (cv2.CAP_PROP_FRAME_HEIGHT, height), (cv2.CAP_PROP_FPS, fps))
+        for name, value in wanted:
+            if value is not None:
+                capture.set(name, value)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # images that wait in a queue are old
+    return capture
+
+
+def plays_a_file(address: str) -> bool:
+    """Whether an address is a file, which has an end."""
+    try:
+        return Path(address).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def read_image(device: Device) -> np.ndarray | None:
+    """The grabbed image in grey (H, W), as stored in 8 or 16 bits; None where there is none."""
+    import cv2
+
+    try:
+        with quiet_libraries():
+            good, image = device.retrieve()
+    except cv2.error:
+        return None
+    if not good or image is None or image.size == 0:
+        return None
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+
+
+def without_password(address: str) -> str:
+    """An address as it may be shown."""
+    scheme, mark, rest = address.partition("://")
+    return f"{scheme}{mark}{rest.rpartition('@')[2]}" if mark else address
+
+
+def _hint(address: str) -> str:
+    """What may be the reason."""
+    import cv2
+
+    if address.isdecimal():
+        there = sorted(str(path) for path in Path("/dev").glob("video*"))
+        return f": there are {', '.join(there)}" if there else ": this machine shows no camera (/dev/video*)"
+    if "!" in address and not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+        return ": this OpenCV was built without GStreamer"
+    if "://" not in address and "!" not in address and not Path(address).exists():
+        return ": there is no such file or device"
+    return ""

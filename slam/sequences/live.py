@@ -1,0 +1,129 @@
+"""Frames at their own rate, as a camera gives them: the newest counts, what came before it unseen is dropped."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+from slam.data import StereoFrame
+from slam.sequences.base import Sequence, is_live
+
+_LOOK = 0.05  # [s] between two looks whether the end was asked for
+_PARTING = 1.0  # [s] that the thread is waited for; a driver may hold it for longer
+_REMEMBERED = 16  # frames whose arrival is known
+
+
+class LiveFrames:
+    """Frames when they are due: each is there at its stamp, and only the newest one waits; iterate once.
+
+    A thread of its own reads them. Whoever is too slow for their rate gets fewer, and is never behind by more than the
+    frame that is worked on. Where reading is slower than the frames' rate, their clock waits for it.
+
+    Args:
+        frames: a sequence, or frames in order of time.
+        paced: hold each frame back until it is due by its stamp; default: unless they come from a camera.
+        until: the frames end when it is set, also while the next one is waited for.
+
+    Attributes:
+        dropped: frames that were there and not taken, since a newer one came.
+        clock_waited: by how much reading was too slow for the frames' own rate, in all [s].
+
+    Example:
+        >>> import slam
+        >>> sequence = slam.open_sequence("synthetic:desk?frames=3&width=160&height=120")
+        >>> live = slam.LiveFrames(sequence)
+        >>> system = slam.StereoSlam(sequence.rig)
+        >>> done = [result.status for frame, result in system.run(live)]
+        >>> len(done) + live.dropped
+        3
+    """
+
+    live = True  # `StereoSlam.run` then extracts no frame before it can be used
+
+    def __init__(
+        self, frames: Sequence | Iterable[StereoFrame], paced: bool | None = None, until: threading.Event | None = None
+    ) -> None:
+        self.dropped = 0
+        self.clock_waited = 0.0
+        self._frames = frames
+        self._paced = not is_live(frames) if paced is None else paced
+        self._until = until or threading.Event()  # only read: it is the caller's
+        self._closed = False
+        self._changed = threading.Condition()
+        self._newest: StereoFrame | None = None
+        self._since = 0.0  # when the newest came, by the clock of `time.monotonic`
+        self._arrivals: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
+        self._over = self._ended_early = False
+        self._error: BaseException | None = None
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        thread = threading.Thread(target=self._read, name="live frames", daemon=True)
+        thread.start()
+        try:
+            while (frame := self._take()) is not None:
+                yield frame
+            if self._error is not None:
+                raise self._error
+        finally:
+            self._closed = True
+            thread.join(_PARTING)
+
+    @property
+    def ended_early(self) -> bool:
+        """Whether the end was asked for before the last frame was taken."""
+        return self._ended_early
+
+    def age(self, frame: StereoFrame) -> float:
+        """Time since one of the frames taken last came [s]; NaN for all others."""
+        now = time.monotonic()
+        return next((now - since for index, since in self._arrivals if index == frame.index), float("nan"))
+
+    def _take(self) -> StereoFrame | None:
+        """The newest frame, waited for; None at the end, before which the last frame is still given."""
+        with self._changed:
+            while self._newest is None and not self._over and not self._until.is_set():
+                self._changed.wait(_LOOK)
+            frame, self._newest = self._newest, None
+            if frame is None or self._until.is_set():
+                self._ended_early = self._until.is_set()
+                return None
+            self._arrivals.append((frame.index, self._since))
+            return frame
+
+    def _read(self) -> None:
+        """Put every frame where it is taken from when it is due; in a thread of its own."""
+        origin = None
+        frames = iter(self._frames)
+        try:
+            for frame in frames:
+                if self._paced:
+                    now = time.monotonic()
+                    origin = now - frame.stamp if origin is None else origin
+                    late = max(0.0, now - (origin + frame.stamp))
+                    origin, self.clock_waited = origin + late, self.clock_waited + late
+                    self._wait_until(origin + frame.stamp)
+                if self._closed or self._until.is_set():
+                    break
+                self._put(frame)
+        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
+            self._error = error
+        finally:
+            close = getattr(frames, "close", None)
+            if close is not None:
+                close()  # a camera is released in the thread that reads it
+            with self._changed:
+                self._over = True
+                self._changed.notify_all()
+
+    def _wait_until(self, due: float) -> None:
+        """Wait for a time of the clock, or for the end."""
+        while (rest := due - time.monotonic()) > 0 and not (self._closed or self._until.is_set()):
+            time.sleep(min(rest, _LOOK))
+
+    def _put(self, frame: StereoFrame) -> None:
+        with self._changed:
+            self.dropped += self._newest is not None
+            self._newest, self._since = frame, time.monotonic()
+            self._changed.notify_all()

@@ -1,0 +1,272 @@
+"""ROS recordings as sequences: ``.bag`` files of ROS 1, folders, ``.mcap`` and ``.db3`` files of ROS 2.
+
+They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), loaded when one is opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.data import StereoFrame
+from slam.errors import ConfigurationError, SequenceError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.geometry.stamps import IntArray
+from slam.sequences import rigs
+from slam.sequences.base import RecordedSequence
+from slam.sequences.calibration import naming
+from slam.sequences.camera_info import rig_from_camera_infos
+from slam.sequences.faults import FaultLog
+from slam.sequences.images import Size
+from slam.sequences.ros_images import grey_image, naming_recording
+from slam.sequences.ros_topics import Topics, choose_topics
+from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
+
+#: Options besides ``kind``.
+OPTIONS = frozenset({"left", "right", "left_info", "right_info", "tolerance"}) | rigs.OPTIONS
+
+#: Endings of files, in lower case.
+SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+
+_METADATA = "metadata.yaml"
+_WIDEST_TOLERANCE = 10.0  # [s]
+
+
+def matches(path: Path) -> bool:
+    """Whether a path is a ROS recording by its ending or, for a folder, by its ``metadata.yaml``."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() and any(file.suffix in SUFFIXES for file in path.iterdir())
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def open_folder(path: Path, options: dict[str, str]) -> RecordedSequence:
+    """Open a recording; all of it is read once, for the stamps.
+
+    Raises:
+        SequenceError: rosbags is not installed, the recording is damaged, or its topics are not found or do not pair.
+        CalibrationError: there is no calibration, or an impossible one.
+        ConfigurationError: an option has an impossible value.
+    """
+    warnings: list[str] = []
+    with FaultLog(warnings) as faults:
+        with open_bag(path) as bag:
+            topics = choose_topics(bag, options)
+            left_all, right_all = (_listing(bag, topic, faults) for topic in (topics.left, topics.right))
+            size = _first_size(bag, topics.left)
+        ordered = [in_order(messages.listing(), messages.topic, faults) for messages in (left_all, right_all)]
+        tolerance = _tolerance(options, ordered[0])
+        left, partners = pair_listings(ordered[0], ordered[1], tolerance, "ns", faults)
+        left, partners, stamps = in_seconds(left, partners, faults)
+        rig = _rig(path, topics, size, options, faults)
+    rows = np.array([int(name) for name in left.names])
+    right_rows = np.array([-1 if name is None else int(name) for name in partners])
+    source = RosPairs(stamps, path, left_all, right_all, rows, right_rows, size)
+    return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
+
+
+@dataclass(frozen=True)
+class Messages:
+    """When the messages of a topic were taken and recorded, in the order of the recording.
+
+    Attributes:
+        topic: name.
+        stamps: of their headers (N,) [ns].
+        recorded: when they were written (N,) [ns].
+    """
+
+    topic: str
+    stamps: IntArray
+    recorded: IntArray
+
+    def listing(self) -> Listing:
+        """Them as a listing; the names are their rows."""
+        return Listing(Path(self.topic), self.stamps, [str(i) for i in range(len(self.stamps))])
+
+    def seek(self, row: int) -> tuple[int | None, int]:
+        """The time from which on to read for a row, and the first row that comes then; None for the beginning."""
+        if (np.diff(self.recorded) < 0).any():
+            return None, 0
+        return int(self.recorded[row]), int(np.searchsorted(self.recorded, self.recorded[row]))
+
+
+@dataclass(frozen=True)
+class RosPairs:
+    """A frame source: two topics of a recording, already paired.
+
+    Attributes:
+        stamps: times (N,) [s], strictly increasing.
+        path: of the recording.
+        left, right: the messages of the topics.
+        left_rows: which of them are the frames (N,).
+        right_rows: the same for the right images, -1 where there is none (N,).
+        size: width and height that every image must have.
+    """
+
+    stamps: Array
+    path: Path
+    left: Messages
+    right: Messages
+    left_rows: IntArray
+    right_rows: IntArray
+    size: Size
+
+    def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
+        """Decode frames `start` to `stop`; a damaged left image costs its frame, a right one itself."""
+        right_rows = self.right_rows[start:stop]
+        with ExitStack() as stack:
+            bags = [stack.enter_context(open_bag(self.path)) for _ in range(2)]  # each goes its own way through it
+            left = stack.enter_context(closing(self._images(bags[0], self.left, self.left_rows[start:stop])))
+            right = stack.enter_context(closing(self._images(bags[1], self.right, right_rows[right_rows >= 0])))
+            for index, right_row in zip(range(start, stop), right_rows.tolist()):
+                image = next(left, None)
+                partner = next(right, None) if right_row >= 0 else None
+                if image is None:
+                    return
+                if isinstance(image, SequenceError):
+                    faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {image}")
+                    continue
+                if isinstance(partner, SequenceError):
+                    line = f"frame {index} is given without its right image: {partner}"
+                    faults.report("right images unreadable, frames given without them", line)
+                    partner = None
+                yield StereoFrame(index, float(self.stamps[index]), image, partner)
+
+    def _images(
+        self, bag: Bag, messages: Messages, rows: IntArray
+    ) -> Generator[np.ndarray | SequenceError, None, None]:
+        """The images of these rows of a topic, which increase; an error in place of one that is damaged."""
+        if not len(rows):
+            return
+        wanted = iter(rows.tolist())
+        row = next(wanted)
+        since, first = messages.seek(row)
+        for number, (_, kind, raw) in enumerate(bag.messages([messages.topic], since), start=first):
+            if number == row:
+                try:
+                    yield bag.image(raw, kind, f"{messages.topic}, message {row}", self.size)
+                except SequenceError as error:
+                    yield error
+                row = next(wanted, -1)
+                if row < 0:
+                    return
+
+
+class Bag:
+    """An open recording, whatever its kind; every fault of it is a `SequenceError` with its name."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path, self._reader = path, reader
+        self.kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
+
+    def messages(self, topics: list[str], since: int | None = None) -> Generator[tuple[int, str, bytes], None, None]:
+        """Time of recording [ns], type and bytes of all messages of some topics, from a time on."""
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        messages = iter(self._reader.messages(connections, start=since)) if connections else iter(())
+        while True:
+            with naming_recording(self.path):
+                found = next(messages, None)
+            if found is None:
+                return
+            yield int(found[1]), found[0].msgtype, found[2]
+
+    def message(self, raw: bytes, kind: str) -> Any:
+        """A message of its bytes."""
+        with naming_recording(self.path):
+            return self._reader.deserialize(raw, kind)
+
+    def image(self, raw: bytes, kind: str, what: str, size: Size | None = None) -> np.ndarray:
+        """The image (H, W) of a message's bytes, see `grey_image`."""
+        with naming_recording(self.path):
+            return grey_image(self._reader.deserialize(raw, kind), kind, what, size)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic; None where there is none."""
+        with closing(self.messages([topic])) as messages:
+            found = next(messages, None)
+        return None if found is None else self.message(found[2], found[1])
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a recording, and close it in the end.
+
+    Raises:
+        SequenceError: rosbags is not installed, or the recording cannot be read.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise SequenceError(
+            f"{path}: ROS recordings are read by the package rosbags: pip install 'surf-stereo-slam[ros]'"
+        ) from None
+    with ExitStack() as stack:
+        with naming_recording(path):
+            reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            stack.enter_context(reader)
+            bag = Bag(path, reader)
+        yield bag
+
+
+def _listing(bag: Bag, topic: str, faults: FaultLog) -> Messages:
+    """Stamps of all messages of a topic; where their headers hold none, when they were recorded."""
+    stamps, recorded = [], []
+    for time, kind, raw in bag.messages([topic]):
+        message = bag.message(raw, kind)
+        with naming_recording(bag.path):
+            stamps.append(int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec))
+        recorded.append(time)
+    if not stamps:
+        raise SequenceError(f"{bag.path}: topic {topic} has no messages")
+    if not any(stamps):
+        faults.report("stamps", f"{topic}: the images have no stamps; the times of recording are taken")
+        stamps = recorded
+    return Messages(topic, np.array(stamps, np.int64), np.array(recorded, np.int64))
+
+
+def _first_size(bag: Bag, topic: str) -> Size:
+    """Width and height of the first image of a topic that can be read."""
+    reason = "no messages"
+    for _, kind, raw in bag.messages([topic]):
+        try:
+            image = bag.image(raw, kind, topic)
+        except SequenceError as error:
+            reason = str(error)
+            continue
+        return image.shape[1], image.shape[0]
+    raise SequenceError(f"{bag.path}: no image of {topic} can be read: {reason}")
+
+
+def _tolerance(options: dict[str, str], left: Listing) -> int:
+    """How far the stamps of a pair may be apart [ns]."""
+    if "tolerance" not in options:
+        return hardware_tolerance(left)
+    try:
+        seconds = float(options["tolerance"])
+    except ValueError:
+        seconds = float("nan")
+    if not 0 <= seconds <= _WIDEST_TOLERANCE:
+        raise ConfigurationError(f"tolerance must be 0 to {_WIDEST_TOLERANCE:g} s, got {options['tolerance']!r}")
+    return round(1e9 * seconds)
+
+
+def _rig(path: Path, topics: Topics, size: Size, options: dict[str, str], faults: FaultLog) -> StereoRig:
+    """The rig by the calibration file that is named, else by the camera messages."""
+    if "calibration" in options:
+        paths = rigs.calibration_files(path if path.is_dir() else path.parent, options)
+        rig = rigs.read_rig(paths, size, options)
+        rigs.warn_of_unit(rig, paths[0], options, faults)
+        return rig
+    assert topics.left_info is not None and topics.right_info is not None
+    where = Path(topics.info_names)
+    rectified = rigs.flag(options, "rectified") if "rectified" in options else topics.rectified
+    with naming(where):
+        rig = rig_from_camera_infos(topics.left_info, topics.right_info, rectified)
+    require_size(size, (rig.width, rig.height), where)
+    return rig

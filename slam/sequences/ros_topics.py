@@ -1,0 +1,196 @@
+"""Which topics of a ROS recording are the two cameras of a stereo rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.naming import suggestion
+from slam.sequences.calibration import naming
+from slam.sequences.camera_info import CameraInfo
+from slam.sequences.ros_images import COMPRESSED, DEPTH, RAW, naming_recording
+
+_INFO = "sensor_msgs/msg/CameraInfo"
+_NAMES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
+_SAME_PLACE = 1e-6  # [m] from a pair's left camera
+_LISTED = 12  # topics named in a message
+
+
+class Recording(Protocol):
+    """What is asked of a recording."""
+
+    path: Path
+    kinds: dict[str, str]
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic; None where there is none."""
+        ...
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The topics of a stereo rig.
+
+    Attributes:
+        left, right: of the images.
+        left_info, right_info: the cameras' calibrations; None where a file is named in their place.
+        info_names: the topics of these.
+    """
+
+    left: str
+    right: str
+    left_info: CameraInfo | None = None
+    right_info: CameraInfo | None = None
+    info_names: str = ""
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images are rectified, by ROS's names for topics (``image_rect``, ``image_rect_raw``)."""
+        return all("rect" in _base(topic).rpartition("/")[2] for topic in (self.left, self.right))
+
+
+def choose_topics(recording: Recording, options: Mapping[str, str]) -> Topics:
+    """The topics by the options ``left``, ``right``, ``left_info``, ``right_info``; without them those of a pair.
+
+    A pair are two cameras whose messages say so: the same size and focal length of the rectified images, and a baseline
+    in the right one's projection. Depth images do not count. Where a calibration is named, names decide.
+
+    Raises:
+        SequenceError: a topic is not there, or there is not exactly one pair.
+        CalibrationError: there is no calibration.
+        ConfigurationError: one of the two images is named and the other is not.
+    """
+    if ("left" in options) != ("right" in options):
+        raise ConfigurationError("name both topics: left=/…&right=/…")
+    if "left" in options:
+        left, right = (_named(recording, options[side], (RAW, COMPRESSED)) for side in ("left", "right"))
+        return Topics(left, right) if "calibration" in options else _with_infos(recording, left, right, options)
+    if "calibration" in options:
+        return _one([Topics(*pair) for pair in _pairs_by_name(recording)], recording)
+    return _one(list(_pairs_by_messages(recording)), recording)
+
+
+def _with_infos(recording: Recording, left: str, right: str, options: Mapping[str, str]) -> Topics:
+    """Named images with their cameras' messages, named or in the same name space."""
+    names = []
+    for side, topic in (("left", left), ("right", right)):
+        usual = f"{_space(topic)}/camera_info"
+        if f"{side}_info" in options:
+            names.append(_named(recording, options[f"{side}_info"], (_INFO,)))
+        elif recording.kinds.get(usual) == _INFO:
+            names.append(usual)
+        else:
+            known = _listed(_of_kind(recording, (_INFO,)))
+            raise CalibrationError(
+                f"{recording.path}: no {usual} for {topic}: add {side}_info=/… (there are {known}) or calibration=FILE"
+            )
+    infos = [_info(recording, name) for name in names]
+    return Topics(left, right, infos[0], infos[1], " and ".join(names))
+
+
+def _pairs_by_messages(recording: Recording) -> Iterator[Topics]:
+    """All pairs of cameras that say that they are one."""
+    cameras = []
+    for name in _of_kind(recording, (_INFO,)):
+        images = [t for t in _of_kind(recording, (RAW, COMPRESSED)) if _space(t) == _space(name)]
+        images = sorted((t for t in images if not _is_depth(recording, t)), key=_preference(recording))
+        if images and recording.first(name) is not None:
+            cameras.append((images[0], name, _info(recording, name)))
+    for left, left_name, a in cameras:
+        for right, right_name, b in cameras:
+            same = a.size == b.size and a.P[0, 0] == b.P[0, 0]
+            if same and abs(a.baseline_term) < _SAME_PLACE and b.baseline_term > _SAME_PLACE:
+                yield Topics(left, right, a, b, f"{left_name} and {right_name}")
+
+
+def _pairs_by_name(recording: Recording) -> list[tuple[str, str]]:
+    """Pairs of topics of images that differ in one of the usual names for left and right, one of each two cameras."""
+    images = sorted(_of_kind(recording, (RAW, COMPRESSED)), key=_preference(recording))
+    found: dict[tuple[str, str], tuple[str, str]] = {}
+    for topic in images:
+        for names in _NAMES:
+            other = topic.replace(*names)
+            if other != topic and other in images and not _is_depth(recording, topic):
+                spaces = _space(topic), _space(other)
+                found.setdefault(spaces if spaces[0] != spaces[1] else (topic, other), (topic, other))
+    return list(found.values())
+
+
+def _one(pairs: list[Topics], recording: Recording) -> Topics:
+    """The only pair.
+
+    Raises:
+        SequenceError: there is none, or there are several.
+    """
+    if len(pairs) == 1:
+        return pairs[0]
+    images = _of_kind(recording, (RAW, COMPRESSED))
+    if pairs:
+        found = "; ".join(f"left={pair.left}&right={pair.right}" for pair in pairs[:3])
+        raise SequenceError(f"{recording.path}: several stereo pairs, choose one: {found}")
+    if not images:
+        raise SequenceError(f"{recording.path}: no images; its topics are {_listed(sorted(recording.kinds))}")
+    raise SequenceError(
+        f"{recording.path}: its camera messages name no stereo pair: add left=/…&right=/… of {_listed(images)}, "
+        "and calibration=FILE where the cameras are not calibrated"
+    )
+
+
+def _named(recording: Recording, topic: str, kinds: tuple[str, ...]) -> str:
+    """A topic that must be there, and of one of these types."""
+    known = _of_kind(recording, kinds)
+    if topic not in known:
+        there = f"it holds {recording.kinds[topic]}" if topic in recording.kinds else "there is none"
+        hint = suggestion(topic, known)
+        raise SequenceError(f"{recording.path}: topic {topic}: {there}{hint}; there are {_listed(known)}")
+    return topic
+
+
+def _info(recording: Recording, topic: str) -> CameraInfo:
+    message = recording.first(topic)
+    if message is None:
+        raise CalibrationError(f"{recording.path}: topic {topic} has no messages")
+    with naming_recording(recording.path), naming(Path(topic)):
+        return CameraInfo.of(message)
+
+
+def _of_kind(recording: Recording, kinds: tuple[str, ...]) -> list[str]:
+    return sorted(topic for topic, kind in recording.kinds.items() if kind in kinds)
+
+
+def _is_depth(recording: Recording, topic: str) -> bool:
+    """Whether a topic holds depth images, or nothing."""
+    message = recording.first(topic)
+    if message is None or recording.kinds[topic] == COMPRESSED:
+        return message is None or "compressedDepth" in topic
+    with naming_recording(recording.path):
+        return message.encoding in DEPTH
+
+
+def _preference(recording: Recording) -> Any:
+    """The order in which a camera's topics are chosen: rectified, raw before compressed, grey before colour."""
+
+    def key(topic: str) -> tuple[bool, bool, bool, str]:
+        name = _base(topic).rpartition("/")[2]
+        return "rect" not in name, recording.kinds[topic] == COMPRESSED, "color" in name, topic
+
+    return key
+
+
+def _base(topic: str) -> str:
+    """A topic without what names its compression."""
+    base, _, last = topic.rpartition("/")
+    return base if last.startswith("compressed") else topic
+
+
+def _space(topic: str) -> str:
+    """The name space of a camera's topic."""
+    return _base(topic).rpartition("/")[0]
+
+
+def _listed(topics: list[str]) -> str:
+    more = f", … ({len(topics)})" if len(topics) > _LISTED else ""
+    return (", ".join(topics[:_LISTED]) or "none") + more

@@ -1,0 +1,139 @@
+"""What looks wrong with the images and their times, said once each with what to do."""
+
+from __future__ import annotations
+
+import logging
+from numbers import Real
+
+import numpy as np
+
+from slam.data import StereoFeatures, StereoFrame
+from slam.errors import CalibrationError
+from slam.geometry.rig import StereoRig
+from slam.models import EstimatorModels
+from slam.tracking.pair_check import pair_geometry
+from slam.tracking.state import ENOUGH_FEATURES
+
+logger = logging.getLogger("slam.input")
+
+#: Times between frames that cameras have [s]: a thousand frames a second to one in ten seconds.
+SHORTEST, LONGEST = 1e-3, 10.0
+
+_INTERVALS = 5  # times between frames whose median is judged: single frames may be missing
+_POOR = 5  # frames in a row that must show too little before it is said
+_LAST_LOOK = 64  # frame at which the pair is looked at for the last time
+_UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+
+
+class InputWarnings:
+    """Looks at what the front end is given, and warns once of each thing that looks wrong.
+
+    Args:
+        rig: the cameras.
+        models: the motion that is expected.
+        rows: how far from its row the front end looks for a feature's partner [px].
+
+    Attributes:
+        lines: the warnings so far.
+    """
+
+    def __init__(self, rig: StereoRig, models: EstimatorModels, rows: float) -> None:
+        self.lines: list[str] = []
+        self._rig, self._rows = rig, rows
+        self._farthest = farthest_apart(rig, models)
+        self._stamps: list[float] = []
+        self._count = self._poor = 0
+        self._pair_is_known = self._texture_is_known = False
+
+    def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
+        """Look at a frame and what the front end found in it; what is no frame is for others to refuse."""
+        if not isinstance(frame, StereoFrame) or not isinstance(features, StereoFeatures):
+            return
+        if len(self._stamps) <= _INTERVALS and isinstance(frame.stamp, Real):
+            self._stamps.append(float(frame.stamp))
+            if len(self._stamps) > _INTERVALS:
+                self._check_intervals(float(np.median(np.diff(self._stamps))))
+        if not self._texture_is_known:
+            self._check_texture(len(features))
+        if not self._pair_is_known and frame.right is not None and _is_a_power_of_two(self._count):
+            self._check_pair(frame.left, frame.right)
+        self._pair_is_known |= self._count >= _LAST_LOOK
+        self._count += 1
+
+    def _check_intervals(self, interval: float) -> None:
+        """Stamps in another unit, and frames between which a camera moves anywhere."""
+        if not 0 < interval < float("inf"):
+            return  # a step refuses them
+        if not SHORTEST <= interval <= LONGEST:
+            guess = next((unit for unit, size in _UNITS if interval * size <= LONGEST), _UNITS[-1][0])
+            what = f" (are they in {guess}?)" if interval > LONGEST else ""
+            self._warn(f"frames are {interval:.3g} s apart by their stamps{what}: give stamps in seconds")
+        elif interval > self._farthest:
+            self._warn(
+                f"frames are {interval:.3g} s apart: a camera can turn out of view from one to the next; "
+                f"take more frames per second, at least {1 / self._farthest:.2g}"
+            )
+
+    def _check_texture(self, features: int) -> None:
+        """Images that show nothing for several frames."""
+        self._poor = self._poor + 1 if features < ENOUGH_FEATURES else 0
+        if self._poor >= _POOR:
+            self._texture_is_known = True
+            self._warn(
+                f"the images show hardly anything to follow ({features} features in frame {self._count}): more light, "
+                "sharper focus, shorter exposure, or a view with more texture"
+            )
+
+    def _check_pair(self, left: np.ndarray, right: np.ndarray) -> None:
+        """Cameras that look swapped, and rows that do not agree."""
+        if not (_is_image(left, self._rig) and _is_image(right, self._rig)):
+            return  # a front end refuses them, or takes what others do not
+        try:
+            found = pair_geometry(self._rig, _eight_bits(left), _eight_bits(right), self._rows)
+        except CalibrationError:  # no rectified rig is left: a front end may do without
+            self._pair_is_known = True
+            return
+        self._pair_is_known = found.conclusive
+        if found.swapped:
+            self._warn(
+                f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras "
+                f"when the images are exchanged, {found.as_given} as they are; exchange them "
+                "(left=…&right=… of a folder, swap=yes of a camera)"
+            )
+        elif found.rows_differ:
+            self._warn(
+                f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
+                f"{found.row_offset:.1f} px in the median; check that the calibration is this camera's, at this size"
+            )
+
+    def _warn(self, line: str) -> None:
+        self.lines.append(line)
+        logger.warning("%s", line)
+
+
+def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
+    """Time between frames [s] in which the expected turn moves a feature by half an image, one standard deviation.
+
+    The angular velocity changes by ``density · √Δt`` in Δt, and the turn by that times Δt.
+    """
+    half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
+    return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
+
+
+def _is_a_power_of_two(number: int) -> bool:
+    return number & (number - 1) == 0
+
+
+def _is_image(image: object, rig: StereoRig) -> bool:
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16):
+        return False
+    return image.shape[:2] == (rig.height, rig.width) and image.shape[2:] in ((), (1,), (3,), (4,))
+
+
+def _eight_bits(image: np.ndarray) -> np.ndarray:
+    """A grey image (H, W) uint8 of any image that a front end takes."""
+    import cv2
+
+    if image.ndim == 3:
+        image = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
+    return np.ascontiguousarray(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))

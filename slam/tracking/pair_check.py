@@ -1,0 +1,115 @@
+"""Whether two images are a stereo pair of their rig: which camera is the left one, and whether rows agree.
+
+The front end looks for a feature's partner in the same row and to the left alone, so it cannot tell. Here features are
+matched wherever they lie; those that agree with one another (a fundamental matrix, by RANSAC) are held against the rig.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+
+_FEATURES = 1000  # of an image that are matched
+_TOLERANCE = 2.0  # [px] from an epipolar line: ORB places features to a pixel or two
+_SAMPLE = 8  # matches that any fundamental matrix can be made to fit
+_SIGMAS = 5.0  # a chance of 3e-7 to be wrong
+
+
+@dataclass(frozen=True)
+class PairGeometry:
+    """How the features of two images lie to each other in the rectified rig.
+
+    Attributes:
+        matches: number of matches that agree with one another.
+        conclusive: there are more than wrong matches would give by chance; else the other numbers are zero.
+        as_given: number of them in their rows, and farther right in the left image, as they must be.
+        as_swapped: the same if the left image is the right camera's, and the other way round.
+        off_rows: number of matches farther from their row than the front end looks.
+        row_offset: median distance of their rows [px].
+    """
+
+    matches: int
+    conclusive: bool = False
+    as_given: int = 0
+    as_swapped: int = 0
+    off_rows: int = 0
+    row_offset: float = 0.0
+
+    @property
+    def swapped(self) -> bool:
+        """The matches fit the rig far better with the images exchanged."""
+        return self.conclusive and _most(self.as_swapped, self.as_given)
+
+    @property
+    def rows_differ(self) -> bool:
+        """Most matches lie outside of the rows where it is looked for."""
+        return self.conclusive and _most(self.off_rows, self.matches - self.off_rows)
+
+
+def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
+    """How two images lie to each other.
+
+    Args:
+        rig: the cameras.
+        left: grey image (H, W), uint8.
+        right: the same of the right camera.
+        rows: how far from its row a partner is looked for [px].
+    """
+    import cv2
+
+    pixels = _matches(left, right)
+    if len(pixels[0]) <= _SAMPLE:
+        return PairGeometry(len(pixels[0]))
+    _, mask = cv2.findFundamentalMat(*pixels, cv2.FM_RANSAC, _TOLERANCE, 0.999)
+    inliers = np.zeros(len(pixels[0]), bool) if mask is None else np.asarray(mask).reshape(-1) > 0
+    if inliers.sum() <= _by_chance(len(inliers), rig):
+        return PairGeometry(int(inliers.sum()))
+    a, b = (uv[inliers] for uv in pixels)
+    band = max(rows, _TOLERANCE)
+    shift, offset = _offsets(rig, a, b)
+    shift_swapped, offset_swapped = _offsets(rig, b, a)
+    return PairGeometry(
+        len(a),
+        True,
+        int(((shift > _TOLERANCE) & (np.abs(offset) <= band)).sum()),
+        int(((shift_swapped > _TOLERANCE) & (np.abs(offset_swapped) <= band)).sum()),
+        int((np.abs(offset) > band).sum()),
+        float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
+    )
+
+
+def _offsets(rig: StereoRig, uv_left: Array, uv_right: Array) -> tuple[Array, Array]:
+    """Disparities and right less left rows (N,) [px] of pixels (N, 2) in the rectified rig."""
+    rectified, cameras = rig.rectified, rig.rectified.rig
+    difference = rectified.rectify_right(uv_right) - rectified.rectify_left(uv_left)
+    return cameras.right.u0 - cameras.left.u0 - difference[:, 0], difference[:, 1]
+
+
+def _by_chance(matches: int, rig: StereoRig) -> float:
+    """Most wrong matches that agree with some fundamental matrix: each lies in a strip around its epipolar line."""
+    share = min(1.0, 2 * _TOLERANCE / min(rig.width, rig.height))
+    return _SAMPLE + matches * share + _SIGMAS * float(np.sqrt(matches * share))
+
+
+def _most(some: int, others: int) -> bool:
+    """Whether there are more of some than of the others, beyond chance."""
+    return some - others > _SIGMAS * np.sqrt(some + others)
+
+
+def _matches(left: NDArray, right: NDArray) -> tuple[Array, Array]:
+    """Pixels (N, 2) of features that are each other's best match, wherever they lie."""
+    import cv2
+
+    orb = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined, unused-ignore]
+    (points_left, a), (points_right, b) = (orb.detectAndCompute(image, None) for image in (left, right))
+    if a is None or b is None:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a, b)
+    uv_left = np.array([points_left[m.queryIdx].pt for m in pairs], float).reshape(-1, 2)
+    uv_right = np.array([points_right[m.trainIdx].pt for m in pairs], float).reshape(-1, 2)
+    return uv_left, uv_right

@@ -1,0 +1,263 @@
+"""Cameras, their part played by video files and by a class that stops giving frames when it is told to."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import slam
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.sequences import camera, devices, is_live
+
+WIDTH, HEIGHT = 160, 120
+
+
+@pytest.fixture
+def scene() -> list[slam.StereoFrame]:
+    return list(slam.open_sequence(f"synthetic:desk?frames=4&width={WIDTH}&height={HEIGHT}"))
+
+
+@pytest.fixture
+def rig_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> slam.StereoRig:
+    """The calibration of the scene in the working folder."""
+    rig = slam.open_sequence(f"synthetic:desk?frames=4&width={WIDTH}&height={HEIGHT}").rig
+    storage = cv2.FileStorage(str(tmp_path / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"K1": rig.left.K, "K2": rig.right.K, "R": rig.R, "T": rig.R @ rig.b}.items():
+        storage.write(name, value)
+    storage.release()
+    monkeypatch.chdir(tmp_path)
+    return rig
+
+
+class Played:
+    """A camera that gives images in turn; None stands for a failure, after which it must be opened again."""
+
+    opened = 0
+
+    def __init__(self, images: list[np.ndarray | None]) -> None:
+        self.images, self.now, self.released = images, None, False
+        Played.opened += 1
+
+    def grab(self) -> bool:
+        self.now = self.images.pop(0) if self.images else None
+        return self.now is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        return self.now is not None, self.now
+
+    def release(self) -> None:
+        self.released = True
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch):
+    """Puts cameras in place of the machine's: a list of images by address, shared by all that open it."""
+    monkeypatch.setattr(camera, "_AGAIN", 0.01)
+    Played.opened = 0
+
+    def put(images: dict[str, list[np.ndarray | None]]) -> None:
+        def open_device(address, *_):
+            if address not in images:
+                raise SequenceError(f"camera:{address}: cannot be opened")
+            return Played(images[address])
+
+        monkeypatch.setattr(devices, "open_device", open_device)
+
+    return put
+
+
+def grey(value: int, width: int = WIDTH) -> np.ndarray:
+    return np.full((HEIGHT, width), value, np.uint8)
+
+
+def write_video(path: Path, images: list[np.ndarray], rate: float = 50.0) -> None:
+    size = images[0].shape[1], images[0].shape[0]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate, size)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+
+
+# ------------------------------------------------------------------------------------------------ what is given
+
+
+def test_two_devices_and_one_with_both_images_give_the_same(rig_here, played):
+    left, right = [grey(10 * k) for k in range(1, 5)], [grey(10 * k + 5) for k in range(1, 5)]
+    both = [np.hstack(pair) for pair in zip(left, right)]
+    expected = [(10 * k, 10 * k + 5) for k in (2, 3, 4)]  # the first pair told the size
+    for text, images in (("camera:0,1", {"0": left, "1": right}), ("camera:2", {"2": both})):
+        played(images)
+        sequence = slam.open_sequence(text)
+        assert is_live(sequence)
+        assert (sequence.format, sequence.kind, sequence.name) == ("camera", "handheld", text)
+        assert sequence.rig.b == pytest.approx(rig_here.b)
+        frames = list(sequence.frames(0, 3))
+        assert [(int(f.left[0, 0]), int(f.right[0, 0])) for f in frames] == expected
+        assert [f.index for f in frames] == [0, 1, 2]
+        assert (np.diff([f.stamp for f in frames]) > 0).all()
+        assert abs(frames[0].stamp - time.time()) < 60
+
+
+def test_swapped_halves_and_a_part_of_the_frames(rig_here, played):
+    played({"0": [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(9)]})
+    frames = list(slam.open_sequence("camera:0?swap=yes&kind=driving").frames(2, 5))
+    assert [(f.index, int(f.left[0, 0]), int(f.right[0, 0])) for f in frames] == [(2, 35, 30), (3, 45, 40), (4, 55, 50)]
+
+
+def test_a_video_file_plays_a_device_at_its_own_rate(rig_here, scene, tmp_path):
+    write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 20.0)
+    sequence = slam.open_sequence("camera:both.avi")
+    began = time.monotonic()
+    frames = list(slam.LiveFrames(sequence))
+    assert [f.index for f in frames] == [0, 1, 2]  # the first told the size; a file has an end
+    assert time.monotonic() - began > 0.09
+    assert frames[0].left.shape == (HEIGHT, WIDTH)
+
+
+# ------------------------------------------------------------------------------------------------ faults
+
+
+def test_a_camera_that_stops_and_comes_back_is_waited_for(rig_here, played, caplog):
+    pairs = [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(6)]
+    played({"0": [*pairs[:3], None, None, None, *pairs[3:]]})
+    sequence = slam.open_sequence("camera:0")
+    frames = list(sequence.frames(0, 5))
+    assert [int(f.left[0, 0]) for f in frames] == [10, 20, 30, 40, 50]
+    assert (np.diff([f.stamp for f in frames]) > 0).all()
+    assert Played.opened == 4  # at first, and after each of the failures
+    assert len(sequence.warnings) == 2
+    assert "no more frames; they are waited for 10 s" in caplog.text
+    assert "frames again after 0." in caplog.text
+
+
+def test_a_camera_that_stays_silent_ends_the_run_with_one_line(rig_here, played):
+    played({"0": [np.hstack([grey(10), grey(15)])] * 3})
+    frames = slam.open_sequence("camera:0?wait=0.05").frames()
+    assert next(frames).index == 0
+    assert next(frames).index == 1
+    with pytest.raises(SequenceError, match=r"camera:0: no frames for 0.05 s"):
+        next(frames)
+
+
+def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
+    played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
+    wrong = {
+        "camera:": "name one device",
+        "camera:0,1,2": "name one device",
+        "camera:?left=0": "both left",
+        "camera:0?left=0&right=1": "no other address",
+        "camera:0?colour=yes": "unknown option 'colour' of format camera",
+        "camera:0?kind=flying": "kind of motion",
+        "camera:0?wait=long": "wait must be a number",
+        "camera:0?width=0": "width must be a number",
+    }
+    for text, words in wrong.items():
+        with pytest.raises(ConfigurationError, match=words):
+            slam.open_sequence(text)
+    for text, words in {
+        "camera:9": "cannot be opened",
+        "camera:0,1": "differ in size: 64x120 and 160x120",
+        "camera:2": "161x120 cannot hold two side by side",
+        "camera:3?wait=0": "gives no images",
+    }.items():
+        played({"0": [grey(0, 64)], "1": [grey(0)], "2": [grey(0, 161)], "3": []})
+        with pytest.raises(SequenceError, match=words):
+            slam.open_sequence(text)
+    with pytest.raises(TypeError, match="no number of frames"):
+        played({"1": [grey(0, 320)]})
+        len(slam.open_sequence("camera:1"))
+    (tmp_path / "calibration.yaml").unlink()
+    with pytest.raises(CalibrationError, match="calibration is missing"):
+        slam.open_sequence("camera:1")
+
+
+def test_images_of_another_size_than_the_calibration_s(rig_here, played, tmp_path):
+    text = (tmp_path / "calibration.yaml").read_text()
+    (tmp_path / "calibration.yaml").write_text(f"{text}image_width: 320\nimage_height: 240\n")
+    played({"0": [grey(0, 2 * WIDTH)]})
+    with pytest.raises(SequenceError, match=r"images are 160x120, but .* is for 320x240; .*width="):
+        slam.open_sequence("camera:0")
+
+
+def test_a_missing_device_is_one_line(rig_here):
+    for text, words in {
+        "camera:87": "camera:87: cannot be opened",
+        "camera:nothing.mp4": "there is no such file or device",
+        "camera:rtsp://me:secret@127.0.0.1:9/s?x=1": "camera:rtsp://127.0.0.1:9/s",
+        "camera:videotestsrc ! appsink?swap=no": "cannot be opened",
+    }.items():
+        with pytest.raises(SequenceError, match=words) as error:
+            slam.open_sequence(text)
+        assert "secret" not in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------------ the command
+
+
+class Watched:
+    """A camera that gives the same scene until rows are written; then it sends Ctrl-C and is stuck."""
+
+    sent, free = threading.Event(), threading.Event()
+
+    def __init__(self, image: np.ndarray, rows: Path) -> None:
+        self.image, self.rows = image, rows
+
+    def grab(self) -> bool:
+        time.sleep(0.01)
+        if self.sent.is_set():
+            return False
+        if self.rows.exists() and self.rows.read_text().count("\n") >= 4:
+            self.sent.set()
+            os.kill(os.getpid(), signal.SIGINT)
+            self.free.wait(20)
+            return False
+        return True
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, self.image
+
+    def release(self) -> None:
+        pass
+
+
+def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scene, slam_command, tmp_path, monkeypatch):
+    image, out = np.hstack([scene[0].left, scene[0].right]), tmp_path / "out"
+    monkeypatch.setattr(devices, "open_device", lambda *_: Watched(image, out / "frames.csv"))
+    Watched.free.clear()
+    Watched.sent.clear()
+    try:
+        done = slam_command("run", "camera:0?wait=0", "--out", out, "--no-picture")
+    finally:
+        Watched.free.set()
+    assert done.returncode == 0, done.stderr
+    assert "frames dropped" in done.stdout
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["ended"] == "ended by the user"
+    assert summary["frames"] >= 3
+    assert summary["live"]["milliseconds behind"]["median"] > 0
+    assert (out / "trajectory_final.txt").read_text().count("\n") == summary["frames"]
+    config = json.loads((out / "config.json").read_text())
+    assert config["source"] == {"format": None, "given": "camera:0?wait=0"}
+
+
+def test_a_recording_runs_live_and_says_what_it_left_out(slam_command, tmp_path):
+    world = f"synthetic:desk?frames=12&width={WIDTH}&height={HEIGHT}"
+    done = slam_command("run", world, "--live", "--out", tmp_path / "out", "--no-picture", "--quiet")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["ended"] == "completed"
+    assert summary["frames"] + summary["live"]["frames dropped"] == 12
+
+
+def test_cameras_cannot_be_compared(slam_command, tmp_path):
+    done = slam_command("compare", "camera:0", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "compare recordings" in done.stderr

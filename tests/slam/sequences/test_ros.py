@@ -1,0 +1,380 @@
+"""ROS recordings of all kinds, written by rosbags itself: topics found, stamps paired, cameras calibrated."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+import slam
+from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError
+from slam.sequences.ros_images import COMPRESSED, RAW, grey_image
+
+WIDTH, HEIGHT = 64, 48
+T0 = 1_700_000_000_000_000_000
+STEP = 50_000_000
+STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
+INFO = "sensor_msgs/msg/CameraInfo"
+LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
+
+
+def picture(value: int) -> np.ndarray:
+    noise = np.random.default_rng(value).integers(0, 4, (HEIGHT, WIDTH))
+    return (10 * (value + 1) + noise).astype(np.uint8)
+
+
+def header(store, stamp: int):
+    types = store.types
+    time = types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9)
+    more = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__annotations__ else {}
+    return types["std_msgs/msg/Header"](stamp=time, frame_id="camera", **more)
+
+
+def image(store, stamp: int, pixels: np.ndarray, encoding: str = "mono8", big: bool = False):
+    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+    padded = np.pad(rows, ((0, 0), (0, 3)))  # drivers align rows
+    return store.types[RAW](
+        header(store, stamp), len(pixels), pixels.shape[1], encoding, int(big), padded.shape[1], padded.ravel()
+    )
+
+
+def compressed(store, stamp: int, message):
+    data = cv2.imencode(".png", message.data.reshape(HEIGHT, -1)[:, :WIDTH])[1].ravel()
+    return store.types[COMPRESSED](header(store, stamp), "png", data)
+
+
+K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
+D = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
+R_LEFT = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+R_RIGHT = cv2.Rodrigues(np.array([-0.01, 0.01, 0.003]))[0]
+
+
+def info(store, baseline: float, R: np.ndarray = R_LEFT, **change):
+    P = np.array([[48.0, 0, 30.0, -48.0 * baseline], [0, 48.0, 24.0, 0], [0, 0, 1, 0]])
+    types, capital = store.types, store is STORES[1]
+    matrices = {"D": D, "K": K.ravel(), "R": R.ravel(), "P": P.ravel()}
+    values = {
+        "header": header(store, T0),
+        "height": HEIGHT,
+        "width": WIDTH,
+        "distortion_model": "plumb_bob",
+        **{(name if capital else name.lower()): value for name, value in matrices.items()},
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+    }
+    return types[INFO](**{**values, **change})
+
+
+def stereo(store, count: int = 6, late: int = 0):
+    """Topic, kind, time of recording and message of a stereo recording whose right images come `late` ns later."""
+    rows = [
+        ("/stereo/left/camera_info", INFO, T0, info(store, 0.0)),
+        ("/stereo/right/camera_info", INFO, T0, info(store, 0.2, R_RIGHT)),
+    ]
+    for k in range(count):
+        stamp = T0 + k * STEP
+        rows.append((LEFT, RAW, stamp + 1000, image(store, stamp, picture(k))))
+        rows.append((RIGHT, RAW, stamp + 2000 + late, image(store, stamp + 1_000_000, picture(k + 10))))
+    return rows
+
+
+def write(path: Path, rows, version: int = 1) -> Path:
+    store = STORES[version]
+    mcap = {"storage_plugin": StoragePlugin.MCAP} if path.suffix == ".mcap" else {}
+    folder = path.with_suffix("") if version == 2 else path
+    with Writer1(path) if version == 1 else Writer2(folder, version=9, **mcap) as bag:
+        topics = {}
+        for topic, kind, time, message in sorted(rows, key=lambda row: row[2]):
+            if topic not in topics:
+                topics[topic] = bag.add_connection(topic, kind, typestore=store)
+            data = store.serialize_ros1(message, kind) if version == 1 else store.serialize_cdr(message, kind)
+            bag.write(topics[topic], time, data)
+    return path if version == 1 else folder
+
+
+def seeds(sequence) -> list[tuple[int, int | None]]:
+    def seed(pixels):
+        return None if pixels is None else round((float(pixels.mean()) - 1.5) / 10) - 1
+
+    return [(seed(f.left), seed(f.right)) for f in sequence]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return write(tmp_path / "walk.bag", stereo(STORES[1]))
+
+
+# ------------------------------------------------------------------------------------------------ formats
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2 folder", "mcap", "db3"])
+def test_every_kind_of_recording_is_found_out_and_read(kind: str, tmp_path: Path) -> None:
+    version = 1 if kind == "ros1" else 2
+    name = {"ros1": "walk.bag", "mcap": "walk.mcap"}.get(kind, "walk")
+    path = write(tmp_path / name, stereo(STORES[version]), version)
+    if kind in ("mcap", "db3"):
+        (path,) = path.glob(f"*.{kind}")
+    sequence = slam.open_sequence(path)
+    assert (sequence.format, sequence.kind, len(sequence)) == ("ros", "handheld", 6)
+    assert seeds(sequence) == [(k, k + 10) for k in range(6)]
+    assert seeds(sequence.frames(2, 4)) == [(2, 12), (3, 13)]
+    assert [f.index for f in sequence.frames(4)] == [4, 5]
+    assert np.allclose(np.diff([f.stamp for f in sequence]), 0.05)
+    assert next(iter(sequence)).stamp == pytest.approx(T0 * 1e-9, abs=1e-6)
+    assert sequence.warnings == []
+
+
+def test_raw_images_have_the_rig_that_the_rectified_ones_come_from(bag: Path) -> None:
+    rig = slam.open_sequence(bag).rig
+    points = np.array([[0.1, -0.2, 2.0], [-0.3, 0.1, 4.0]])
+    for camera, R, shift in ((rig.left, R_LEFT, 0.0), (rig.right, R_RIGHT, -0.2)):
+        own = (points @ R_LEFT.T + [shift, 0, 0]) @ R  # to rectified axes, to the other camera, and back
+        expected = cv2.projectPoints(own, np.zeros(3), np.zeros(3), K, D)[0].reshape(-1, 2)
+        pixels = rig.project(points)[0 if camera is rig.left else 1]
+        assert np.allclose(pixels, expected, atol=1e-6)
+    assert rig.baseline == pytest.approx(0.2)
+
+
+def test_rectified_images_have_the_rig_of_p(tmp_path: Path) -> None:
+    rows = [(t.replace("image_raw", "image_rect"), *rest) for t, *rest in stereo(STORES[1])]
+    path = write(tmp_path / "rect.bag", rows)
+    rig = slam.open_sequence(path).rig
+    assert rig.is_rectified
+    assert (rig.left.fu, rig.left.u0, rig.baseline) == (48.0, 30.0, pytest.approx(0.2))
+    assert not slam.open_sequence(f"{path}?rectified=no").rig.is_rectified
+
+
+def test_a_right_topic_recorded_long_after_the_left_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "late.bag", stereo(STORES[1], late=4 * STEP))
+    assert seeds(slam.open_sequence(path).frames(1)) == [(k, k + 10) for k in range(1, 6)]
+
+
+def test_missing_partners_and_the_tolerance(tmp_path: Path) -> None:
+    rows = [row for row in stereo(STORES[1]) if not (row[0] == RIGHT and T0 + STEP < row[2] < T0 + 2 * STEP)]
+    path = write(tmp_path / "gap.bag", rows)
+    sequence = slam.open_sequence(path)
+    assert seeds(sequence) == [(0, 10), (1, None), (2, 12), (3, 13), (4, 14), (5, 15)]
+    assert any("/stereo/left/image_raw: 1 images have no partner" in line for line in sequence.warnings)
+    with pytest.raises(SequenceError, match="nearest two are 1000000 ns apart"):
+        slam.open_sequence(f"{path}?tolerance=0.0005")
+
+
+def test_images_without_stamps_take_the_times_of_recording(tmp_path: Path) -> None:
+    store = STORES[1]
+    rows = stereo(store)[:2]
+    for k in range(3):
+        rows += [(topic, RAW, T0 + k * STEP, image(store, 0, picture(k))) for topic in (LEFT, RIGHT)]
+    sequence = slam.open_sequence(write(tmp_path / "zero.bag", rows))
+    assert np.allclose(np.diff(sequence.stamps), 0.05)
+    assert any("have no stamps" in line for line in sequence.warnings)
+
+
+# ------------------------------------------------------------------------------------------------ images
+
+
+COLOURS = np.zeros((4, 6, 3), np.uint8)
+COLOURS[:] = (10, 60, 200)  # blue, green, red
+GREY = int(cv2.cvtColor(COLOURS, cv2.COLOR_BGR2GRAY)[2, 2])
+
+
+def bayer(pattern: str) -> np.ndarray:
+    value = {"b": 10, "g": 60, "r": 200}
+    return np.tile(np.array([[value[pattern[0]], value[pattern[1]]], [value[pattern[2]], value[pattern[3]]]]), (2, 3))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixels", "grey", "dtype"),
+    [
+        ("mono8", np.full((4, 6), 7, np.uint8), 7, np.uint8),
+        ("mono16", np.full((4, 6), 700, np.uint16), 700, np.uint16),
+        ("bgr8", COLOURS, GREY, np.uint8),
+        ("rgb8", np.ascontiguousarray(COLOURS[..., ::-1]), GREY, np.uint8),
+        ("rgba8", np.dstack([COLOURS[..., ::-1], COLOURS[..., :1]]), GREY, np.uint8),
+        ("bgr16", COLOURS.astype(np.uint16) * 256, 256 * GREY, np.uint16),
+        *((f"bayer_{p}8", bayer(p).astype(np.uint8), GREY, np.uint8) for p in ("rggb", "bggr", "gbrg", "grbg")),
+        ("bayer_rggb16", (bayer("rggb") * 256).astype(np.uint16), 256 * GREY, np.uint16),
+    ],
+)
+def test_encodings(encoding: str, pixels: np.ndarray, grey: int, dtype: type) -> None:
+    found = grey_image(image(STORES[2], T0, pixels, encoding), RAW, "/x", (6, 4))
+    assert found.dtype == dtype
+    assert found.shape == (4, 6)
+    assert abs(int(found[2, 2]) - grey) <= 256 * (dtype == np.uint16) * (encoding != "mono16") + 1
+
+
+def test_big_endian_pixels() -> None:
+    pixels = (100 * np.arange(24)).reshape(4, 6).astype(">u2")
+    assert np.array_equal(grey_image(image(STORES[2], T0, pixels, "mono16", True), RAW, "/x"), pixels)
+
+
+def test_compressed_images(tmp_path: Path) -> None:
+    store = STORES[2]
+    rows = [
+        (f"{topic}/compressed", COMPRESSED, time, compressed(store, time, message))
+        if kind == RAW
+        else (topic, kind, time, message)
+        for topic, kind, time, message in stereo(store)
+    ]
+    sequence = slam.open_sequence(f"{write(tmp_path / 'small', rows, 2)}?kind=driving")
+    assert sequence.kind == "driving"
+    assert seeds(sequence) == [(k, k + 10) for k in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"encoding": "jpg9"}, "encoding 'jpg9' is not supported"),
+        ({"height": 400}, "image is 6x400, not 6x4"),
+        ({"step": 2}, "bytes are too few"),
+        ({"data": np.zeros(5, np.uint8)}, "5 bytes are too few"),
+    ],
+)
+def test_messages_that_do_not_agree_with_themselves(change: dict, words: str) -> None:
+    message = image(STORES[2], T0, np.zeros((4, 6), np.uint8))
+    for name, value in change.items():
+        object.__setattr__(message, name, value)
+    with pytest.raises(SequenceError, match=words):
+        grey_image(message, RAW, "/x", (6, 4))
+    object.__setattr__(message, "width", 2**31)
+    with pytest.raises(SequenceError, match="at most 67108864 pixels"):
+        grey_image(message, RAW, "/x")
+
+
+def test_a_damaged_image_costs_its_frame_alone(tmp_path: Path) -> None:
+    store, rows = STORES[1], stereo(STORES[1])
+    for k, (topic, kind, time, message) in enumerate(rows):
+        if topic == LEFT and message.header.stamp.nanosec == (T0 + 2 * STEP) % 10**9:
+            rows[k] = (topic, kind, time, image(store, T0 + 2 * STEP, picture(2)[:, :32]))
+    sequence = slam.open_sequence(write(tmp_path / "hurt.bag", rows))
+    assert seeds(sequence) == [(k, k + 10) for k in (0, 1, 3, 4, 5)]
+    assert sequence.warnings == ["frame 2 skipped: /stereo/left/image_raw, message 2: image is 32x48, not 64x48"]
+
+
+# ------------------------------------------------------------------------------------------------ topics
+
+
+def test_topics_can_be_named_and_a_missing_one_lists_those_there_are(bag: Path) -> None:
+    assert len(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}")) == 6
+    infos = "left_info=/stereo/left/camera_info&right_info=/stereo/right/camera_info"
+    assert len(slam.open_sequence(f"{bag}?left={LEFT}&right={RIGHT}&{infos}")) == 6
+    with pytest.raises(SequenceError, match=rf"/stereo/lft/image_raw: there is none .*mean '{LEFT}'.*{LEFT}, {RIGHT}"):
+        slam.open_sequence(f"{bag}?left=/stereo/lft/image_raw&right={RIGHT}")
+    with pytest.raises(SequenceError, match=r"it holds sensor_msgs/msg/CameraInfo"):
+        slam.open_sequence(f"{bag}?left=/stereo/left/camera_info&right={RIGHT}")
+    with pytest.raises(ConfigurationError, match="name both topics"):
+        slam.open_sequence(f"{bag}?left={LEFT}")
+    with pytest.raises(ConfigurationError, match="tolerance must be"):
+        slam.open_sequence(f"{bag}?tolerance=long")
+    with pytest.raises(ConfigurationError, match="unknown option 'fps' of format ros"):
+        slam.open_sequence(f"{bag}?fps=3")
+
+
+def test_depth_images_and_other_cameras_are_no_stereo_pair(tmp_path: Path) -> None:
+    store, rows = STORES[1], stereo(STORES[1])
+    depth = image(store, T0, np.zeros((HEIGHT, WIDTH), np.uint16), "16UC1")
+    rows += [("/depth/camera_info", INFO, T0, info(store, 0.0)), ("/depth/image_rect", RAW, T0, depth)]
+    rows += [("/colour/camera_info", INFO, T0, info(store, 0.0, width=2 * WIDTH))]
+    rows += [("/colour/image_raw", RAW, T0, image(store, T0, np.zeros((HEIGHT, 2 * WIDTH), np.uint8)))]
+    assert seeds(slam.open_sequence(write(tmp_path / "many.bag", rows)).frames(0, 1)) == [(0, 10)]
+    rows += [
+        ("/twin/camera_info", INFO, T0, info(store, 0.0)),
+        ("/twin/image_raw", RAW, T0, image(store, T0, picture(3))),
+    ]
+    with pytest.raises(
+        SequenceError, match=rf"several stereo pairs, choose one: left={LEFT}&right={RIGHT}; left=/twin"
+    ):
+        slam.open_sequence(write(tmp_path / "more.bag", rows))
+
+
+def test_without_camera_messages_a_calibration_file_and_names_decide(tmp_path: Path) -> None:
+    rows = [row for row in stereo(STORES[1]) if row[1] == RAW]
+    rows = [(t.replace("/stereo/left", "/cam0").replace("/stereo/right", "/cam1"), *rest) for t, *rest in rows]
+    path = write(tmp_path / "euroc.bag", rows)
+    with pytest.raises(
+        SequenceError, match=r"no stereo pair: add left=/….* of /cam0/image_raw, /cam1/image_raw, and cal"
+    ):
+        slam.open_sequence(path)
+    with pytest.raises(CalibrationError, match="no /cam0/camera_info for /cam0/image_raw: add left_info"):
+        slam.open_sequence(f"{path}?left=/cam0/image_raw&right=/cam1/image_raw")
+    camera = f"  intrinsics: [50, 50, 31, 23]\n  resolution: [{WIDTH}, {HEIGHT}]\n"
+    T = "  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    (tmp_path / "camchain.yaml").write_text(f"cam0:\n{camera}cam1:\n{camera}{T}")
+    sequence = slam.open_sequence(f"{path}?calibration=camchain.yaml")
+    assert sequence.rig.baseline == pytest.approx(0.1)
+    assert seeds(sequence) == [(k, k + 10) for k in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"K": np.zeros(9)}, "left camera is not calibrated"),
+        ({"distortion_model": "kannala"}, "distortion model 'kannala' is not supported"),
+        ({"binning_x": 2}, "binning"),
+        ({"width": 32}, "images are 64x48, but .* is for 32x48"),
+        ({"K": np.full(9, np.nan)}, "K is not finite"),
+    ],
+)
+def test_cameras_that_are_not_calibrated(change: dict, words: str, tmp_path: Path) -> None:
+    store, rows = STORES[1], stereo(STORES[1])
+    rows[0] = (*rows[0][:3], info(store, 0.0, **change))
+    rows[1] = (*rows[1][:3], info(store, 0.2, R_RIGHT, **({"width": 32} if "width" in change else {})))
+    with pytest.raises(SlamError, match=words):
+        slam.open_sequence(write(tmp_path / "wrong.bag", rows))
+
+
+# ------------------------------------------------------------------------------------------------ faults
+
+
+def test_a_folder_above_names_the_recordings_in_it(bag: Path) -> None:
+    (bag.parent / "notes.txt").write_text("x")
+    with pytest.raises(SequenceError, match=r"below it are walk\.bag"):
+        slam.open_sequence(bag.parent)
+
+
+def test_without_the_package_the_line_says_how_to_install_it(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(SequenceError, match=r"pip install 'surf-stereo-slam\[ros\]'"):
+        slam.open_sequence(bag)
+
+
+def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
+    for name, data in (("a.bag", b""), ("b.bag", b"#ROSBAG V1.2\n"), ("c.mcap", b"nonsense"), ("d.db3", b"nonsense")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(SequenceError, match=rf"{name}: cannot be read as a ROS recording"):
+            slam.open_sequence(tmp_path / name)
+    rows = [("/talk", "std_msgs/msg/Header", T0, header(STORES[1], T0))]
+    with pytest.raises(SequenceError, match="no images; its topics are /talk"):
+        slam.open_sequence(write(tmp_path / "talk.bag", rows))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_damaged_recordings_end_in_one_line_or_are_read(version: int, tmp_path: Path) -> None:
+    path = write(tmp_path / ("walk.bag" if version == 1 else "walk.mcap"), stereo(STORES[version], 2), version)
+    file = path if version == 1 else next(path.glob("*.mcap"))
+    data, rng = file.read_bytes(), np.random.default_rng(0)
+    hurt = tmp_path / f"hurt{file.suffix}"
+    for _ in range(60):
+        changed = bytearray(data[: rng.integers(1, len(data)) if rng.random() < 0.3 else len(data)])
+        for at in rng.integers(0, len(changed), 8):
+            changed[at] = rng.integers(0, 256)
+        hurt.write_bytes(changed)
+        try:
+            list(slam.open_sequence(hurt))
+        except SlamError as error:
+            assert "\n" not in str(error)
+
+
+def test_a_recording_as_this_test_writes_it_is_one_for_others(bag: Path) -> None:
+    with AnyReader([bag]) as reader:
+        assert sorted(reader.topics) == [
+            "/stereo/left/camera_info", LEFT, "/stereo/right/camera_info", RIGHT,
+        ]  # fmt: skip

@@ -1,0 +1,163 @@
+"""What looks wrong with images and times is said once each; what is right is left in peace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import slam
+from slam import worlds
+from slam.data import StereoFeatures, StereoFrame
+from slam.geometry.camera import PinholeCamera
+from slam.models import models_for
+from slam.tracking.input_warnings import InputWarnings, farthest_apart
+from slam.tracking.pair_check import pair_geometry
+
+SEQUENCE = slam.open_sequence("synthetic:desk?frames=1")
+FRAME = next(iter(SEQUENCE))
+RIG = SEQUENCE.rig
+
+
+def lines(frames, features=200, rig=RIG, kind="handheld"):
+    """What is said of frames in which the front end found so many features."""
+    watch = InputWarnings(rig, models_for(kind), 1.5)
+    image = np.zeros((features, 2))
+    found = replace(
+        StereoFeatures.empty(0.0),
+        **{name: image for name in ("uv_left", "uv_right", "descriptors")},
+        **{name: image[:, 0] for name in ("scale", "angle", "response", "laplacian")},
+    )
+    for frame in frames:
+        watch.look(frame, found)
+    return watch.lines
+
+
+def stamped(stamps):
+    return [replace(FRAME, index=k, stamp=stamp) for k, stamp in enumerate(stamps)]
+
+
+@pytest.mark.parametrize("world", worlds.names())
+def test_worlds_are_right(world):
+    sequence = slam.open_sequence(f"synthetic:{world}?frames=2")
+    found = pair_geometry(sequence.rig, *images(next(iter(sequence))), 1.5)
+    assert found.conclusive
+    assert not found.swapped
+    assert not found.rows_differ
+
+
+def images(frame):
+    return frame.left, frame.right
+
+
+def test_swapped_cameras_are_named_once():
+    swapped = [replace(f, left=f.right, right=f.left) for f in stamped(0.05 * np.arange(8))]
+    (line,) = lines(swapped)
+    assert "left and right look swapped" in line
+    assert "exchange them" in line
+
+
+def test_swapped_cameras_of_an_unrectified_rig():
+    turn = cv2.Rodrigues(np.array([0.02, 0.05, -0.03]))[0]
+    left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.1, 0.02, 0.001, 0.0))
+    right = PinholeCamera(255.0, 256.0, 150.0, 130.0, 320, 240, "radtan", (-0.12, 0.02, 0.0, 0.001))
+    rig = slam.StereoRig(left, right, turn, turn.T @ np.array([-0.12, 0.004, 0.002]))
+    # The rig's own images: where each pixel's ray meets the rectified image of the world
+    views = []
+    for image, camera, R in ((FRAME.left, left, np.eye(3)), (FRAME.right, right, turn)):
+        v, u = np.mgrid[:240, :320]
+        rays = np.column_stack(
+            [camera.normalise(np.column_stack([u.ravel(), v.ravel()]).astype(float)), np.ones(76800)]
+        )
+        uv = np.nan_to_num(RIG.left.project(rays @ R), nan=-1).astype(np.float32).reshape(240, 320, 2)
+        views.append(cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR))
+    rig = slam.StereoRig(left, right, turn, RIG.b)
+    good, bad = pair_geometry(rig, *views, 1.5), pair_geometry(rig, *views[::-1], 1.5)
+    assert good.conclusive and not good.swapped and not good.rows_differ
+    assert bad.swapped
+
+
+@pytest.mark.parametrize("shift", [-9, 4])
+def test_rows_that_do_not_agree_are_told_with_how_much(shift):
+    shifted = [replace(f, right=np.roll(f.right, shift, axis=0)) for f in stamped(0.05 * np.arange(8))]
+    (line,) = lines(shifted)
+    assert "rows of left and right image do not agree" in line
+    assert f"off by {abs(shift)}.0 px" in line
+
+
+def test_a_turned_camera_is_found_by_its_rows():
+    turn = cv2.getRotationMatrix2D((160, 120), 8.0, 1.0)
+    turned = [replace(f, right=cv2.warpAffine(f.right, turn, (320, 240))) for f in stamped([0.0])]
+    assert "rows of left and right" in lines(turned)[0]
+
+
+def test_images_of_different_things_say_nothing():
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in range(2)]
+    assert lines([StereoFrame(k, 0.05 * k, *noise) for k in range(70)]) == []
+    black = np.zeros((240, 320), np.uint8)
+    assert lines([StereoFrame(k, 0.05 * k, black, black) for k in range(3)]) == []
+    assert lines([replace(FRAME, right=None)]) == []
+
+
+def test_colour_and_sixteen_bits():
+    colour = [cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in images(FRAME)]
+    deep = [image.astype(np.uint16) * 257 for image in images(FRAME)]
+    for left, right in (colour, deep):
+        assert "swapped" in lines([StereoFrame(0, 0.0, right, left)])[0]
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        (50.0, "50 s apart by their stamps (are they in milliseconds?): give stamps in seconds"),
+        (33_333.0, "are they in microseconds?"),
+        (5e7, "are they in nanoseconds?"),
+        (5e-11, "5e-11 s apart by their stamps: give stamps in seconds"),
+        (2.0, "frames are 2 s apart: a camera can turn out of view"),
+    ],
+)
+def test_stamps_in_another_unit_and_frames_far_apart(interval, words):
+    (line,) = lines(stamped(interval * np.arange(20)))
+    assert words in line
+
+
+def test_usual_rates_and_single_gaps_say_nothing():
+    for interval in (0.001, 0.05, 0.5):
+        assert lines(stamped(interval * np.arange(8))) == []
+    assert lines(stamped([0, 0.1, 0.2, 40.0, 40.1, 40.2, 40.3])) == []
+
+
+def test_how_far_frames_may_be_apart_follows_from_view_and_motion():
+    handheld, driving = (farthest_apart(RIG, models_for(kind)) for kind in ("handheld", "driving"))
+    assert driving > handheld
+    # one standard deviation of the turn after that time is half of the view
+    assert 1.0 * np.sqrt(handheld) * handheld == pytest.approx(np.arctan(160 / RIG.left.fu))
+
+
+def test_frames_without_texture_are_named_once_and_single_ones_are_not():
+    frames = stamped(0.05 * np.arange(12))
+    (line,) = lines(frames, features=3)
+    assert "hardly anything to follow (3 features in frame 4)" in line
+    assert lines(frames[:4], features=3) == []
+
+
+def test_a_run_says_it_on_the_terminal_and_in_its_summary(slam_command, tmp_path):
+    for side, image in (("left", FRAME.right), ("right", FRAME.left)):
+        (tmp_path / "mine" / side).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "mine" / side / "000000.png"), image)
+        cv2.imwrite(str(tmp_path / "mine" / side / "000001.png"), image)
+    storage = cv2.FileStorage(str(tmp_path / "mine" / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"K1": RIG.left.K, "K2": RIG.right.K, "R": RIG.R, "T": RIG.R @ RIG.b}.items():
+        storage.write(name, value)
+    storage.release()
+    done = slam_command("run", f"{tmp_path / 'mine'}?fps=20", "--out", tmp_path / "out", "--quiet", "--no-picture")
+    assert done.returncode == 0
+    assert done.stderr.count("look swapped") == 1
+    assert (tmp_path / "out" / "summary.json").read_text().count("look swapped") == 1
+    done = slam_command(
+        "run", f"{tmp_path / 'mine'}?fps=20&left=right&right=left", "--out", tmp_path / "o2", "--quiet", "--no-picture"
+    )
+    assert "swapped" not in done.stderr
