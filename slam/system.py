@@ -20,6 +20,7 @@ from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
+from slam.one_thread import OneThread
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
 from slam.runtime.stages import Stages
@@ -55,6 +56,9 @@ class _Last:
 
 class StereoSlam:
     """Stereo SLAM with a front end and a back end of choice.
+
+    For one thread at a time; systems of their own may run in several threads, and give the same bytes as alone. A
+    system can be pickled and copied with `copy.deepcopy` where its parts can; the copy goes on to the same bytes.
 
     Args:
         rig: the two cameras.
@@ -113,6 +117,7 @@ class StereoSlam:
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
+        self._stepping, self._extracting = OneThread("this system"), OneThread("this system's front end")
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._given = self.calibration.applied  # the correction of all that the back end was given
         self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
@@ -124,9 +129,10 @@ class StereoSlam:
 
     def process(self, frame: StereoFrame) -> FrameResult:
         """One step from a pair of images; see `process_features`."""
-        _, features, milliseconds = self._extract(frame)
-        result = self.process_features(features)
-        return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+        with self._stepping:
+            _, features, milliseconds = self._extract(frame)
+            result = self._step(features)
+            return replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
@@ -149,7 +155,7 @@ class StereoSlam:
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
         stages = Stages()
-        with stages.stage("extract"):
+        with self._extracting, stages.stage("extract"):
             features = self.frontend.extract(frame)
         return frame, features, stages.milliseconds
 
@@ -162,9 +168,15 @@ class StereoSlam:
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
+            SlamError: another thread is using the system.
         """
+        with self._stepping:
+            return self._step(features)
+
+    def _step(self, features: StereoFeatures) -> FrameResult:
+        """`process_features`, in the only thread."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
-        self.roll_back()
+        self._roll_back()
         index, stages = self._last.index + 1, self._stages
         if self._relocalizer.search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
@@ -208,6 +220,11 @@ class StereoSlam:
         stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step, `estimate`
         and `snapshot` do this by themselves; without such an exception there is nothing to do.
         """
+        with self._stepping:
+            self._roll_back()
+
+    def _roll_back(self) -> None:
+        """`roll_back`, in the only thread."""
         stage = self._stages.current
         if stage in ("associate", "objects"):
             self.objects.restart()
@@ -218,11 +235,17 @@ class StereoSlam:
 
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose (in a known map, from when it was found)."""
-        return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
+        with self._stepping:
+            return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
-        self.roll_back()
+        with self._stepping:
+            return self._estimate()
+
+    def _estimate(self) -> Estimate:
+        """`estimate`, in the only thread."""
+        self._roll_back()
         search = self._relocalizer.search
         return self._considered(self.backend.estimate()) if search is None else search.estimate(float("nan"))
 
@@ -232,14 +255,20 @@ class StereoSlam:
         Raises:
             SlamError: there is no map yet.
         """
-        if self._relocalizer.search is not None:
-            return self._relocalizer.search.known
-        estimate = self.estimate() if self.landmarks is not None else None
-        if estimate is None or self.landmarks is None:
-            raise SlamError("there is no map yet: no frame was processed")
         from slam import __version__
 
-        return SavedMap.of(self.landmarks, estimate, self.frontend_name, self.world_frame, __version__)
+        with self._stepping:
+            if self._relocalizer.search is not None:
+                return self._relocalizer.search.known
+            estimate = self._estimate() if self.landmarks is not None else None
+            if estimate is None or self.landmarks is None:
+                raise SlamError("there is no map yet: no frame was processed")
+            return SavedMap.of(self.landmarks, estimate, self.frontend_name, self.world_frame, __version__)
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a copy holds; refused while another thread is in a step."""
+        with self._stepping:
+            return vars(self).copy()
 
     @property
     def restarted(self) -> list[int]:

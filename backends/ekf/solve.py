@@ -120,6 +120,10 @@ class Solution:
         B = self.H.transposed_times(self.inverse.T)
         return B if self.measured.all() else B[:, self.measured]
 
+    def uncertainty(self, sigma: float) -> float:
+        """Largest standard deviation of an innovation, given those before it, in that of a pixel, `sigma` [px]."""
+        return 1 / (sigma * float(self.inverse.diagonal().min()))
+
 
 @dataclass(frozen=True)
 class _Iterate:
