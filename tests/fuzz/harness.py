@@ -19,7 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+import slam
 from slam.errors import SlamError
+from slam.system import StereoSlam
 
 SECONDS = 10.0  # of processor time for any case
 BLOCKED = 30.0  # of wall time, after which a case waits for something
@@ -82,6 +84,17 @@ def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
     finally:
         _remove(folder)
     return None
+
+
+def warm_up() -> None:
+    """Have the kernels compiled, which takes longer than any case may: a short run of both back ends."""
+    world = slam.open_sequence("synthetic:box?frames=80&density=40&width=160&height=120")
+    for backend in ("ekf", "smoother"):
+        observed, shown = StereoSlam(world.rig, None, backend), StereoSlam(world.rig, "surf", backend)
+        for k in range(60, 80):  # the box moves
+            observed.process_features(world.observations(k))
+        for frame in world.frames(60, 63):
+            shown.process(frame)
 
 
 def require_line(error: SlamError) -> None:
