@@ -88,10 +88,10 @@ def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
 
 def warm_up() -> None:
     """Have the kernels compiled, which takes longer than any case may: a short run of both back ends."""
-    world = slam.open_sequence("synthetic:box?frames=80&density=40&width=160&height=120")
+    world = slam.open_sequence("synthetic:box?frames=90&density=300")
     for backend in ("ekf", "smoother"):
         observed, shown = StereoSlam(world.rig, None, backend), StereoSlam(world.rig, "surf", backend)
-        for k in range(60, 80):  # the box moves
+        for k in range(58, 84):  # the box moves, and is found
             observed.process_features(world.observations(k))
         for frame in world.frames(60, 63):
             shown.process(frame)

@@ -15,8 +15,8 @@ import slam
 from slam.config import SystemConfig
 from slam.system import StereoSlam
 
-WORLD = "synthetic:box?density=40&frames=90&width=160&height=120"
-FIRST = 60  # the box begins to move
+WORLD = "synthetic:box?density=300&frames=90"
+FIRST = 58  # the box moves, and is found twenty frames later
 BACKENDS = ("ekf", "smoother")
 
 
@@ -54,7 +54,7 @@ def main() -> None:
 
     def work() -> None:
         for backend in BACKENDS:
-            found[backend] = run(backend, 25, 4, threads)
+            found[backend] = run(backend, 26, 4, threads)
 
     if elsewhere:
         thread = threading.Thread(target=work)
