@@ -1,6 +1,7 @@
 """The whole system for hours: memory, open files and time, and a camera that stops giving frames and comes back.
 
     python experiments/endurance.py [--quick] [--backend ekf smoother] [--frames 20000] [--images 3000] [--out DIR]
+                                    [--page docs/robustness.md]
 
 Two runs of each back end:
 
@@ -9,7 +10,7 @@ Two runs of each back end:
 
 After a quarter of the frames the camera gives none for an hour, and after half of them nothing is to be seen in fifty.
 A row for every twentieth part: CPU time of a frame, memory of the process and its open files, landmarks, and frames
-that were not tracked.
+that were not tracked. ``--page`` puts the table of all runs in DIR, also earlier ones, on a page.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _HOUR = 3600.0
 _DARK = 50  # frames in which nothing is to be seen
 _RENDERED = 90  # images of the desk, forwards and backwards
 _PARTS = 20
+_KINDS = {"frame": int, "milliseconds": float, "memory": float, "files": int, "landmarks": int, "untracked": int}
+BEGIN, END = "<!-- endurance: written by experiments/endurance.py --page -->", "<!-- end of endurance -->"
 _WORLD = f"synthetic:desk?frames={_RENDERED}&width=240&height=180"
 
 
@@ -120,7 +123,7 @@ def _darkened(item: StereoFrame | StereoFeatures) -> StereoFrame | StereoFeature
 
 
 def table(runs: dict[str, list[Part]]) -> str:
-    """Some parts of every run, and what the last did to the second."""
+    """Some parts of every run."""
     header = ("run", "frames", "ms a frame", "memory [MB]", "open files", "landmarks", "not tracked, so far")
     lines = ["| " + " | ".join(header) + " |", "| --- |" + " ---: |" * (len(header) - 1)]
     for name, parts in runs.items():
@@ -129,6 +132,18 @@ def table(runs: dict[str, list[Part]]) -> str:
             cells = (p.frame, f"{p.milliseconds:.1f}", f"{p.memory:.0f}", p.files, p.landmarks, lost)
             lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
+
+
+def write_page(page: Path, text: str) -> None:
+    """Replace the table on a page, which is between two marks."""
+    before, after = page.read_text(encoding="utf-8").split(BEGIN)
+    page.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after.split(END)[1]}", encoding="utf-8")
+
+
+def read_csv(path: Path) -> list[Part]:
+    """What `write_csv` wrote."""
+    with path.open(newline="") as file:
+        return [Part(*(kind(row[name]) for name, kind in _KINDS.items())) for row in csv.DictReader(file)]
 
 
 def write_csv(path: Path, parts: list[Part]) -> None:
@@ -146,6 +161,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=20_000, help="of observations; 0 for none")
     parser.add_argument("--images", type=int, default=3_000, help="frames of images; 0 for none")
     parser.add_argument("--out", type=Path, default=Path("results/endurance"))
+    parser.add_argument("--page", type=Path, help="a page for the table")
     arguments = parser.parse_args()
     counts = {"observations": arguments.frames, "images": arguments.images}
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -158,6 +174,9 @@ def main() -> int:
                 print(f"{backend} {kind} {part}", file=sys.stderr, flush=True)
                 write_csv(arguments.out / f"{backend}_{kind}.csv", parts)
     print(table(runs))
+    if arguments.page is not None:
+        done = sorted(arguments.out.glob("*_*.csv"), key=lambda path: path.stem.split("_")[::-1], reverse=True)
+        write_page(arguments.page, table({path.stem.replace("_", ", "): read_csv(path) for path in done}))
     return 0
 
 

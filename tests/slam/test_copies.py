@@ -56,7 +56,7 @@ def test_what_holds_gtsam_says_that_it_cannot_be_copied(copied, backend, after):
     for k in range(after):
         system.process_features(SEQUENCE.observations(FIRST + k))
     whole = system if copied is not copy.copy else getattr(system.backend, "_smoother", system.backend)
-    with pytest.raises(CopyError, match="save the map .* or record the run") as caught:
+    with pytest.raises(CopyError, match=r"save the map .* or record the run") as caught:
         copied(whole)
     assert isinstance(caught.value, SlamError) and isinstance(caught.value, TypeError)
     assert system.process_features(SEQUENCE.observations(FIRST + after)).located
