@@ -38,9 +38,7 @@ _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an
 _ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
 _PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
-_VAGUE = (
-    1e3  # standard deviations of a pixel that a prediction may be off by while the rest waits to be brought up to date
-)
+_VAGUE = 1e3  # deviation of an innovation, in those of a pixel, above which all of P is brought up to date
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
 
