@@ -45,3 +45,7 @@ class TrajectoryError(SlamError):
 
 class MeasurementError(SlamError):
     """Measurements handed to an estimator break the contract (shape, ids, NaN, time running backwards)."""
+
+
+class CopyError(SlamError, TypeError):
+    """An object can be neither copied nor pickled; the message says what to do instead."""

@@ -14,6 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from slam.errors import SequenceError, SlamError
 
 _MEBI = 2**20
@@ -75,6 +77,37 @@ def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
         raise error(f"{path}: not a regular file")
     if not status.st_size:
         raise error(f"{path}: the file is empty")
+    require_utf8(path, error)
+
+
+def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
+    """Raise where the name of a file is no UTF-8: OpenCV and other libraries crash on such a name.
+
+    Raises:
+        SlamError: of type `error`.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise error(f"{path}: the name is not in UTF-8") from None
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write an image as PNG, whatever the file is called.
+
+    Raises:
+        OSError: it cannot be written; no part of it is left.
+    """
+    import cv2
+
+    content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+    try:
+        path.write_bytes(content)
+    except OSError:
+        with suppress(OSError):
+            if path.is_file():
+                path.unlink()
+        raise
 
 
 def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:

@@ -23,6 +23,7 @@ from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
+from slam.one_thread import OneThread
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
@@ -63,6 +64,9 @@ class _Last:
 
 class StereoSlam:
     """Stereo SLAM with a front end and a back end of choice.
+
+    For one thread at a time; systems of their own may run in several threads, and give the same bytes as alone. A
+    system can be pickled and copied with `copy.deepcopy` where its parts can; the copy goes on to the same bytes.
 
     Args:
         rig: the two cameras.
@@ -125,6 +129,7 @@ class StereoSlam:
         self._stages = Stages()
         rows = getattr(getattr(self.frontend, "config", None), "epipolar", _ROWS)
         self._input_warnings = InputWarnings(rig, c.models, rows)
+        self._stepping, self._extracting = OneThread("this system"), OneThread("this system's front end")
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         self._given = self.calibration.applied  # the correction of all that the back end was given
         self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
@@ -154,9 +159,10 @@ class StereoSlam:
             SequenceError: the images are of another type or size than the rig's.
         """
         frame = self._frame(left, right, stamp)
-        _, features, milliseconds = self._extract(frame)
-        result = self.process_features(features)
-        return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+        with self._stepping:
+            _, features, milliseconds = self._extract(frame)
+            result = self._step(features)
+            return replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
     def _frame(self, left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None) -> StereoFrame:
         """What `process` was given as a frame."""
@@ -191,12 +197,11 @@ class StereoSlam:
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
         stages = Stages()
-        with stages.stage("extract"):
+        with self._extracting, stages.stage("extract"):
             features = self.frontend.extract(frame)
         self._input_warnings.look(frame, features)
         return frame, features, stages.milliseconds
 
-    @one_blas_thread
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 
@@ -206,9 +211,16 @@ class StereoSlam:
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
+            SlamError: another thread is using the system.
         """
+        with self._stepping:
+            return self._step(features)
+
+    @one_blas_thread
+    def _step(self, features: StereoFeatures) -> FrameResult:
+        """`process_features`, in the only thread."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
-        self.roll_back()
+        self._roll_back()
         index, stages = self._last.index + 1, self._stages
         if self._relocalizer.search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
@@ -257,6 +269,11 @@ class StereoSlam:
         stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step, `estimate`
         and `snapshot` do this by themselves; without such an exception there is nothing to do.
         """
+        with self._stepping:
+            self._roll_back()
+
+    def _roll_back(self) -> None:
+        """`roll_back`, in the only thread."""
         stage = self._stages.current
         if stage in ("associate", "objects"):
             self.objects.restart()
@@ -265,9 +282,11 @@ class StereoSlam:
             self._uncertainty.keep(np.zeros(0, np.int64) if self.landmarks is None else self.landmarks.ids)
         self._stages = Stages()
 
+    @one_blas_thread
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose (in a known map, from when it was found)."""
-        return self.atlas.path(self._path())
+        with self._stepping:
+            return self.atlas.path(self._path())
 
     def _path(self) -> Trajectory:
         """The path as the back end has it, in its own frame."""
@@ -275,7 +294,12 @@ class StereoSlam:
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
-        self.roll_back()
+        with self._stepping:
+            return self._estimate()
+
+    def _estimate(self) -> Estimate:
+        """`estimate`, in the only thread."""
+        self._roll_back()
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
@@ -287,21 +311,27 @@ class StereoSlam:
         Raises:
             SlamError: there is no map yet.
         """
-        if self._relocalizer.search is not None:
-            return self._relocalizer.search.known
-        estimate = self.estimate() if self.landmarks is not None else None
-        if estimate is None or self.landmarks is None:
-            raise SlamError("there is no map yet: no frame was processed")
         from slam import __version__
 
-        rows = self.landmarks.moved(self.atlas.T_map_odom)
-        keyframes = self.atlas.in_map_as_keyframes()
-        return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, keyframes)
+        with self._stepping:
+            if self._relocalizer.search is not None:
+                return self._relocalizer.search.known
+            estimate = self._estimate() if self.landmarks is not None else None
+            if estimate is None or self.landmarks is None:
+                raise SlamError("there is no map yet: no frame was processed")
+            rows = self.landmarks.moved(self.atlas.T_map_odom)
+            keyframes = self.atlas.in_map_as_keyframes()
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, keyframes)
 
     @property
     def warnings(self) -> list[str]:
         """What looked wrong with the images and their times, a line each (see `slam.tracking.input_warnings`)."""
         return list(self._input_warnings.lines)
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a copy holds; refused while another thread is in a step."""
+        with self._stepping:
+            return vars(self).copy()
 
     @property
     def restarted(self) -> list[int]:

@@ -38,6 +38,7 @@ _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an
 _ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
 _PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
+_VAGUE = 1e3  # deviation of an innovation, in those of a pixel, above which all of P is brought up to date
 _PIECES = 64  # at most, of one step through the angles' singularity
 _SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
 
@@ -120,6 +121,8 @@ class EkfBackend:
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids)
+            if found.solution.uncertainty(problem.sigma) > _VAGUE:
+                self._make_all_local()
             self._correct(slots, found)
         except UnsolvableError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
@@ -403,6 +406,15 @@ class EkfBackend:
     def _changed(self, change: Array) -> Array:
         """The pose (4, 4) after a change of [r, φ] (6,)."""
         return se3.pose(attitude(self._R_world_angles, self._camera[3:6] + change[3:]), self._camera[:3] + change[:3])
+
+    def _make_all_local(self) -> None:
+        """Before an update that ends a great uncertainty: only the dense part keeps enough digits in it.
+
+        What the rest becomes is a difference of numbers larger than itself by the condition of S.
+        """
+        joined = self._covariance.make_local(np.arange(len(self._landmarks)))
+        if self._consistent:
+            self._refer_landmarks(joined)
 
     def _correct(self, slots: SlotArray, found: Agreement) -> None:
         """Change the whole state and covariance, or nothing.

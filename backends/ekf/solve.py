@@ -126,6 +126,10 @@ class Solution:
         W = dtrmm(1.0, self.inverse, self.H.times(X).T, side=1, lower=1, trans_a=1, overwrite_b=1).T
         return np.asarray(W if self.measured.all() else W[self.measured])
 
+    def uncertainty(self, sigma: float) -> float:
+        """Largest standard deviation of an innovation, given those before it, in that of a pixel, `sigma` [px]."""
+        return 1 / (sigma * float(self.inverse.diagonal().min()))
+
 
 @dataclass(frozen=True)
 class _Iterate:

@@ -30,7 +30,7 @@ from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.checks import require_guess, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
-from slam.errors import MeasurementError
+from slam.errors import CopyError, MeasurementError
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
@@ -246,6 +246,19 @@ class SmootherBackend:
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
         self._objects.remove(ids)
+
+    # --- copies ---
+
+    def __reduce_ex__(self, protocol: object) -> str:
+        """Refuse to be copied: gtsam ends the process where its objects are.
+
+        Raises:
+            CopyError: always.
+        """
+        raise CopyError(
+            f"{type(self).__name__} can be neither copied nor pickled, as gtsam's solver cannot: save the map "
+            "(slam.save_map) and start in it, or record the run (--record) and replay it"
+        )
 
     # --- parts ---
 

@@ -24,6 +24,10 @@ class Workers:
         self.threads = threads
         self._pool: ThreadPoolExecutor | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy holds: no threads; it starts its own."""
+        return {**vars(self), "_pool": None}
+
     def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """Results of independent tasks, in their order."""
         if self.threads == 1 or len(tasks) < 2:

@@ -7,6 +7,7 @@ from typing import Any
 
 from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
+from slam.files import write_png
 from slam.run.drawing import draw_objects
 from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
 from slam.run.outputs import write_json
@@ -27,7 +28,6 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         frames: number of frames.
         quiet: show nothing.
     """
-    import cv2
     import matplotlib
 
     matplotlib.use("Agg")
@@ -49,7 +49,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         draw_errors(runs, truth, out / "errors.png")
     if last is not None:
         frame = next(iter(open_sequence(world).frames(frames - 1)))
-        cv2.imwrite(str(out / "frame.png"), draw_objects(frame.left, last, open_sequence(world).rig))
+        write_png(out / "frame.png", draw_objects(frame.left, last, open_sequence(world).rig))
     if not quiet:
         print_summary(summaries, out)
     return summaries

@@ -12,6 +12,7 @@ import numpy as np
 
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError
+from slam.files import reason, require_utf8, write_png
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
@@ -121,6 +122,8 @@ class FramePictures:
         self._video: Any = None
         if path.suffix and not self._film:
             raise SlamError(f"{path}: pictures go to a folder, or to a video FILE.mp4")
+        if self._film:
+            require_utf8(path)
         try:
             (path.parent if self._film else path).mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -132,12 +135,12 @@ class FramePictures:
 
     def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
         """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
-        import cv2
-
         if not self._film:
             file = self.path / f"{number:06d}.png"
-            if not cv2.imwrite(str(file), picture):
-                raise SlamError(f"{file}: cannot be written")
+            try:
+                write_png(file, picture)
+            except OSError as error:
+                raise SlamError(f"{file}: cannot be written: {reason(error)}") from error
         elif self._first is None:
             self._first = (stamp, picture)
         else:

@@ -14,6 +14,7 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult, StereoFrame
 from slam.errors import SlamError
+from slam.files import require_utf8
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, quaternion
 from slam.geometry.trajectory import Trajectory
@@ -169,6 +170,7 @@ def _open(rr: Any, target: str) -> Any:
             recording.spawn()
         else:
             path = Path(target)
+            require_utf8(path)
             path.parent.mkdir(parents=True, exist_ok=True)
             recording.save(str(path))
     except (OSError, RuntimeError) as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import lru_cache, wraps
-from threading import Lock
+from threading import RLock
 from typing import Any, TypeVar
 
 from threadpoolctl import LibController, ThreadpoolController
@@ -31,7 +31,7 @@ class _Limit:
     """The number of BLAS threads of the process is 1 as long as any thread is inside."""
 
     def __init__(self) -> None:
-        self._lock = Lock()
+        self._lock = RLock()  # one that an interrupt leaves locked does not stop its own thread
         self._inside = 0
         self._changed: _Changed = []
 

@@ -2,7 +2,9 @@
 
 Kernels are called from Python: they let go of the global lock and are cached on disk, in their package's folder or,
 where that is read-only, in the user's cache. Helpers are called from kernels of the same file alone, because Numba
-notices changes in a kernel's own file only.
+notices changes in a kernel's own file only. They are always inlined: a call would go to whichever copy of the helper
+the process has got first, its own or that of another kernel, and these are optimised differently. The results would
+depend on whether a kernel was compiled or loaded.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from slam.runtime.compile_clock import compile_clock
 _LOG = logging.getLogger(__name__)
 _ROOMS = ("slam.", "frontends.", "backends.")
 _NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no exception
-_INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
 helper = njit(**_INNER)
 #: Sums may be reordered, so that loops run on vector registers; always the same way, whatever the number of threads.

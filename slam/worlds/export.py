@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from slam.errors import SequenceError
+from slam.files import write_png
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array, inverse, transform
@@ -104,11 +105,8 @@ class _ImageList:
 
     def add(self, nanoseconds: int, image: np.ndarray) -> None:
         """Write an image and its row."""
-        import cv2
-
         name = f"{nanoseconds}.png"
-        if not cv2.imwrite(str(self._data / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 3]):
-            raise OSError(f"{name} was not written")
+        write_png(self._data / name, image)
         self._table.write(f"{nanoseconds},{name}\n")
         self._table.flush()
 

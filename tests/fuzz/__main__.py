@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.fuzz.catalogue import SUBJECTS
-from tests.fuzz.harness import Failure, Subject, run_case
+from tests.fuzz.harness import Failure, Subject, run_case, warm_up
 from tests.fuzz.page import Tally, write_page
 
 
@@ -31,6 +31,7 @@ def main() -> int:
     if unknown:
         parser.error(f"unknown class {min(unknown)}; known: {', '.join(s.name for s in SUBJECTS)}")
     chosen = [s for s in SUBJECTS if not names or s.name in names]
+    warm_up()
     if arguments.case is not None:
         failures = [run_case(s, arguments.seed, arguments.case) for s in chosen]
         print("\n".join(f.detail for f in failures if f) or "holds")

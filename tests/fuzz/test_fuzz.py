@@ -8,8 +8,13 @@ import pytest
 
 from slam.errors import SlamError
 from tests.fuzz.catalogue import SUBJECTS
-from tests.fuzz.harness import Broken, Subject, run_case
+from tests.fuzz.harness import Broken, Subject, run_case, warm_up
 from tests.fuzz.page import BEGIN, END, Tally, write_page
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _warm():
+    warm_up()
 
 
 @pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name.replace(" ", "_") for s in SUBJECTS])

@@ -8,6 +8,7 @@ import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.run.drawing import FramePictures, draw_objects
+from tests.fuzz.runs import disk_of
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +64,23 @@ def test_places_that_cannot_be_written_are_said(steps, tmp_path):
     system, ((frame, result), _) = steps
     with pytest.raises(SlamError, match=r"folder\.mp4: cannot be written"), FramePictures(tmp_path / "folder.mp4") as p:
         p.show(frame, result, system)
+
+
+@pytest.mark.parametrize("name", ["\udc80", "\udc80.mp4"])
+def test_names_that_are_no_utf8(steps, tmp_path, name):
+    """OpenCV ends the process where it is given one."""
+    system, ((frame, result), _) = steps
+    if name.endswith("mp4"):
+        with pytest.raises(SlamError, match="the name is not in UTF-8"):
+            FramePictures(tmp_path / name)
+        return
+    with FramePictures(tmp_path / name) as pictures:
+        pictures.show(frame, result, system)
+    assert len(list((tmp_path / name).iterdir())) == 1
+
+
+def test_a_picture_is_whole_or_not_there(steps, tmp_path):
+    system, ((frame, result), _) = steps
+    with pytest.raises(SlamError, match=r"png: cannot be written: File too large"), disk_of(500):
+        FramePictures(tmp_path / "out").show(frame, result, system)
+    assert list((tmp_path / "out").iterdir()) == []

@@ -265,6 +265,14 @@ def test_damaged_videos_print_nothing(two_folders, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_a_video_whose_name_is_no_utf8(two_folders):
+    """OpenCV ends the process where it is given such a name."""
+    for side in ("left", "right"):
+        (two_folders / f"{side}\udc80.avi").write_bytes(b"RIFF")
+    with pytest.raises(SlamError, match="the name is not in UTF-8"):
+        open_sequence(f"{two_folders}?left=left\udc80.avi&right=right\udc80.avi")
+
+
 # --- ground truth ---
 
 

@@ -1,0 +1,61 @@
+"""``python -m tests.slam.run.kills BACKEND FOLDER COUNT``: runs that are killed, the k-th after k/COUNT of its time.
+
+Each is a fork of a process that has loaded everything, so that many take no longer than one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from slam.config import SystemConfig
+from slam.run.runner import RunOptions, run
+from slam.sequences import open_sequence
+from tests.fuzz.runs import Scripted, _Frontend, _Numbered
+
+FRAMES = 25
+
+
+class Seen(Scripted):
+    """More frames without images."""
+
+    def __init__(self) -> None:
+        world = open_sequence(f"synthetic:desk?frames={FRAMES}&density=6")
+        self.rig, self.features, self.warnings = world.rig, [world.observations(k) for k in range(FRAMES)], []
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def frames(self, start=0, stop=None):
+        yield from (_Numbered(k, seen) for k, seen in enumerate(self.features))
+
+
+def main() -> None:
+    backend, folder, count = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+    sequence, ends = Seen(), []
+
+    def work(out: Path) -> None:
+        out.mkdir()
+        options = RunOptions(backend, "none", SystemConfig(), out, record=out / "a.npz", save_map=out / "a.map")
+        run(sequence, options, frontend=_Frontend())
+
+    work(folder / "whole")
+    start = time.monotonic()
+    work(folder / "timed")
+    whole = time.monotonic() - start
+    for k in range(count):
+        child = os.fork()
+        if not child:
+            work(folder / str(k))
+            os._exit(0)
+        time.sleep(whole * k / count)
+        os.kill(child, signal.SIGKILL)
+        ends.append(os.WIFSIGNALED(os.waitpid(child, 0)[1]))
+    print(sum(ends))
+
+
+if __name__ == "__main__":
+    main()

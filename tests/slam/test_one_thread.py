@@ -1,0 +1,141 @@
+"""Systems in threads: each as if it were alone; one system used from two threads says so and is not broken."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+from functools import cache
+
+import pytest
+
+import slam
+from slam.errors import SlamError
+from slam.one_thread import OneThread
+from slam.system import StereoSlam
+from tests.slam.digest import FIRST, WORLD, state
+
+SEQUENCE = slam.open_sequence(WORLD)
+FRAMES = 14
+
+
+class Waiting:
+    """A back end or front end whose `predict` or `extract` waits to be let go."""
+
+    def __init__(self, part):
+        self.part = part
+        self.entered, self.go = threading.Event(), threading.Event()
+
+    def __getattr__(self, name):
+        return getattr(self.part, name)
+
+    def _wait(self):
+        self.entered.set()
+        assert self.go.wait(60)
+
+    def predict(self, stamp):
+        self._wait()
+        return self.part.predict(stamp)
+
+    def extract(self, frame):
+        self._wait()
+        return self.part.extract(frame)
+
+
+def run(backend: str) -> str:
+    system = StereoSlam(SEQUENCE.rig, None, backend)
+    for k in range(FRAMES):
+        system.process_features(SEQUENCE.observations(FIRST + k))
+    return state(system)
+
+
+alone = cache(run)
+
+
+def in_threads(*works):
+    """Results, or exceptions, of functions each in a thread of its own, begun together."""
+    found, start = [None] * len(works), threading.Barrier(len(works))
+
+    def begin(k):
+        start.wait()
+        try:
+            found[k] = works[k]()
+        except Exception as error:  # noqa: BLE001 it is compared
+            found[k] = error
+
+    threads = [threading.Thread(target=begin, args=(k,)) for k in range(len(works))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return found
+
+
+@pytest.mark.parametrize("names", [("ekf", "ekf"), ("smoother", "smoother"), ("ekf", "smoother")])
+def test_two_systems_in_two_threads_give_the_same_bytes_as_alone(names):
+    assert in_threads(*(lambda name=name: run(name) for name in names)) == [alone(name) for name in names]
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_one_system_used_from_two_threads_says_so_and_goes_on(backend):
+    system = StereoSlam(SEQUENCE.rig, None, backend)
+    system.process_features(SEQUENCE.observations(FIRST))
+    system.backend = slow = Waiting(system.backend)
+    thread = threading.Thread(target=lambda: system.process_features(SEQUENCE.observations(FIRST + 1)))
+    thread.start()
+    assert slow.entered.wait(60)
+    calls = [
+        lambda: system.process_features(SEQUENCE.observations(FIRST + 2)), system.estimate, system.snapshot,
+        system.trajectory, system.roll_back, lambda: pickle.dumps(system),
+    ]  # fmt: skip
+    for call in calls:
+        with pytest.raises(SlamError, match=r"^this system is in use by another thread"):
+            call()
+    slow.go.set()
+    thread.join()
+    system.backend = slow.part
+    for k in range(2, FRAMES):
+        system.process_features(SEQUENCE.observations(FIRST + k))
+    assert state(system) == alone(backend)
+
+
+def test_one_front_end_used_from_two_threads_says_so():
+    system = StereoSlam(SEQUENCE.rig, "surf", "ekf")
+    system.frontend = slow = Waiting(system.frontend)
+    frames = list(SEQUENCE.frames(FIRST, FIRST + 3))
+    results = []
+    thread = threading.Thread(target=lambda: results.extend(system.run(frames)))  # extracts in a third thread
+    thread.start()
+    assert slow.entered.wait(60)
+    with pytest.raises(SlamError, match="this system's front end is in use"):
+        system.process(frames[0])
+    slow.go.set()
+    thread.join()
+    assert len(results) == 3
+
+
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+def test_a_free_for_all_breaks_nothing(backend):
+    """Four threads take frames as they come: each step either happens or is refused."""
+    system, done = StereoSlam(SEQUENCE.rig, None, backend), []
+
+    def work(first):
+        for k in range(first, 12, 4):
+            try:
+                done.append(system.process_features(SEQUENCE.observations(FIRST + k)).index)
+            except SlamError as error:
+                assert "another thread" in str(error) or "not later" in str(error)
+
+    assert in_threads(*(lambda k=k: work(k) for k in range(4))) == [None] * 4
+    assert sorted(done) == list(range(len(done))) and done
+    assert system.process_features(SEQUENCE.observations(FIRST + 13)).index == len(done)
+    assert sorted(system.estimate().ids) == sorted(system.landmarks.ids)
+
+
+def test_after_an_error_inside_the_next_thread_may_enter():
+    guard = OneThread("it")
+    with pytest.raises(ZeroDivisionError), guard:
+        raise ZeroDivisionError
+    entered = in_threads(lambda: guard.__enter__())
+    assert entered == [None]
+    with pytest.raises(SlamError, match="it is in use"), guard:
+        pass
