@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from slam.sequences import open_sequence as open_sequence
     from slam.system import StereoSlam as StereoSlam
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _PUBLIC = {
     "EstimatorModels": "slam.models",
