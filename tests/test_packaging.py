@@ -1,4 +1,4 @@
-"""What a package index and a citing reader are told: versions that agree, links that lead somewhere, extras that exist."""
+"""What a package index and a citing reader are told: versions agree, links lead somewhere, extras exist."""
 
 from __future__ import annotations
 
