@@ -6,6 +6,8 @@ import os
 import signal
 from pathlib import Path
 
+from slam.compare.frames import count_one
+
 
 def double(x):
     return 2 * x
@@ -30,3 +32,8 @@ def die(x):
 
 def threads():
     return os.environ["OPENBLAS_NUM_THREADS"], os.environ["OMP_NUM_THREADS"]
+
+
+def frames(count):
+    for _ in range(count):
+        count_one()
