@@ -6,12 +6,17 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam.errors import TrajectoryError
 from slam.files import read_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
+from slam.showing import card, count, path_svg, widest
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,33 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def __repr__(self) -> str:
+        seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
+        return f"Trajectory({count(len(self), 'pose')}, {seconds:.3f} s, {self.length:.3f} m)"
+
+    def _repr_html_(self) -> str:
+        return card(repr(self), [path_svg(self.positions)])
+
+    def plot(self, axis: Axes | None = None, **options: Any) -> Axes:
+        """Draw the path in the plane of the two coordinates that reach farthest, both on one scale.
+
+        Args:
+            axis: of matplotlib, to draw into; None for a new figure.
+            **options: of the line, such as ``label="ekf"``.
+
+        Returns:
+            the axis, for more on it.
+        """
+        if axis is None:
+            import matplotlib.pyplot as plt
+
+            axis = plt.figure(layout="constrained").add_subplot()
+        across, up = widest(self.positions)
+        axis.plot(self.positions[:, across], self.positions[:, up], **options)
+        axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
+        axis.set_aspect("equal", adjustable="datalim")
+        return axis
 
     @property
     def positions(self) -> Array:

@@ -24,6 +24,7 @@ from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.mapping.known_landmarks import require_known
+from slam.showing import count
 
 
 class HasMap(Protocol):
@@ -118,6 +119,9 @@ class SavedMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"SavedMap({count(len(self), 'landmark')}, {self.dimensions}-D, {self.world_frame})"
 
     @property
     def dimensions(self) -> int:

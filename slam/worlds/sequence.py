@@ -15,6 +15,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
+from slam.showing import sequence_html, sequence_line
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import Appearance, ObservationModel, SimulatedFeatures, appearance, simulate
@@ -93,6 +94,9 @@ class WorldSequence:
 
     def __iter__(self) -> Iterator[StereoFrame]:
         return self.frames()
+
+    __repr__ = sequence_line
+    _repr_html_ = sequence_html
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Images of frames `start` up to, but without, `stop`, each rendered when it is asked for.
