@@ -53,21 +53,28 @@ class Trajectory:
     def _repr_html_(self) -> str:
         return card(repr(self), [path_svg(self.positions)])
 
-    def plot(self, axis: Axes | None = None, **options: Any) -> Axes:
-        """Draw the path in the plane of the two coordinates that reach farthest, both on one scale.
+    def plot(self, axis: Axes | None = None, plane: str = "", **options: Any) -> Axes:
+        """Draw the path, two of its coordinates, both on one scale.
 
         Args:
             axis: of matplotlib, to draw into; None for a new figure.
+            plane: the coordinates to the right and up, such as ``"xz"``: the top view, where the world is the first
+                camera's frame. The two that reach farthest where it is empty.
             **options: of the line, such as ``label="ekf"``.
 
         Returns:
             the axis, for more on it.
+
+        Raises:
+            TrajectoryError: the plane is not named by two of x, y, z.
         """
+        if plane and not (len(plane) == 2 and set(plane) <= set("xyz")):
+            raise TrajectoryError(f"trajectory: a plane is two of x, y and z, such as 'xz', not {plane!r}")
         if axis is None:
             import matplotlib.pyplot as plt
 
             axis = plt.figure(layout="constrained").add_subplot()
-        across, up = widest(self.positions)
+        across, up = map("xyz".index, plane) if plane else widest(self.positions)
         axis.plot(self.positions[:, across], self.positions[:, up], **options)
         axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
         axis.set_aspect("equal", adjustable="datalim")

@@ -82,6 +82,9 @@ def test_a_path_is_drawn_where_it_reaches_farthest():
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("x [m]", "z [m]")
     np.testing.assert_array_equal(axis.lines[0].get_ydata(), positions[:, 2])
     assert axis.lines[0].get_label() == "mine"
+    assert path.plot(Figure().add_subplot(), "yx").get_ylabel() == "x [m]"
+    with pytest.raises(slam.SlamError, match="two of x, y and z"):
+        path.plot(Figure().add_subplot(), "top")
 
 
 def test_a_new_figure_where_no_axis_is_given():
