@@ -23,6 +23,7 @@ from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
 from slam.interfaces import Backend
+from slam.testing import check_backend, findings
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -53,6 +54,17 @@ def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
     assert all(result.status.value == "tracked" for result in results[1:])
     errors = absolute_errors(system.trajectory(), sequence.ground_truth)
     assert errors.translation_statistics.rmse < 0.02  # measured 4 mm, on 25 cm of path
+
+
+def test_the_back_end_in_50_lines_keeps_as_much_of_the_contract_as_its_page_says():
+    check_backend(pose_fit(), "runs")
+    page = (DOCS / "adding_a_backend.md").read_text(encoding="utf-8")
+    found = list(findings(pose_fit()))
+    for tier in ("right", "good"):
+        failures = [bool(f.failure) for f in found if f.tier == tier]
+        assert re.search(rf"^\| {tier} .*\| fails {sum(failures)} of {len(failures)} \|$", page, re.M)
+    (said,) = re.findall(r"such as `(predict.*?)`", page)
+    assert said in [f.failure for f in found]
 
 
 def test_the_back_end_in_50_lines_keeps_the_map():
@@ -312,4 +324,4 @@ def test_python_in_pages_runs(name, tmp_path, monkeypatch):
         for shown, used in RUN[name].items():
             block = block.replace(shown, used)
         if not block.startswith("--8<--"):
-            exec(block, names)
+            exec(compile(block, name, "exec", dont_inherit=True), names)
