@@ -10,7 +10,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -191,7 +191,7 @@ class DaskScheduler:
     patience: float = 10.0
 
     def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
-        """See `Scheduler`. Raises SlamError where dask.distributed is missing or nobody answers at the address."""
+        """See `Scheduler`. Raises SlamError where dask.distributed is missing, or nobody answers, or no longer."""
         distributed = _distributed()
         try:
             client = distributed.Client(self.address, timeout=self.patience)
@@ -201,13 +201,28 @@ class DaskScheduler:
         running: dict[Any, Job] = {}
         with client:
             while waiting or running:
-                while waiting and len(running) < max(1, 2 * sum(client.ncores().values())):
-                    job = waiting.popleft()
-                    # Not pure: Dask must not take calls with equal arguments for one.
-                    running[client.submit(job.function, *job.arguments(), pure=False)] = job
-                for future in distributed.wait(list(running), return_when="FIRST_COMPLETED").done:
-                    failed = future.exception()
-                    deliver(running.pop(future), None if failed else future.result(), failed)
+                with self._lost():
+                    free = max(1, 2 * sum(client.ncores().values())) - len(running)
+                for job in [waiting.popleft() for _ in range(min(free, len(waiting)))]:
+                    arguments = job.arguments()
+                    with self._lost():  # not pure: Dask must not take calls with equal arguments for one
+                        running[client.submit(job.function, *arguments, pure=False)] = job
+                with self._lost():
+                    done = distributed.wait(list(running), return_when="FIRST_COMPLETED").done
+                    ended = [(future, error := future.exception(), error or future.result()) for future in done]
+                for future, failed, value in ended:
+                    deliver(running.pop(future), None if failed else value, failed)
+
+    @contextmanager
+    def _lost(self) -> Iterator[None]:
+        """Say in one line that the scheduler has gone."""
+        try:
+            yield
+        except (OSError, CancelledError, TimeoutError) as error:
+            raise SlamError(
+                f"the Dask scheduler at {self.address} has gone: {error or type(error).__name__}; "
+                "with a new one the same command goes on"
+            ) from error
 
 
 def _distributed() -> Any:

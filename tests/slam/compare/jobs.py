@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 
 from slam.compare.frames import count_one
@@ -11,6 +12,10 @@ from slam.compare.frames import count_one
 
 def double(x):
     return 2 * x
+
+
+def slowly(seconds):
+    time.sleep(seconds)
 
 
 def fail(x):
