@@ -209,9 +209,10 @@ class DaskScheduler:
                         running[client.submit(job.function, *arguments, pure=False)] = job
                 with self._lost():
                     done = distributed.wait(list(running), return_when="FIRST_COMPLETED").done
-                    ended = [(future, error := future.exception(), error or future.result()) for future in done]
+                    failures = [(future, future.exception()) for future in done]
+                    ended = [(future, failed, None if failed else future.result()) for future, failed in failures]
                 for future, failed, value in ended:
-                    deliver(running.pop(future), None if failed else value, failed)
+                    deliver(running.pop(future), value, failed)
 
     @contextmanager
     def _lost(self) -> Iterator[None]:

@@ -191,4 +191,4 @@ def removed_landmarks_are_gone(factory: Factory) -> None:
         require(k > 8 or not np.isin(prediction.ids, gone).any(), "a removed landmark is predicted")
     assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose after removals")
     back = gone[np.isin(gone, scene.frames[-1].ids)]
-    require(len(back) and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back")
+    require(len(back) > 0 and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back")
