@@ -7,6 +7,7 @@ loaded when it is used.
 from __future__ import annotations
 
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from slam.sequences.rigs import load_rig as load_rig
     from slam.system import StereoSlam as StereoSlam
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _PUBLIC = {
     "EstimatorModels": "slam.models",
@@ -43,6 +44,11 @@ _PUBLIC = {
 }
 
 __all__ = sorted(_PUBLIC)
+
+
+def __dir__() -> list[str]:
+    """The public names, and what a module has of itself."""
+    return sorted({*_PUBLIC, *(n for n, v in globals().items() if n.startswith("__") or isinstance(v, ModuleType))})
 
 
 def __getattr__(name: str) -> Any:

@@ -22,6 +22,7 @@ from slam.geometry.arrays import Array
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.object_data import MovingObject
+from slam.showing import count, of_shapes, point
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,11 @@ class StereoFrame:
     stamp: float
     left: np.ndarray
     right: np.ndarray | None
+
+    def __repr__(self) -> str:
+        height, width = self.left.shape[:2]
+        right = "" if self.right is not None else ", no right image"
+        return f"StereoFrame({self.index}, {self.stamp:.3f} s, {width}x{height} {self.left.dtype}{right})"
 
 
 @dataclass(frozen=True)
@@ -78,6 +84,10 @@ class StereoFeatures:
 
     def __len__(self) -> int:
         return len(self.uv_left)
+
+    def __repr__(self) -> str:
+        pairs = f"{int(self.has_stereo.sum())} with a right pixel, {self.descriptors.shape[1]}-D"
+        return f"StereoFeatures({count(len(self), 'feature')}, {pairs}, {self.stamp:.3f} s)"
 
     @property
     def has_stereo(self) -> BoolArray:
@@ -130,6 +140,9 @@ class Observations:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def __repr__(self) -> str:
+        return f"Observations({count(len(self), 'landmark')}, {int(self.has_stereo.sum())} with a right pixel)"
+
     @property
     def has_stereo(self) -> BoolArray:
         """Which observations have a right pixel (M,)."""
@@ -167,6 +180,8 @@ class Prediction:
     uv_right: Array
     innovation: Array
 
+    __repr__ = of_shapes
+
 
 class UpdateStatus(StrEnum):
     """How an update ended."""
@@ -196,6 +211,11 @@ class UpdateReport:
     nis: float
     dof: int
 
+    def __repr__(self) -> str:
+        why = f" ({self.reason})" if self.reason else ""
+        taken = f"{len(self.used)} used, {len(self.rejected)} rejected"
+        return f"UpdateReport({self.status.value}{why}, {taken}, NIS {self.nis:.1f} of {self.dof})"
+
     @classmethod
     def nothing(cls, status: UpdateStatus, reason: str, rejected: IdArray | None = None) -> UpdateReport:
         """A report of an update that used no observation."""
@@ -222,6 +242,21 @@ class Estimate:
     ids: IdArray
     positions: Array
     covariances: Array
+
+    def __repr__(self) -> str:
+        R = self.T_world_left[:3, :3]
+        sigma = np.sqrt(np.diag(R @ self.covariance[3:, 3:] @ R.T).clip(min=0))
+        where = f"camera at {point(self.T_world_left[:3, 3])} ± {point(sigma)} m"
+        return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
+
+    def to_table(self) -> dict[str, NDArray]:
+        """The landmarks as columns (N,), of the names and units of ``landmarks.csv``; a data frame takes them as is.
+
+        Returns:
+            ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
+        """
+        terms = {f"c{'xyz'[i]}{'xyz'[j]}": self.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
+        return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
 
 
 class Revision(Protocol):
@@ -295,3 +330,10 @@ class FrameResult:
     loop: int | None = None
     keyframe: bool = False
     returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __repr__(self) -> str:
+        why = f" ({self.reason})" if self.reason else ""
+        landmarks = f"{len(self.matched)} of {self.predicted} landmarks matched"
+        change = f"{len(self.added)} added, {len(self.erased)} erased, {self.map_size} in the map"
+        objects = f", {count(len(self.objects), 'moving object')}" if self.objects else ""
+        return f"FrameResult({self.index}, {self.status.value}{why}, {landmarks}, {change}{objects})"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array, transform
+from slam.showing import count
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,9 @@ class LandmarkRows:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"LandmarkRows({count(len(self), 'landmark')}, {self.descriptors.shape[1]}-D)"
 
     @classmethod
     def empty(cls, dimensions: int) -> LandmarkRows:

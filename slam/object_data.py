@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam.errors import MeasurementError
 from slam.geometry.arrays import Array, BoolArray, IdArray
+from slam.showing import count, of_shapes, point
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class ObjectObservations:
     uv_left: Array
     uv_right: Array
     T_world_object: Array | None = None
+
+    __repr__ = of_shapes
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -97,6 +100,8 @@ class ObjectEstimate:
     used: IdArray
     rejected: IdArray
 
+    __repr__ = of_shapes
+
 
 @dataclass(frozen=True)
 class MovingObject:
@@ -122,6 +127,11 @@ class MovingObject:
     extent: Array
     moving: bool
     found_at: float = float("nan")
+
+    def __repr__(self) -> str:
+        speed = float(np.linalg.norm(self.estimate.velocity[3:]))
+        where = f"at {point(self.estimate.T_world_object[:3, 3])} m"
+        return f"MovingObject({self.id}, {where}, {speed:.2f} m/s, {count(len(self.features), 'feature')})"
 
 
 @dataclass(frozen=True)

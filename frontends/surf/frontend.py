@@ -13,8 +13,9 @@ from frontends.surf.correlation import patch_windows, refine
 from frontends.surf.epipolar import half_image, search_rows
 from frontends.surf.images import FULL_SCALE, grey
 from frontends.surf.integral import integral_image
+from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
-from frontends.surf.surf import Keypoints, Surf
+from frontends.surf.surf import Surf
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
@@ -57,6 +58,11 @@ class SurfFrontend:
     def threshold(self) -> float:
         """D_threshold for the next frame."""
         return self._threshold
+
+    @property
+    def surf(self) -> Surf:
+        """Detector and descriptor, with the methods of OpenCV's Feature2D."""
+        return self._surf
 
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""

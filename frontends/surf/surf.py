@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from frontends.surf.detector import COLUMNS, detect_octave
 from frontends.surf.filters import Filters, layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
 from frontends.surf.integral import integral_image
+from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
 from frontends.surf.workers import SHARES, Workers
@@ -24,42 +25,8 @@ from slam.errors import ConfigurationError
 if TYPE_CHECKING:
     import cv2
 
-#: Angle of upright features [rad]: OpenCV's convention, 270 degrees.
-UPRIGHT_ANGLE = 1.5 * np.pi
-
 _SMALLEST_STRIPE = 48  # grid rows that are worth a task of their own
 _REACH = 0.15  # furthest that localisation moves a feature, in units of its size
-
-
-@dataclass(frozen=True)
-class Keypoints:
-    """Detected features, a row each, by falling response.
-
-    Attributes:
-        uv: pixels (N, 2), the centre of the first pixel at (0, 0).
-        size: diameter (N,) [px]: the side of the box filter that responded most.
-        angle: orientation (N,) [rad] in 0..2π, y down; `UPRIGHT_ANGLE` where upright; NaN where not measured.
-        response: determinant of the Hessian (N,), on OpenCV's scale for 8-bit images.
-        laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
-        octave: 0-based octave (N,) int8.
-    """
-
-    uv: NDArray[np.float64]
-    size: NDArray[np.float64]
-    angle: NDArray[np.float64]
-    response: NDArray[np.float64]
-    laplacian: NDArray[np.int8]
-    octave: NDArray[np.int8]
-
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    def select(self, rows: NDArray) -> Keypoints:
-        """The features of these rows (a mask or indices)."""
-        return Keypoints(
-            self.uv[rows], self.size[rows], self.angle[rows], self.response[rows], self.laplacian[rows],
-            self.octave[rows],
-        )  # fmt: skip
 
 
 class Surf:
@@ -105,7 +72,7 @@ class Surf:
         self._weights = gaussian_weights(4 if descriptor == 64 else 2)
 
     def detect(self, image: NDArray, mask: NDArray | None = None, threshold: float | None = None) -> Keypoints:
-        """Features of an image (H, W) or (H, W, 3|4), uint8 or uint16, by falling response.
+        """Features of an image (H, W) or (H, W, 3|4), uint8 or uint16, by falling response; no angle yet.
 
         Args:
             image: the image, of any size.
@@ -148,19 +115,57 @@ class Surf:
         mask = None if mask is None else binary_mask(mask, image.shape)
         return self.describe_in(integral, self.detect_in(integral, FULL_SCALE[image.dtype], mask))
 
+    # What people know from OpenCV's Feature2D; `detect` is above, and gives what serves as a list of cv2.KeyPoint.
+
+    def compute(
+        self, image: NDArray, keypoints: Iterable[cv2.KeyPoint]
+    ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
+        """Describe key points of any detector, as OpenCV's method of this name: those described, and descriptors.
+
+        Their orientation is measured anew, unless upright. Left out are those that cannot be oriented, whose centre is
+        not in the image, or that are larger than it. None is smaller than SURF's smallest filter, 9 px.
+
+        Raises:
+            SequenceError: the image or a key point is unusable.
+        """
+        image = grey(image)
+        given, (height, width) = Keypoints.from_cv2(keypoints), image.shape
+        inside = (given.uv > -0.5).all(axis=1) & (given.uv < (width - 0.5, height - 0.5)).all(axis=1)
+        inside &= given.size <= max(height, width)
+        given = replace(given, size=np.maximum(given.size, layer_sizes(0, 2)[0])).select(inside)
+        found, descriptors = self.describe_in(integral_image(image), given)
+        return found.to_cv2(), descriptors
+
     def detectAndCompute(
         self, image: NDArray, mask: NDArray | None = None
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
         """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64)."""
+        keypoints, descriptors = self.detect_and_describe(image, mask)
+        return keypoints.to_cv2(), descriptors
+
+    def descriptorSize(self) -> int:
+        """Numbers in a descriptor."""
+        return self.descriptor
+
+    def descriptorType(self) -> int:
+        """OpenCV's name for 32-bit floats."""
         import cv2
 
-        keypoints, descriptors = self.detect_and_describe(image, mask)
-        degrees = np.rad2deg(keypoints.angle)
-        rows = zip(keypoints.uv, keypoints.size, degrees, keypoints.response, keypoints.octave, keypoints.laplacian)
-        return tuple(
-            cv2.KeyPoint(float(uv[0]), float(uv[1]), float(size), float(angle), float(r), int(octave), int(sign))
-            for uv, size, angle, r, octave, sign in rows
-        ), descriptors
+        return int(cv2.CV_32F)
+
+    def defaultNorm(self) -> int:
+        """OpenCV's name for the distance of descriptors: Euclidean."""
+        import cv2
+
+        return int(cv2.NORM_L2)
+
+    def empty(self) -> bool:
+        """As of OpenCV's own: true, nothing is learnt or loaded."""
+        return True
+
+    def getDefaultName(self) -> str:
+        """Name as OpenCV gives one."""
+        return "Feature2D.SURF"
 
     def detect_in(
         self,

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from slam.compare.paper import write_paper
-from slam.compare.plan import Plan, Trial, Variant, parse_variant
+from slam.compare.plan import Plan, Variant, parse_variant
 from slam.compare.report import conclusions, most_trials, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler, available_cores
 from slam.compare.sweep import Run, check, sweep
@@ -53,43 +53,26 @@ def compare(
     Raises:
         SlamError: bad input; nothing has been run then.
     """
-    from slam.commands.display import counting
+    from slam.commands.display import SweepProgress, print_conclusions
 
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
         raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
     count = workers or available_cores()
-    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
     where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
-    check(plan)  # before there is a progress bar
-    total = sum(1 for mode in plan.modes for _ in plan.trials_of(mode))
-    done = 0
-    with counting(total, "runs", quiet) as progress:
-
-        def on_done(trial: Trial) -> None:
-            nonlocal done
-            done += 1
-            progress(done)
-
-        runs = sweep(plan, out, scheduler, on_done)
+    frames = check(plan)  # before there is a progress bar
+    with SweepProgress([frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)], quiet) as bar:
+        scheduler: Scheduler = LocalScheduler(count, bar.frames) if address is None else DaskScheduler(address)
+        runs = sweep(
+            plan, out, scheduler,
+            lambda trial: bar.ended(frames[trial.sequence]), lambda trial: bar.kept(frames[trial.sequence]),
+        )  # fmt: skip
     write_tables(plan, runs, out)
     write_paper(plan, runs, out)
     report = write_report(plan, runs, out, where)
     if not quiet:
-        _print_conclusions(plan, runs, report)
+        every = groups(plan, runs)
+        print_conclusions(conclusions(every), caution(most_trials(every), count_tests(every)), plan.backends[0])
+        failed = sum(not run.completed for run in runs)
+        print(f"{len(runs)} runs, {failed} failed. Report: {report}")
     return runs
-
-
-def _print_conclusions(plan: Plan, runs: Sequence[Run], report: Path) -> None:
-    every = groups(plan, runs)
-    for found in conclusions(every):
-        print(found.name)
-        for line in found.short:
-            print(f"  {line}")
-        for line in found.full:
-            print(f"    {line}")
-    warning = caution(most_trials(every), count_tests(every))
-    if warning:
-        print(warning)
-    failed = sum(not run.completed for run in runs)
-    print(f"{len(runs)} runs, {failed} failed. Report: {report}")

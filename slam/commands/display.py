@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,6 +17,9 @@ from rich.table import Table
 from slam.data import FrameResult
 from slam.evaluation.consistency import verdict
 from slam.runtime.compile_clock import working_time
+
+if TYPE_CHECKING:
+    from slam.compare.report import Conclusions
 
 _console = Console()
 _COMPILED = 0.05  # compile times below this [s] are not worth a row
@@ -80,6 +83,101 @@ def counting(total: int | None, title: str, quiet: bool = False) -> Iterator[Cal
     task = bar.add_task(title, total=total)
     with bar:
         yield lambda done: bar.update(task, completed=done)
+
+
+class SweepProgress:
+    """A progress bar over the frames of all runs of a comparison, with the time left; a context manager.
+
+    Args:
+        frames: of each run.
+        quiet: show nothing.
+    """
+
+    def __init__(self, frames: Sequence[int], quiet: bool = False) -> None:
+        self._bar = RichProgress(
+            TextColumn("runs {task.fields[runs]}, frames"),
+            BarColumn(bar_width=10),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._runs, self._ended, self._ended_frames, self._counted, self._before = len(frames), 0, 0, 0, 0
+        self._round = 0  # frames that were counted in scheduler calls that are over
+        self._task = self._bar.add_task("", total=sum(frames), runs=f"0/{self._runs}", rate="")
+
+    def __enter__(self) -> SweepProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def kept(self, frames: int) -> None:
+        """A run of so many frames was done before."""
+        self._before += frames
+        self.ended(frames)
+
+    def ended(self, frames: int) -> None:
+        """A run of so many frames is over."""
+        self._ended += 1
+        self._ended_frames += frames
+        self._show()
+
+    def frames(self, counted: int) -> None:
+        """So many frames were done in this call of a scheduler; the next one begins at zero."""
+        if counted < self._counted:
+            self._round += self._counted
+        self._counted = counted
+        self._show()
+
+    def _show(self) -> None:
+        """Frames of runs that are over, or where that is more, those counted while they run."""
+        done = max(self._ended_frames, self._before + self._round + self._counted)
+        task = self._bar.tasks[0]
+        rate = f"{task.speed:.1f} Hz" if task.speed else ""
+        runs = f"{self._ended}/{self._runs}"
+        self._bar.update(self._task, completed=min(done, task.total or 0), runs=runs, rate=rate)
+
+
+#: Colours of badges, by direction.
+_COLOURS = {"better": "green", "worse": "dark_orange3", "": "default"}
+
+
+def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str) -> None:
+    """What may be concluded, in the words of the report: a badge, and what it is about.
+
+    Args:
+        every: of each group.
+        caution: what so few trials can show at best; empty where they are enough.
+        reference: the back end that the others are compared with.
+    """
+    from slam.compare.wording import STRENGTH, WORDS
+
+    used = {line.verdict for found in every for line in found.headlines}
+    for found in every:
+        _say(found.name, "bold")
+        if found.failed:
+            _say(found.failed)
+        table = Table.grid(padding=(0, 2))
+        for line in found.headlines:
+            style = f"bold {_COLOURS[line.direction]}" if WORDS[line.verdict] == "certain" else _COLOURS[line.direction]
+            table.add_row(f"  [{style}]{escape(line.badge)}[/]", escape(line.text))
+        _console.print(table, highlight=False)
+        for text in found.honesty:
+            _say(f"  {text}")
+    meanings = [meaning for verdict, meaning in STRENGTH.items() if verdict in used]
+    if meanings:
+        _say(f"Better or worse than {reference}: {'; '.join(meanings)}.")
+    if caution:
+        _say(caution)
+
+
+def _say(text: str, style: str | None = None) -> None:
+    _console.print(escape(text), style=style, highlight=False)
 
 
 def print_summary(summaries: list[dict[str, Any]], out: Path) -> None:

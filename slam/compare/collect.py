@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from slam.compare.frames import count_one
 from slam.compare.measure import object_figures
 from slam.data import FrameResult, FrameStatus, IdArray
 from slam.errors import TrajectoryError
@@ -84,6 +85,7 @@ class Collector:
 
     def add(self, result: FrameResult) -> None:
         """One more frame."""
+        count_one()
         number, features, report = self.start + result.index, result.features, result.report
         if self._truth is not None:
             if self.score:

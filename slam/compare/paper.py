@@ -122,7 +122,8 @@ def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
         return "-- & --"
     digits = decimals(mean)
     shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
-    return f"{shown[0]} $\\pm$ {shown[1]} & [{shown[2]}, {shown[3]}]" if np.isfinite(sd) else f"{shown[0]} & --"
+    spread = f"{shown[0]} $\\pm$ {shown[1]}" if np.isfinite(sd) else shown[0]
+    return f"{spread} & [{shown[2]}, {shown[3]}]" if np.isfinite(low) else f"{spread} & --"
 
 
 def _difference_cells(d: Difference) -> list[str]:

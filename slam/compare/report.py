@@ -14,13 +14,16 @@ import numpy as np
 from slam.compare import figures
 from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
-from slam.compare.statistics import LEVEL, Difference, Verdict
+from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures
 from slam.compare.wording import (
     STRENGTH,
+    WORDS,
     Line,
+    badge,
     caution,
+    direction,
     failures,
     headline,
     honesty,
@@ -35,17 +38,7 @@ from slam.compare.wording import (
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
-_WORDS = {
-    Verdict.CERTAIN: "certain",
-    Verdict.LIKELY: "likely",
-    Verdict.HINT: "a hint",
-    Verdict.OPEN: "open",
-    Verdict.EQUAL: "equal",
-    Verdict.SINGLE: "one trial",
-    Verdict.NONE: "none",
-    Verdict.UNTESTED: "",
-}
-_DIRECTED = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
+_TESTED = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
 
 
 def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Path:
@@ -72,8 +65,8 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         short=conclusions(every),
         caution=caution(most_trials(every), count_tests(every)),
         tests=count_tests(every),
-        strengths=[(verdict.value, _WORDS[verdict], STRENGTH[verdict]) for verdict in _DIRECTED],
-        words=_WORDS,
+        strengths=[(verdict.value, WORDS[verdict], STRENGTH[verdict]) for verdict in _TESTED],
+        fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=_sections(plan, every),
         workers=workers,
@@ -100,18 +93,15 @@ class Conclusions:
         name: of the group.
         failed: which runs failed; empty where none did.
         headlines: what is certain, likely and a hint, in both directions, and which main figures are open.
-        full: a sentence per main figure, and one per back end on its covariances.
+        sentences: one per main figure.
+        honesty: one per back end, on its covariances.
     """
 
     name: str
     failed: str
     headlines: list[Line]
-    full: list[str]
-
-    @property
-    def short(self) -> list[str]:
-        """The headlines as plain text, failures first."""
-        return [line for line in (self.failed, *(line.text for line in self.headlines)) if line]
+    sentences: list[str]
+    honesty: list[str]
 
 
 def conclusions(every: Sequence[Group]) -> list[Conclusions]:
@@ -127,14 +117,14 @@ def most_trials(every: Sequence[Group]) -> int:
 def _conclusions(group: Group) -> Conclusions:
     first, *others = group.runs
     compared = [group.differences(metric) for metric in group.metrics]
-    short: list[Line] = []
-    full: list[str] = []
+    headlines: list[Line] = []
+    sentences: list[str] = []
     for other in others:
         own = [differences[other] for differences in compared]
-        short += headline(own, first, other)
-        full += [sentence(d, first, other) for d in own if worth_saying(d)]
+        headlines += headline(own, other)
+        sentences += [sentence(d, first, other) for d in own if worth_saying(d)]
     failed = failures({b: group.failures(b) for b in group.runs}, group.trials)
-    return Conclusions(_name(group), failed, short, [*full, *_honesty(group)])
+    return Conclusions(_name(group), failed, headlines, sentences, _honesty(group))
 
 
 def _honesty(group: Group) -> list[str]:
@@ -199,14 +189,10 @@ def _row(group: Group, metric: Metric, differences: dict[str, Difference]) -> di
 
 def _cells(d: Difference) -> dict[str, str]:
     """A difference's cells; the badge's colour is the direction, its strength the verdict."""
-    words, direction = _WORDS[d.verdict], ""
-    if d.better is not None and d.verdict in _DIRECTED:
-        direction = "better" if d.better else "worse"
-        words = f"{direction}: {words}"
     return {
         "verdict": d.verdict.value,
-        "direction": direction,
-        "words": words,
+        "direction": direction(d),
+        "words": badge(d.verdict, direction(d)),
         "mean": shown_mean(d),
         "interval": shown_interval(d),
         "p": shown_p(d.p) if d.varies else "–",

@@ -4,7 +4,9 @@ Two estimators run on the same recordings: the difference of each pair is free o
 over the trials is the effect. It has a 95 % bootstrap confidence interval (bias-corrected and accelerated, Efron 1987)
 and a p-value by the sign-flip permutation test (two-sided): how often so large a mean would come about if neither were
 better. Many figures are tested at once, so p is adjusted over all tests of a report (Holm 1979). With few trials the
-bootstrap is too sure of itself, while the test's p cannot fall below 2 / 2ᴺ; a difference needs both.
+bootstrap is too sure of itself, while the test's p cannot fall below 2 / 2ᴺ; a difference needs both. With fewer than
+`FEWEST` trials there is no interval: even one from the smallest to the largest value would leave out the middle of what
+they were drawn from with probability 2 / 2ᴺ, more than the level allows.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ class Verdict(StrEnum):
 
     CERTAIN = "certain"  #: the interval leaves out zero, and the Holm-adjusted p is at most `ALPHA`
     LIKELY = "likely"  #: the interval leaves out zero, and p is at most `ALPHA`, the adjusted one is not
-    HINT = "hint"  #: the interval leaves out zero, and p is above `ALPHA` and at most `HINT_ALPHA`
+    HINT = "hint"  #: the interval leaves out zero or there is none; p is above `ALPHA` and at most `HINT_ALPHA`
     OPEN = "open"  #: the interval holds zero, or p is above `HINT_ALPHA`
     EQUAL = "equal"  #: every pair is the same to the last digit
     SINGLE = "single"  #: one pair: a difference without any spread to judge it by
@@ -59,7 +61,7 @@ class Difference:
         missing: trials in which one or both have not, because they failed.
         reference, other: mean over the pairs.
         mean: of the differences, other less reference.
-        low, high: bounds of its confidence interval; NaN with fewer than two pairs.
+        low, high: bounds of its confidence interval; NaN with fewer than `FEWEST` pairs.
         p: of the sign-flip test, two-sided; NaN with fewer than two pairs, and where nothing is better or worse.
         p_holm: p adjusted over the tests of a report, see `adjusted`; p itself where there is no other test.
         lower, higher: pairs in which the other is lower, and higher.
@@ -162,9 +164,13 @@ def fewest(tests: int) -> int:
     return int(np.ceil(np.log2(2 * max(tests, 1) / ALPHA)))
 
 
+#: Values from which on a mean has a confidence interval.
+FEWEST = fewest(1)
+
+
 def interval(values: Array) -> tuple[float, float]:
-    """Bounds of the confidence interval of the mean of values (N,); NaN with fewer than two."""
-    if len(values) < 2:
+    """Bounds of the confidence interval of the mean of values (N,); NaN with fewer than `FEWEST`."""
+    if len(values) < FEWEST:
         return float("nan"), float("nan")
     if np.ptp(values) == 0:  # no spread to resample
         return float(values[0]), float(values[0])
@@ -172,7 +178,7 @@ def interval(values: Array) -> tuple[float, float]:
 
 
 def interval_and_test(d: Array) -> tuple[float, float, float]:
-    """Bounds of the mean of paired differences (N,), and the sign-flip test's p; NaN with fewer than two."""
+    """Bounds of the mean of paired differences (N,), see `interval`, and the test test's p; NaN below two pairs."""
     if len(d) < 2:
         return float("nan"), float("nan"), float("nan")
     return *interval(d), sign_flip(d)

@@ -60,14 +60,21 @@ class Run:
         return self.outcome == COMPLETED
 
 
-def sweep(plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial], None] | None = None) -> list[Run]:
+def sweep(
+    plan: Plan,
+    out: Path,
+    scheduler: Scheduler,
+    on_done: Callable[[Trial], None] | None = None,
+    on_kept: Callable[[Trial], None] | None = None,
+) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 
     Args:
         plan: what to run.
         out: folder; one of an earlier sweep with the same versions is gone on with.
         scheduler: where trials run.
-        on_done: called for each trial that ends, and for those that were done before.
+        on_done: called for each trial that ends.
+        on_kept: called for each that was done before.
 
     Raises:
         SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
@@ -78,8 +85,8 @@ def sweep(plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial]
         jobs = {}
         for trial in plan.trials_of(mode):
             if _is_done(trial, out):
-                if on_done is not None:
-                    on_done(trial)
+                if on_kept is not None:
+                    on_kept(trial)
             else:
                 jobs[trial.folder] = trial
         scheduler.run(
@@ -89,16 +96,23 @@ def sweep(plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial]
     return [read_run(trial, out) for mode in plan.modes for trial in plan.trials_of(mode)]
 
 
-def check(plan: Plan) -> None:
-    """Try every sequence, front end, back end and setting once; raises SlamError for what cannot work."""
+def check(plan: Plan) -> dict[str, int]:
+    """Try every sequence, front end, back end and setting once; raises SlamError for what cannot work.
+
+    Returns:
+        number of frames of a run, by sequence.
+    """
+    frames = {}
     for trial in plan.trials_of(CLOSED_LOOP):
         if trial.seed:
             continue
         sequence = open_sequence(trial.source)
+        frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
         config = config_of(trial, sequence)
         if frontend_of(trial, sequence) is None:
             registry.create("frontends", trial.variant.frontend, sequence.rig, **config.frontend)
         registry.create("backends", trial.backend, sequence.rig, models=config.models, **config.backend)
+    return frames
 
 
 def read_run(trial: Trial, out: Path) -> Run:

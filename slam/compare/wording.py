@@ -9,10 +9,22 @@ import numpy as np
 
 from slam.compare.measure import Metric
 from slam.compare.plan import REPLAY
-from slam.compare.statistics import ALPHA, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
+from slam.compare.statistics import ALPHA, FEWEST, HINT_ALPHA, LEVEL, Difference, Verdict, fewest
 from slam.evaluation.metrics import chi_square_band
 
-#: How sure a verdict is, in the usual words.
+#: A verdict as a badge has it, in the report and on the terminal.
+WORDS = {
+    Verdict.CERTAIN: "certain",
+    Verdict.LIKELY: "likely",
+    Verdict.HINT: "a hint",
+    Verdict.OPEN: "open",
+    Verdict.EQUAL: "equal",
+    Verdict.SINGLE: "one trial",
+    Verdict.NONE: "none",
+    Verdict.UNTESTED: "",
+}
+
+#: What a badge means.
 STRENGTH = {
     Verdict.CERTAIN: f"certain (Holm-adjusted p ≤ {ALPHA:g})",
     Verdict.LIKELY: f"likely (p ≤ {ALPHA:g}, not after Holm's adjustment)",
@@ -30,36 +42,49 @@ class Line:
     """A line of a headline.
 
     Attributes:
-        text: a sentence.
-        short: who, and which figures; `direction` and `verdict` say the rest.
-        direction: "better" or "worse", of the other back end; empty where neither.
+        text: who, and which figures; the badge says the rest.
+        direction: "better" or "worse", of the other back end against the reference; empty where neither.
         verdict: how sure that is.
     """
 
     text: str
-    short: str
     direction: str
     verdict: Verdict
 
+    @property
+    def badge(self) -> str:
+        """Direction and strength."""
+        return badge(self.verdict, self.direction)
 
-def headline(differences: Sequence[Difference], reference: str, other: str) -> list[Line]:
+
+def badge(verdict: Verdict, direction: str) -> str:
+    """A verdict in two words: direction and strength."""
+    return f"{direction}: {WORDS[verdict]}" if direction else WORDS[verdict]
+
+
+def direction(d: Difference) -> str:
+    """Whether the other back end is better or worse, as a badge says it; empty where nothing can be said."""
+    if d.better is None or d.verdict not in STRENGTH:
+        return ""
+    return "better" if d.better else "worse"
+
+
+def headline(differences: Sequence[Difference], other: str) -> list[Line]:
     """What the other back end does better and worse than the reference, the surest first, and what remains open.
 
     All that is certain, likely, or a hint is named, in both directions; of the rest the main figures.
     """
     lines = []
-    for verdict, strength in STRENGTH.items():
-        for direction, wins in (("better", True), ("worse", False)):
-            own = [d for d in differences if d.verdict is verdict and d.better is wins and _is_named(d)]
+    for verdict in STRENGTH:
+        for way in ("better", "worse"):
+            own = [d for d in differences if d.verdict is verdict and direction(d) == way and _is_named(d)]
             if own:
-                text = f"{other} {_VERB[verdict]} {direction} than {reference}, {strength}: {_listed(own)}."
-                lines.append(Line(text, f"{other}: {_listed(own)}", direction, verdict))
+                lines.append(Line(f"{other}: {_listed(own)}", way, verdict))
     rest = [d for d in differences if worth_saying(d)]
-    for verdict, text in ((Verdict.OPEN, "No difference can be concluded in"), (Verdict.NONE, "Nothing to compare in")):
+    for verdict in (Verdict.OPEN, Verdict.NONE):
         names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
         if names:
-            listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-            lines.append(Line(f"{text} {listed}.", f"{other}: {listed}", "", verdict))
+            lines.append(Line(f"{other}: {', '.join(names)}", "", verdict))
     return lines
 
 
@@ -142,7 +167,8 @@ def caution(trials: int, tests: int = 1) -> str:
     else:
         why = f"even where all agree, p is {least:.2g}, and {tests} tests multiply it (Holm)"
         what += ", but likely at best"
-    return f"With {trials} trials {what}: {why}. It takes {enough} or more (--trials)."
+    intervals = f" Intervals of a mean are given from {FEWEST} trials on." if trials < FEWEST else ""
+    return f"With {trials} trials {what}: {why}. It takes {enough} or more (--trials).{intervals}"
 
 
 def measurements(mode: str, reference: str) -> str:
@@ -220,7 +246,9 @@ def _is_open(d: Difference) -> bool:
 
 
 def _evidence(d: Difference) -> str:
-    """Interval and p."""
+    """Interval, where there is one, and p."""
+    if not np.isfinite(d.low):
+        return f"p {_equals(d.p)}" + ("" if d.p_holm == d.p else f", Holm-adjusted {shown_p(d.p_holm)}")
     what = f"{round(100 * LEVEL)} % interval"
     if d.metric.better == "one":
         what += " of the ratio of the factors by which they are off"

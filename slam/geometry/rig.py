@@ -162,6 +162,13 @@ class StereoRig:
         T[:3, 3] = self.R @ self.b
         return T
 
+    def __repr__(self) -> str:
+        kind = "rectified" if self.is_rectified else "not rectified"
+        return (
+            f"StereoRig({self.width}x{self.height}, {kind}, focal length {self.left.fu:.1f} px, "
+            f"baseline {self.baseline:.4f} m)"
+        )
+
     @cached_property
     def is_rectified(self) -> bool:
         """No distortion, parallel axes, baseline along rows, and the same focal length and rows in both images."""

@@ -6,12 +6,17 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam.errors import TrajectoryError
 from slam.files import read_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
+from slam.showing import card, count, path_svg, widest
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,40 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def __repr__(self) -> str:
+        seconds = float(self.stamps[-1] - self.stamps[0]) if len(self) else 0.0
+        return f"Trajectory({count(len(self), 'pose')}, {seconds:.3f} s, {self.length:.3f} m)"
+
+    def _repr_html_(self) -> str:
+        return card(repr(self), [path_svg(self.positions)])
+
+    def plot(self, axis: Axes | None = None, plane: str = "", **options: Any) -> Axes:
+        """Draw the path, two of its coordinates, both on one scale.
+
+        Args:
+            axis: of matplotlib, to draw into; None for a new figure.
+            plane: the coordinates to the right and up, such as ``"xz"``: the top view, where the world is the first
+                camera's frame. The two that reach farthest where it is empty.
+            **options: of the line, such as ``label="ekf"``.
+
+        Returns:
+            the axis, for more on it.
+
+        Raises:
+            TrajectoryError: the plane is not named by two of x, y, z.
+        """
+        if plane and not (len(plane) == 2 and set(plane) <= set("xyz")):
+            raise TrajectoryError(f"trajectory: a plane is two of x, y and z, such as 'xz', not {plane!r}")
+        if axis is None:
+            import matplotlib.pyplot as plt
+
+            axis = plt.figure(layout="constrained").add_subplot()
+        across, up = map("xyz".index, plane) if plane else widest(self.positions)
+        axis.plot(self.positions[:, across], self.positions[:, up], **options)
+        axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
+        axis.set_aspect("equal", adjustable="datalim")
+        return axis
 
     @property
     def positions(self) -> Array:

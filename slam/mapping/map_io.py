@@ -26,6 +26,7 @@ from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.keyframes import Keyframe
 from slam.mapping.atlas.saved import KEYFRAME_TYPES, from_arrays, to_arrays
 from slam.mapping.known_landmarks import require_known
+from slam.showing import count
 
 
 class HasMap(Protocol):
@@ -122,6 +123,9 @@ class SavedMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"SavedMap({count(len(self), 'landmark')}, {self.dimensions}-D, {self.world_frame})"
 
     @property
     def dimensions(self) -> int:

@@ -161,7 +161,10 @@ class Mapper:
             return change
         ids = returned.ids[free]
         ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
-        landmarks, _ = _erase(backend, change.landmarks, np.isin(change.landmarks.ids, ids))
+        stale = np.isin(change.landmarks.ids, ids)
+        if stale.any():
+            backend.remove(change.landmarks.ids[stale])
+        landmarks = change.landmarks.select(~stale)
         backend.place(ids, returned.local[free], returned.covariances[free])
         rows = returned.rows[free]
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, self._camera(backend))

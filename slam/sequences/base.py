@@ -12,6 +12,7 @@ from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.faults import FaultLog
+from slam.showing import sequence_html, sequence_line
 
 
 @runtime_checkable
@@ -117,6 +118,9 @@ class RecordedSequence:
 
     def __iter__(self) -> Iterator[StereoFrame]:
         return self.frames()
+
+    __repr__ = sequence_line
+    _repr_html_ = sequence_html
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Frames `start` up to, but without, `stop`; see `Sequence.frames`."""

@@ -1,31 +1,70 @@
 """The contract of a back end as checks that any back end can be put through, third-party ones included.
 
+The contract has three tiers; each takes in the one before it:
+
+- ``"runs"``: it gets through a run. What the system calls is there and returns what the interface says.
+- ``"right"``: its answers are those that the interface describes, misuse is refused, and runs repeat.
+- ``"good"``: it estimates well: covariances fit the errors, velocity is learnt, wrong matches are rejected.
+
+All at once, from the command line, as a list with a sentence for each failure::
+
+    python -m slam.testing my_package.my_module:MyBackend
+
 With pytest, one test a check::
 
     import pytest
-    from slam.testing import BACKEND_CHECKS
+    from slam.testing import RUNS
 
-    @pytest.mark.parametrize("check", BACKEND_CHECKS, ids=lambda check: check.__name__)
+    @pytest.mark.parametrize("check", RUNS, ids=lambda check: check.__name__)
     def test_contract(check):
         check(MyBackend)
 
-or all at once: ``check_backend(MyBackend)``. The factory is called as ``factory(rig, models=EstimatorModels(...))``.
+or in one call: ``check_backend(MyBackend, "runs")``. The factory is called as ``factory(rig, models=…)``.
 Nothing here needs pytest. Tolerances are some ten times what a good estimator reaches on the scene: they find what is
 broken, not what is mediocre. May import everything but `slam.run`, `slam.compare` and `slam.commands`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
-from slam.errors import SlamError
-from slam.testing import estimation, protocol
+from slam.errors import ConfigurationError
+from slam.naming import unknown
+from slam.testing import estimation, protocol, running
 from slam.testing.scene import GENERAL_RIG, MODELS, RIG, SIGMA, Factory
 
-__all__ = ["BACKEND_CHECKS", "GENERAL_RIG", "MODELS", "RIG", "SIGMA", "Factory", "check_backend"]
+__all__ = [
+    "BACKEND_CHECKS",
+    "GENERAL_RIG",
+    "GOOD",
+    "MODELS",
+    "RIG",
+    "RIGHT",
+    "RUNS",
+    "SIGMA",
+    "TIERS",
+    "Factory",
+    "Finding",
+    "check_backend",
+    "findings",
+]
 
-#: Every check of the contract, in the order of increasing demands.
-BACKEND_CHECKS: Sequence[Callable[[Factory], None]] = (
+Check = Callable[[Factory], None]
+
+#: It gets through a run.
+RUNS: Sequence[Check] = (
+    running.every_method_is_there,
+    running.predictions_have_their_shapes,
+    running.updates_are_reported,
+    running.estimates_have_their_shapes,
+    running.landmarks_can_be_removed,
+    running.trajectory_has_a_pose_for_every_prediction,
+    running.a_run_comes_to_its_end,
+)
+
+#: Its answers are those that the interface describes.
+RIGHT: Sequence[Check] = (
     protocol.first_prediction_is_the_start,
     protocol.initial_pose_is_kept,
     protocol.time_must_increase,
@@ -34,33 +73,87 @@ BACKEND_CHECKS: Sequence[Callable[[Factory], None]] = (
     protocol.nothing_seen_is_no_error,
     protocol.ids_must_fit_the_map,
     estimation.new_landmarks_are_triangulated,
+    estimation.predictions_are_of_landmarks_in_view,
     protocol.estimate_is_in_order,
     protocol.trajectory_has_every_stamp,
     protocol.results_are_the_callers_own,
     protocol.same_input_same_bytes,
+    protocol.removed_landmarks_are_gone,
+)
+
+#: It estimates well.
+GOOD: Sequence[Check] = (
     estimation.follows_the_camera,
     estimation.follows_with_a_general_rig,
     estimation.velocity_is_learnt,
-    estimation.predictions_are_of_landmarks_in_view,
     estimation.innovations_are_as_predicted,
     estimation.left_pixels_alone_are_measured,
     estimation.wrong_match_is_rejected,
     estimation.guess_is_no_measurement,
-    protocol.removed_landmarks_are_gone,
 )
 
+#: The tiers by name, in the order of increasing demands.
+TIERS: dict[str, Sequence[Check]] = {"runs": RUNS, "right": RIGHT, "good": GOOD}
 
-def check_backend(factory: Factory) -> None:
-    """Put a back end through the whole contract.
+#: Every check of the contract, in the order of increasing demands.
+BACKEND_CHECKS: Sequence[Check] = (*RUNS, *RIGHT, *GOOD)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found.
+
+    Attributes:
+        tier: its tier.
+        check: its name.
+        demand: what it asks for, a sentence.
+        failure: how the back end fails it, a sentence; empty where it passes.
+    """
+
+    tier: str
+    check: str
+    demand: str
+    failure: str
+
+
+def findings(factory: Factory, tier: str = "good") -> Iterator[Finding]:
+    """Put a back end through all checks up to a tier, one after another.
 
     Args:
         factory: called as ``factory(rig, models=...)``, for each check anew; usually the back end's class.
+        tier: ``"runs"``, ``"right"`` or ``"good"``.
 
     Raises:
-        AssertionError: the first check that fails, by name.
+        ConfigurationError: there is no such tier.
     """
-    for check in BACKEND_CHECKS:
-        try:
-            check(factory)
-        except (AssertionError, SlamError) as error:
-            raise AssertionError(f"{check.__name__}: {error}") from error
+    if tier not in TIERS:
+        raise ConfigurationError(unknown("tier", tier, TIERS))
+    for name, checks in TIERS.items():
+        for check in checks:
+            demand = " ".join((check.__doc__ or "").split("\n\n")[0].split())
+            yield Finding(name, check.__name__, demand, _failure(check, factory))
+        if name == tier:
+            return
+
+
+def check_backend(factory: Factory, tier: str = "good") -> None:
+    """Put a back end through the contract, up to a tier; see `findings`.
+
+    Raises:
+        AssertionError: the first check that fails, by name, with how it fails and what it asks for.
+        ConfigurationError: there is no such tier.
+    """
+    for found in findings(factory, tier):
+        if found.failure:
+            raise AssertionError(f"{found.check} ({found.tier}): {found.failure}. Asked for: {found.demand}")
+
+
+def _failure(check: Check, factory: Factory) -> str:
+    """How a check fails, in a sentence; empty where it passes."""
+    try:
+        check(factory)
+    except AssertionError as error:
+        return str(error)
+    except Exception as error:  # noqa: BLE001 - the back end is somebody else's: whatever it raises is a finding
+        return f"raised {type(error).__name__}: {' '.join(str(error).split()) or 'without a message'}"
+    return ""

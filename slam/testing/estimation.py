@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Observations, UpdateStatus
+from slam.data import Observations, UpdateReport, UpdateStatus
 from slam.geometry import se3
 from slam.models import MotionModel
 from slam.testing.scene import (
@@ -22,6 +22,8 @@ from slam.testing.scene import (
     assert_covariance,
     assert_near,
     make_scene,
+    require,
+    require_same,
     started,
     tracked,
 )
@@ -31,12 +33,13 @@ def new_landmarks_are_triangulated(factory: Factory) -> None:
     """A landmark's first position and covariance are the stereo pair's."""
     backend, seen = started(factory)
     found = backend.estimate()
-    np.testing.assert_array_equal(found.ids, seen.ids)
+    require_same(found.ids, seen.ids, "ids of the landmarks that were added")
     h = RIG.triangulate(seen.uv_left, seen.uv_right)
-    np.testing.assert_allclose(found.positions, h, rtol=1e-3)
+    require_same(found.positions, h, "positions of landmarks seen once, against the stereo pair's", 0.02)
     expected = RIG.triangulation_covariance(h, SIGMA)
     ratio = np.trace(found.covariances, axis1=1, axis2=2) / np.trace(expected, axis1=1, axis2=2)
-    assert np.abs(np.median(ratio) - 1) < 0.2, f"first landmark variances are {np.median(ratio)} of the stereo pair's"
+    middle = float(np.median(ratio))
+    require(abs(middle - 1) < 0.2, f"variances of landmarks seen once are {middle:.3g} times those of the stereo pair")
 
 
 def follows_the_camera(factory: Factory) -> None:
@@ -55,18 +58,29 @@ def _follows(factory: Factory, scene: Scene) -> None:
     assert_near(found.T_world_left, scene.poses[-1], "pose after the scene")
     assert_covariance(found.covariance, (6, 6), "pose")
     error = se3.log(se3.inverse(found.T_world_left) @ scene.poses[-1])
-    assert error @ np.linalg.solve(found.covariance, error) < 60, "the pose's covariance is far too small"  # χ²₆: 1e-10
+    nees = float(error @ np.linalg.solve(found.covariance, error))
+    require(nees < 60, f"the pose's covariance is far too small: its NEES is {nees:.3g}, 6 expected")  # χ²₆: 1e-10
     assert_covariance(found.covariances, (len(found.ids), 3, 3), "landmarks")
     off = found.positions - scene.points[found.ids]
-    nees = np.einsum("ni,ni->n", off, np.linalg.solve(found.covariances, off[:, :, None])[:, :, 0])
-    assert np.median(nees) < 12, f"median NEES of landmarks is {np.median(nees)}, 2.4 expected"
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(found.covariances, off[:, :, None])[:, :, 0])
+    middle = float(np.median(squared))
+    require(middle < 12, f"covariances of landmarks are far too small: their median NEES is {middle:.3g}, 2.4 expected")
     for report, seen in zip(reports[1:], scene.frames[1:]):
-        assert report.status is UpdateStatus.OK and report.reason == ""
-        assert len(report.used) > 0.8 * (len(report.used) + len(report.rejected)), "most observations are good"
-        assert not np.isin(report.used, report.rejected).any() and np.isin(report.used, seen.ids).all()
-        assert 2 * len(report.used) <= report.dof <= 4 * len(report.used) and report.nis >= 0
+        _is_in_order(report, seen)
     nis, dof = sum(r.nis for r in reports[1:]), sum(r.dof for r in reports[1:])
-    assert 0.3 < nis / dof < 2, f"NIS is {nis / dof} of its degrees of freedom"
+    require(0.3 < nis / dof < 2, f"NIS is {nis / dof:.3g} times its degrees of freedom, 1 expected")
+
+
+def _is_in_order(report: UpdateReport, seen: Observations) -> None:
+    """Fail unless a report of good observations says so."""
+    used, rejected, dof = len(report.used), len(report.rejected), report.dof
+    fine = report.status is UpdateStatus.OK and report.reason == ""
+    require(fine, f"status of an update with good observations: {report.status} {report.reason!r}, not ok")
+    require(used > 0.8 * (used + rejected), f"{rejected} of {used + rejected} good observations were rejected")
+    own = not np.isin(report.used, report.rejected).any() and np.isin(report.used, seen.ids).all()
+    require(own, "a landmark is both used and rejected, or was not observed")
+    require(2 * used <= dof <= 4 * used, f"{dof} degrees of freedom of {used} landmarks: 2 to 4 each are expected")
+    require(report.nis >= 0, f"NIS is {report.nis:.3g}: it must be a number of at least 0")
 
 
 def velocity_is_learnt(factory: Factory) -> None:
@@ -84,12 +98,13 @@ def predictions_are_of_landmarks_in_view(factory: Factory) -> None:
     prediction = backend.predict(DT * len(scene.frames))
     map_ids = backend.estimate().ids
     left, right = RIG.project(se3.transform(se3.inverse(prediction.T_world_left), backend.positions(map_ids)))
-    np.testing.assert_array_equal(np.sort(prediction.ids), map_ids[RIG.left.in_image(left)])
+    require_same(np.sort(prediction.ids), map_ids[RIG.left.in_image(left)], "landmarks in the predicted angle of view")
     row = np.searchsorted(map_ids, prediction.ids)
-    np.testing.assert_allclose(prediction.uv_left, left[row], atol=1e-6)
-    np.testing.assert_allclose(prediction.uv_right, right[row], atol=1e-6)
+    require_same(prediction.uv_left, left[row], "predicted left pixels, against the projected positions", 1e-6)
+    require_same(prediction.uv_right, right[row], "predicted right pixels, against the projected positions", 1e-6)
     assert_covariance(prediction.innovation, (len(row), 2, 2), "innovations")
-    assert np.linalg.eigvalsh(prediction.innovation).min() > 0.99 * SIGMA**2, "measurement noise is included"
+    noisy = np.linalg.eigvalsh(prediction.innovation).min() > 0.99 * SIGMA**2
+    require(noisy, "innovation covariances are smaller than the pixel noise that they must include")
     assert_covariance(prediction.covariance, (6, 6), "predicted pose")
 
 
@@ -104,7 +119,7 @@ def innovations_are_as_predicted(factory: Factory) -> None:
         nu, S = seen.uv_left[theirs] - prediction.uv_left[ours], prediction.innovation[ours]
         distances.append(np.einsum("ni,ni->n", nu, np.linalg.solve(S, nu[:, :, None])[:, :, 0]))
     mean = float(np.concatenate(distances[10:]).mean())  # by then the velocity is known
-    assert 1 < mean < 4, f"mean squared distance of left innovations is {mean}, about 2 expected"
+    require(1 < mean < 4, f"left innovations have a mean squared Mahalanobis distance of {mean:.3g}, about 2 expected")
 
 
 def left_pixels_alone_are_measured(factory: Factory) -> None:
@@ -114,7 +129,8 @@ def left_pixels_alone_are_measured(factory: Factory) -> None:
         if k > 3:
             seen = replace(seen, uv_right=np.full_like(seen.uv_right, np.nan)).select(run.in_map(seen))
         _, report = run.step(k, seen)
-    assert report.status is UpdateStatus.OK and report.dof <= 3 * len(report.used)
+    require(report.status is UpdateStatus.OK, f"status of an update with left pixels alone: {report.status}, not ok")
+    require(report.dof <= 3 * len(report.used), "right pixels that were not observed count as degrees of freedom")
     assert_near(run.backend.estimate().T_world_left, scene.poses[-1], "pose by left pixels", factor=3)
 
 
@@ -125,7 +141,8 @@ def wrong_match_is_rejected(factory: Factory) -> None:
     shift = np.zeros((len(seen), 2))
     shift[4] = [60.0, -45.0]
     report = backend.update(Observations(seen.ids, seen.uv_left + shift, seen.uv_right + shift))
-    assert seen.ids[4] in report.rejected and seen.ids[4] not in report.used
+    rejected = seen.ids[4] in report.rejected and seen.ids[4] not in report.used
+    require(rejected, "a match that is 75 px off was not rejected")
     assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose despite a wrong match")
 
 
@@ -135,5 +152,6 @@ def guess_is_no_measurement(factory: Factory) -> None:
     for offset in (np.zeros(6), np.array([0.02, -0.03, 0.01, 0.1, -0.1, 0.2])):
         backend, seen = all_but_the_last(factory, scene)
         report = backend.update(seen, guess=scene.poses[-1] @ se3.exp(offset))
-        assert report.status is UpdateStatus.OK
-        assert_near(backend.estimate().T_world_left, scene.poses[-1], f"pose with a guess off by {offset}")
+        require(report.status is UpdateStatus.OK, f"status of an update with a guess: {report.status}, not ok")
+        how = "good" if not offset.any() else "bad"
+        assert_near(backend.estimate().T_world_left, scene.poses[-1], f"pose with a {how} guess to start from")

@@ -27,6 +27,7 @@ from slam.geometry.se3 import Array
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
+from slam.testing.scene import require, require_same
 
 Factory = Callable[..., Backend]
 
@@ -45,32 +46,38 @@ def moves_with_its_body(factory: Factory) -> None:
     origin = estimates[0].T_world_object
     truth = _motion(14) @ origin
     error = se3.log(se3.inverse(estimates[-1].T_world_object) @ truth)
-    assert np.abs(error[:3]).max() < 0.08, f"rotation since found is off by {error[:3]} rad"
-    assert np.abs(error[3:]).max() < 0.05, f"translation since found is off by {error[3:]} m"
-    assert error @ np.linalg.solve(estimates[-1].covariance, error) < 60, "the pose's covariance is far too small"
-    off = _VELOCITY[:3] - estimates[-1].velocity[:3]
-    assert np.abs(off).max() < 1.0, f"angular velocity is off by {off} rad/s"
+    turned, moved = float(np.abs(error[:3]).max()), float(np.abs(error[3:]).max())
+    require(turned < 0.08, f"rotation since the first sight is off by {turned:.3g} rad")
+    require(moved < 0.05, f"translation since the first sight is off by {moved:.3g} m")
+    nees = float(error @ np.linalg.solve(estimates[-1].covariance, error))
+    require(nees < 60, f"the body's covariance is far too small: its NEES is {nees:.3g}, 6 expected")
+    off = float(np.abs(_VELOCITY[:3] - estimates[-1].velocity[:3]).max())
+    require(off < 1.0, f"angular velocity is off by {off:.3g} rad/s")
     for e in estimates:
-        assert e.id == _BODY and e.measured and len(e.used) == _POINTS and len(e.rejected) == 0
+        whole = e.id == _BODY and e.measured and len(e.used) == _POINTS and len(e.rejected) == 0
+        require(whole, f"body {e.id}: measured {e.measured}, {len(e.used)} of {_POINTS} good points used")
 
 
 def first_pose_is_by_definition(factory: Factory) -> None:
     """The frame of a body: its axes are the world's, its origin is the mean of the points, its pose has no error."""
     first = _run(factory, 1)[0]
-    np.testing.assert_allclose(first.T_world_object[:3, :3], np.eye(3), atol=1e-9)
-    assert np.linalg.norm(first.T_world_object[:3, 3] - _shape().mean(axis=0)) < 0.1
-    np.testing.assert_allclose(first.covariance, 0, atol=1e-9)
+    require_same(first.T_world_object[:3, :3], np.eye(3), "rotation of a new body", 1e-9)
+    require_same(
+        first.T_world_object[:3, 3], _shape().mean(axis=0), "a new body's origin, against its points' mean", 0.1
+    )
+    require_same(first.covariance, np.zeros((6, 6)), "covariance of a new body's pose", 1e-9)
 
 
 def unseen_body_is_predicted(factory: Factory) -> None:
     """A body out of sight goes on with growing covariance, and is found again under its id."""
     estimates = _run(factory, 16, hidden=range(8, 13))
     spread = [np.trace(e.covariance) for e in estimates[8:13]]
-    assert not any(e.measured for e in estimates[8:13]) and (np.diff(spread) > 0).all()
+    require(not any(e.measured for e in estimates[8:13]), "a body that was not observed counts as measured")
+    require((np.diff(spread) > 0).all(), "the covariance of a body does not grow while it is not observed")
     step = np.linalg.norm(estimates[12].T_world_object[:3, 3] - estimates[7].T_world_object[:3, 3])
     expected = 5 * _DT * np.linalg.norm(_VELOCITY[3:])
-    assert abs(step - expected) < expected, f"an unseen body moved by {step} m, {expected} m expected"
-    assert all(e.measured for e in estimates[13:])
+    require(abs(step - expected) < expected, f"an unseen body moved by {step:.3g} m, {expected:.3g} m expected")
+    require(all(e.measured for e in estimates[13:]), "a body that was seen again is not measured")
 
 
 def wrong_point_is_rejected(factory: Factory) -> None:
@@ -82,9 +89,10 @@ def wrong_point_is_rejected(factory: Factory) -> None:
         return replace(o, uv_left=o.uv_left + shift, uv_right=o.uv_right + shift)
 
     clean, spoilt = _run(factory, 10)[-1], _run(factory, 10, change=spoil)[-1]
-    assert spoilt.rejected.tolist() == [103] and 103 not in spoilt.used
+    require(spoilt.rejected.tolist() == [103], "a match that is 50 px off was not rejected, or others were")
     off = se3.log(se3.inverse(clean.T_world_object) @ spoilt.T_world_object)
-    assert (np.abs(off) < 2 * np.sqrt(np.diag(clean.covariance))).all(), f"a wrong match moved the body by {off}"
+    still = (np.abs(off) < 2 * np.sqrt(np.diag(clean.covariance))).all()
+    require(still, "a wrong match moved the body by more than two standard deviations")
 
 
 def bodies_come_in_order_and_go(factory: Factory) -> None:
@@ -94,15 +102,16 @@ def bodies_come_in_order_and_go(factory: Factory) -> None:
     backend.predict(0.0)
     seen = _observations(0, rng)
     other = replace(seen, id=1, points=seen.points + 50)
-    assert [e.id for e in objects.update_objects([seen, other])] == [1, _BODY]
+    require_same([e.id for e in objects.update_objects([seen, other])], [1, _BODY], "bodies by ascending id")
     objects.remove_objects([1])
     backend.predict(_DT)
-    assert [e.id for e in objects.update_objects([])] == [_BODY]
+    require_same([e.id for e in objects.update_objects([])], [_BODY], "bodies after one was removed")
     objects.remove_objects(np.array([_BODY]))
     backend.predict(2 * _DT)
-    assert objects.update_objects([]) == []
+    require(objects.update_objects([]) == [], "there are bodies after all were removed")
     backend.predict(3 * _DT)
-    assert [e.id for e in objects.update_objects([_observations(3, rng)])] == [_BODY]
+    again = [e.id for e in objects.update_objects([_observations(3, rng)])]
+    require_same(again, [_BODY], "a removed body that comes back under its id")
 
 
 def misuse_of_bodies_is_refused(factory: Factory) -> None:
@@ -115,7 +124,7 @@ def misuse_of_bodies_is_refused(factory: Factory) -> None:
     _raises(objects.update_objects, [flat], what="a new body without right pixels")
     _raises(objects.update_objects, [few], what="a new body of two points")
     _raises(objects.remove_objects, [5], what="removal of an unknown body")
-    assert objects.update_objects([]) == []
+    require(objects.update_objects([]) == [], "a body that was refused is there")
 
 
 def camera_is_not_moved_by_bodies(factory: Factory) -> None:
@@ -131,7 +140,7 @@ def camera_is_not_moved_by_bodies(factory: Factory) -> None:
             jump = np.array([10.0 * (-1) ** k, 0.0]) if wild else np.zeros(2)
             objects.update_objects([replace(seen, uv_left=seen.uv_left + jump, uv_right=seen.uv_right + jump)])
         poses.append(backend.estimate().T_world_left)
-    np.testing.assert_allclose(poses[0], poses[1], atol=1e-6)
+    require_same(poses[1], poses[0], "the camera's pose while a body jumps", 1e-6)
 
 
 #: All checks.
@@ -175,7 +184,8 @@ def _observations(k: int, rng: np.random.Generator) -> ObjectObservations:
 
 def _create(factory: Factory) -> tuple[Backend, ObjectBackend]:
     backend = factory(RIG, models=MODELS)
-    assert isinstance(backend, ObjectBackend), "update_objects or remove_objects is missing"
+    if not isinstance(backend, ObjectBackend):
+        raise AssertionError("update_objects or remove_objects is missing")
     return backend, backend
 
 
@@ -201,7 +211,7 @@ def _run(
             backend.update(seen)
         given = change(k, _observations(k, rng))
         (estimate,) = objects.update_objects([] if k in hidden else [given])
-        assert estimate.stamp == _DT * k
+        require_same(estimate.stamp, _DT * k, "stamp of a body's estimate")
         out.append(estimate)
     return out
 

@@ -20,6 +20,8 @@ from slam.testing.scene import (
     assert_near,
     make_scene,
     raises,
+    require,
+    require_same,
     started,
     tracked,
 )
@@ -28,14 +30,15 @@ from slam.testing.scene import (
 def first_prediction_is_the_start(factory: Factory) -> None:
     """The first predict returns the initial pose with its covariance and no landmark."""
     prediction = factory(RIG, models=MODELS).predict(3.0)
-    assert prediction.stamp == 3.0
-    np.testing.assert_allclose(prediction.T_world_left, np.eye(4), atol=1e-9)
+    require_same(prediction.stamp, 3.0, "stamp of the first prediction")
+    require_same(prediction.T_world_left, np.eye(4), "pose of the first prediction", 1e-9)
     assert_covariance(prediction.covariance, (6, 6), "first prediction")
     sigma = np.sqrt(np.diag(prediction.covariance))
     expected = np.repeat([MODELS.initial_rotation_sigma, MODELS.initial_position_sigma], 3)
-    np.testing.assert_allclose(sigma, expected, rtol=0.1)
-    assert len(prediction.ids) == len(prediction.uv_left) == len(prediction.uv_right) == 0
-    assert prediction.innovation.shape == (0, 2, 2)
+    near = np.allclose(sigma, expected, rtol=0.1)
+    require(near, "the first covariance is not that of the models' initial_rotation_sigma and initial_position_sigma")
+    rows = len(prediction.ids) + len(prediction.uv_left) + len(prediction.uv_right) + len(prediction.innovation)
+    require(not rows, "the first prediction lists landmarks, but the map is empty")
 
 
 def initial_pose_is_kept(factory: Factory) -> None:
@@ -47,7 +50,7 @@ def initial_pose_is_kept(factory: Factory) -> None:
     assert_near(backend.estimate().T_world_left, T @ scene.poses[-1], "pose in a turned world")
     found = backend.estimate()
     error = found.positions - se3.transform(T, scene.points[found.ids])
-    assert np.median(np.linalg.norm(error, axis=1)) < 0.5, "landmarks are not in the initial pose's world"
+    require(np.median(np.linalg.norm(error, axis=1)) < 0.5, "landmarks are not in the initial pose's world")
 
 
 def time_must_increase(factory: Factory) -> None:
@@ -55,7 +58,7 @@ def time_must_increase(factory: Factory) -> None:
     backend, _ = started(factory)
     for stamp in (0.0, -1.0, float("nan"), float("inf")):
         raises(MeasurementError, backend.predict, stamp, what=f"predict({stamp}) after 0.0")
-    assert backend.predict(DT).stamp == DT
+    require_same(backend.predict(DT).stamp, DT, "stamp of a prediction after refused ones")
 
 
 def calls_before_the_first_prediction(factory: Factory) -> None:
@@ -78,13 +81,17 @@ def nothing_seen_is_no_error(factory: Factory) -> None:
     for k in range(6, 12):
         backend.predict(DT * k)
         report = backend.update(Observations.empty())
-        assert report.status is UpdateStatus.EMPTY and report.dof == 0 and np.isnan(report.nis)
-        assert len(report.used) == len(report.rejected) == 0
+        require(
+            report.status is UpdateStatus.EMPTY, f"status of a frame without observations: {report.status}, not empty"
+        )
+        none = report.dof == 0 and np.isnan(report.nis) and not len(report.used) and not len(report.rejected)
+        require(none, "a report without observations has some used or rejected, degrees of freedom, or a NIS")
     after = backend.estimate()
-    assert np.isfinite(after.T_world_left).all()
+    require(np.isfinite(after.T_world_left).all(), "the pose is not finite after frames without observations")
     assert_covariance(after.covariance, (6, 6), "after frames without observations")
-    assert np.trace(after.covariance) > np.trace(before.covariance), "uncertainty must grow in the dark"
-    np.testing.assert_array_equal(after.ids, before.ids)
+    grown = np.trace(after.covariance) > np.trace(before.covariance)
+    require(grown, "the pose's covariance does not grow in frames without observations")
+    require_same(after.ids, before.ids, "landmarks after frames without observations")
 
 
 def ids_must_fit_the_map(factory: Factory) -> None:
@@ -102,8 +109,8 @@ def ids_must_fit_the_map(factory: Factory) -> None:
     backend.predict(DT)
     raises(MeasurementError, backend.update, stranger, what="update with an unknown id")
     after = backend.estimate()
-    np.testing.assert_array_equal(after.ids, before.ids)
-    np.testing.assert_allclose(after.positions, before.positions, atol=1e-9)
+    require_same(after.ids, before.ids, "landmarks after calls that were refused")
+    require_same(after.positions, before.positions, "positions after calls that were refused", 1e-9)
 
 
 def estimate_is_in_order(factory: Factory) -> None:
@@ -113,15 +120,18 @@ def estimate_is_in_order(factory: Factory) -> None:
     run.step(1, scene.frames[1])
     backend = run.backend
     whole, pose_only = backend.estimate(), backend.estimate(landmarks=False)
-    assert (np.diff(whole.ids) > 0).all()
+    require((np.diff(whole.ids) > 0).all(), "the estimate's ids do not ascend")
     # An offline back end may solve for `estimate` alone, so `positions` may be an earlier answer, but not another one.
     off = np.abs(backend.positions(whole.ids[::-1])[::-1] - whole.positions)
     deviations = np.sqrt(np.diagonal(whole.covariances, axis1=1, axis2=2))
-    assert (off < deviations).all(), "positions and estimate differ by more than a standard deviation"
-    assert len(pose_only.ids) == 0 and pose_only.positions.shape == (0, 3) and pose_only.covariances.shape == (0, 3, 3)
-    np.testing.assert_array_equal(pose_only.T_world_left, whole.T_world_left)
-    np.testing.assert_allclose(pose_only.covariance, whole.covariance, rtol=1e-9)
-    assert whole.stamp == pose_only.stamp == DT
+    require((off < deviations).all(), "positions(ids) and the estimate differ by more than a standard deviation")
+    require_same(pose_only.ids, NONE, "landmarks of estimate(landmarks=False)")
+    require_same(pose_only.positions, np.zeros((0, 3)), "positions of estimate(landmarks=False)")
+    require_same(pose_only.covariances, np.zeros((0, 3, 3)), "covariances of estimate(landmarks=False)")
+    require_same(pose_only.T_world_left, whole.T_world_left, "pose with and without landmarks")
+    scale = 1e-9 * float(np.abs(whole.covariance).max())
+    require_same(pose_only.covariance, whole.covariance, "the pose's covariance with and without landmarks", scale)
+    require_same((whole.stamp, pose_only.stamp), (DT, DT), "stamp of the estimate")
 
 
 def trajectory_has_every_stamp(factory: Factory) -> None:
@@ -129,8 +139,8 @@ def trajectory_has_every_stamp(factory: Factory) -> None:
     scene = make_scene()
     backend = tracked(factory, scene)[0].backend
     trajectory = backend.trajectory()
-    np.testing.assert_allclose(trajectory.stamps, DT * np.arange(len(scene.frames)), atol=1e-12)
-    np.testing.assert_allclose(trajectory.poses[-1], backend.estimate().T_world_left, atol=1e-9)
+    require_same(trajectory.stamps, DT * np.arange(len(scene.frames)), "stamps of the trajectory", 1e-12)
+    require_same(trajectory.poses[-1], backend.estimate().T_world_left, "last pose of trajectory and estimate", 1e-9)
     for T, truth in zip(trajectory.poses, scene.poses):
         assert_near(T, truth, "trajectory")
 
@@ -146,18 +156,19 @@ def results_are_the_callers_own(factory: Factory) -> None:
             array[:] = 7.0
     backend.positions(before.ids)[:] = 7.0
     after = backend.estimate()
-    for a, b in zip(copy, (after.T_world_left, after.positions, after.covariance)):
-        np.testing.assert_array_equal(a, b)
+    now = (after.T_world_left, after.positions, after.covariance)
+    for what, a, b in zip(("pose", "positions", "covariance"), now, copy):
+        require_same(a, b, f"{what} after the caller wrote into an array that was returned")
 
 
 def same_input_same_bytes(factory: Factory) -> None:
     """Two runs over the same observations agree to the last bit."""
     runs = [tracked(factory, make_scene(8))[0].backend for _ in range(2)]
     first, second = (backend.estimate() for backend in runs)
-    np.testing.assert_array_equal(first.T_world_left, second.T_world_left)
-    np.testing.assert_array_equal(first.covariance, second.covariance)
-    np.testing.assert_array_equal(first.positions, second.positions)
-    np.testing.assert_array_equal(runs[0].trajectory().poses, runs[1].trajectory().poses)
+    require_same(second.T_world_left, first.T_world_left, "pose of a second run on the same input")
+    require_same(second.covariance, first.covariance, "covariance of a second run on the same input")
+    require_same(second.positions, first.positions, "positions of a second run on the same input")
+    require_same(runs[1].trajectory().poses, runs[0].trajectory().poses, "path of a second run on the same input")
 
 
 def removed_landmarks_are_gone(factory: Factory) -> None:
@@ -171,13 +182,13 @@ def removed_landmarks_are_gone(factory: Factory) -> None:
     backend.remove(gone)
     run.known -= set(gone.tolist())
     backend.remove(NONE)
-    np.testing.assert_array_equal(backend.estimate().ids, kept)
-    np.testing.assert_allclose(backend.positions(kept), before, atol=1e-6)
+    require_same(backend.estimate().ids, kept, "landmarks after a removal")
+    require_same(backend.positions(kept), before, "positions of those that stay after a removal", 1e-6)
     raises(MeasurementError, backend.positions, gone[:1], what="position of a removed landmark")
     for k in range(8, len(scene.frames)):
         prediction, report = run.step(k, scene.frames[k])
-        assert report.status is UpdateStatus.OK
-        assert k > 8 or not np.isin(prediction.ids, gone).any(), "a removed landmark is predicted"
+        require(report.status is UpdateStatus.OK, f"status after a removal: {report.status}, not ok")
+        require(k > 8 or not np.isin(prediction.ids, gone).any(), "a removed landmark is predicted")
     assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose after removals")
     back = gone[np.isin(gone, scene.frames[-1].ids)]
-    assert len(back) and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back"
+    require(len(back) > 0 and np.isin(back, backend.estimate().ids).all(), "a removed id could not come back")

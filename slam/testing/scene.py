@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from slam.data import BoolArray, Observations, Prediction, UpdateReport
 from slam.geometry import se3
@@ -113,19 +114,44 @@ def raises(error: type[Exception], call: Callable[..., Any], *args: Any, what: s
         call(*args, **kwargs)
     except error:
         return
-    raise AssertionError(f"{what}: {error.__name__} expected")
+    raise AssertionError(f"{what}: was accepted, {error.__name__} is expected")
+
+
+def require(holds: bool | np.bool_, sentence: str) -> None:
+    """Fail with a sentence unless something holds."""
+    if not holds:
+        raise AssertionError(sentence)
+
+
+def require_same(found: ArrayLike, expected: ArrayLike, what: str, tolerance: float = 0.0) -> None:
+    """Fail unless two arrays have one shape and differ by no more than `tolerance`."""
+    a, b = np.asarray(found), np.asarray(expected)
+    require(a.shape == b.shape, f"{what}: shape {a.shape}, {b.shape} expected")
+    if a.size and tolerance:
+        off = float(np.abs(a - b).max())
+        require(off <= tolerance, f"{what}: off by {off:.3g}, at most {tolerance:.3g} allowed")
+    elif a.size:
+        require(bool((a == b).all()), f"{what}: {_few(a[a != b])} where {_few(b[a != b])} is expected")
+
+
+def _few(values: Array) -> str:
+    """The first few of the values."""
+    return ", ".join(f"{value:.6g}" for value in values.ravel()[:3]) + (", …" if values.size > 3 else "")
 
 
 def assert_covariance(P: Array, shape: tuple[int, ...], what: str) -> None:
     """Fail unless P is finite, of that shape, symmetric and positive definite (or nearly)."""
-    assert P.shape == shape and np.isfinite(P).all(), f"{what}: finite covariance of shape {shape} expected"
+    require(P.shape == shape, f"{what}: covariance of shape {P.shape}, {shape} expected")
+    require(np.isfinite(P).all(), f"{what}: the covariance is not finite")
     scale = np.abs(P).max(initial=0.0)
-    assert np.abs(P - np.swapaxes(P, -1, -2)).max(initial=0.0) <= 1e-9 * scale, f"{what}: covariance is not symmetric"
-    assert not len(P) or np.linalg.eigvalsh(P).min() > -1e-9 * scale, f"{what}: covariance is not positive definite"
+    require(np.abs(P - np.swapaxes(P, -1, -2)).max(initial=0.0) <= 1e-9 * scale, f"{what}: covariance is not symmetric")
+    definite = not len(P) or np.linalg.eigvalsh(P).min() > -1e-9 * scale
+    require(definite, f"{what}: covariance is not positive definite")
 
 
 def assert_near(T: Array, truth: Array, what: str, factor: float = 1.0) -> None:
     """Fail unless a pose is near the true one."""
     error = se3.log(se3.inverse(truth) @ T)
     turned, moved = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-    assert moved < factor * _POSITION and turned < factor * _ROTATION, f"{what}: off by {moved} m, {turned} rad"
+    near = moved < factor * _POSITION and turned < factor * _ROTATION
+    require(near, f"{what}: off by {moved:.3g} m, {turned:.3g} rad")

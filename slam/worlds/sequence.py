@@ -16,6 +16,7 @@ from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.worlds.appearance import Appearance, ObservationModel, appearance
+from slam.showing import sequence_html, sequence_line
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import SimulatedFeatures, simulate
@@ -91,6 +92,9 @@ class WorldSequence:
 
     def __iter__(self) -> Iterator[StereoFrame]:
         return self.frames()
+
+    __repr__ = sequence_line
+    _repr_html_ = sequence_html
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoFrame]:
         """Images of frames `start` up to, but without, `stop`, each rendered when it is asked for.

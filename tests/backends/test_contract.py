@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import backends
 from slam import registry
-from slam.errors import MeasurementError
+from slam.errors import ConfigurationError, MeasurementError
 from slam.interfaces import Backend
-from slam.testing import BACKEND_CHECKS, RIG, check_backend
+from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, findings
+from slam.testing.__main__ import main
 from tests.backends.fixed_map import FixedMapBackend
+
+ROOT = Path(__file__).parents[2]
 
 
 def by_name(check):
@@ -75,7 +81,53 @@ class Boastful(FixedMapBackend):
         return super().estimate(landmarks)
 
 
-@pytest.mark.parametrize("broken", [Forgetful, Careless, Boastful])
-def test_the_suite_finds_what_is_broken(broken):
-    with pytest.raises(AssertionError):
+class Empty:
+    def __init__(self, rig, models=None):
+        pass
+
+
+class Buggy(FixedMapBackend):
+    def update(self, observations, guess=None):
+        return self.nothing_of_this_name
+
+
+TIER_OF = {Forgetful: "runs", Careless: "right", Boastful: "right", Empty: "runs", Buggy: "runs"}
+
+
+@pytest.mark.parametrize("broken", TIER_OF)
+def test_the_suite_finds_what_is_broken_and_says_it_in_a_sentence(broken):
+    failed = [found for found in findings(broken) if found.failure]
+    assert failed[0].tier == TIER_OF[broken]
+    for found in failed:
+        assert len(found.failure) > 15 and "\n" not in found.failure, found
+        assert len(found.demand.split()) > 4, found
+    with pytest.raises(AssertionError, match=rf"{failed[0].check} \({failed[0].tier}\): .* Asked for: "):
         check_backend(broken)
+
+
+def test_a_missing_method_and_a_defect_are_named():
+    assert "predict, update, add, remove, estimate, positions, trajectory missing" in next(findings(Empty)).failure
+    said = [found.failure for found in findings(Buggy, "runs") if found.failure]
+    assert said[0] == "raised AttributeError: 'Buggy' object has no attribute 'nothing_of_this_name'"
+
+
+def test_tiers_are_taken_one_after_the_other():
+    assert [found.tier for found in findings(FixedMapBackend, "right")] == ["runs"] * len(RUNS) + ["right"] * len(RIGHT)
+    check_backend(FixedMapBackend)
+    with pytest.raises(ConfigurationError, match="unknown tier 'best'; known: runs, right, good"):
+        check_backend(FixedMapBackend, "best")
+
+
+def test_the_command_prints_how_far_a_back_end_comes(capsys, monkeypatch):
+    monkeypatch.chdir(ROOT / "docs" / "examples")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert main(["pose_fit:PoseFit", "--tier", "runs"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("passes") == len(RUNS) and said.endswith("all passed\n")
+    assert main(["tests.backends.test_contract:Careless", "--tier", "right"]) == 1
+    said = capsys.readouterr().out
+    assert "fails   time_must_increase\n          predict(0.0) after 0.0: was accepted" in said
+    assert "Asked for: A stamp that is not finite" in said
+    for name in ("nothing", "no_such_module:Backend", "pose_fit:Missing"):
+        assert main([name]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
+
+from slam.compare.frames import count_one
 
 
 def double(x):
     return 2 * x
+
+
+def slowly(seconds):
+    time.sleep(seconds)
 
 
 def fail(x):
@@ -30,3 +37,8 @@ def die(x):
 
 def threads():
     return os.environ["OPENBLAS_NUM_THREADS"], os.environ["OMP_NUM_THREADS"]
+
+
+def frames(count):
+    for _ in range(count):
+        count_one()

@@ -6,9 +6,12 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from html import escape
 
 import pytest
+from rich.console import Console
 
+from slam.commands import display
 from slam.compare.paper import differences_table, latex, means_table, write_paper
 from slam.compare.report import conclusions, write_report
 from slam.compare.statistics import Verdict
@@ -41,14 +44,13 @@ def paper(three):
 
 def test_the_headlines_name_what_is_certainly_worse_beside_what_is_better(three):
     found = conclusions(three[3])[0]
-    lines = {(line.short.split(":")[0], line.direction, line.verdict): line.short for line in found.headlines}
+    lines = {(line.text.split(":")[0], line.direction, line.verdict): line.text for line in found.headlines}
     assert "ATE RMSE final" in lines["smoother", "better", Verdict.CERTAIN]
     assert "RPE RMSE over 1 s" in lines["smoother", "worse", Verdict.CERTAIN]
     assert "NEES / 6 over 10 m" in lines["batch", "worse", Verdict.CERTAIN]
     assert "frames tracked 100 → 90.0 %" in lines["batch", "worse", Verdict.CERTAIN]
     assert "1 of 12 of smoother" in found.failed
-    assert any("batch: overconfident. NEES / 6 over 10 m of path is 58, expected 1" in line for line in found.full)
-    assert found.short[0] == found.failed
+    assert any("batch: overconfident. NEES / 6 over 10 m of path is 58, expected 1" in line for line in found.honesty)
 
 
 def test_better_and_worse_have_badges_of_their_own(text):
@@ -162,7 +164,35 @@ def test_one_trial_says_that_it_proves_nothing(tmp_path):
     every = groups(of, runs)
     found = conclusions(every)[0]
     assert {line.verdict for line in found.headlines} <= {Verdict.SINGLE, Verdict.OPEN}
-    assert any(line.startswith("smoother was better than ekf, in one trial") for line in found.short)
+    assert {line.badge for line in found.headlines} <= {"better: one trial", "worse: one trial", "open"}
     assert count_tests(every) > 0  # as many as more trials would have
     text = write_report(of, runs, tmp_path, "here").read_text()
     assert "One trial cannot tell a difference from chance" in text
+
+
+def test_the_terminal_says_the_same_as_the_report(three, text, capsys, monkeypatch):
+    monkeypatch.setattr(display, "_console", Console(width=2000))
+    found = conclusions(three[3])
+    display.print_conclusions(found, "few trials", "ekf")
+    said = capsys.readouterr().out
+    for line in found[0].headlines:
+        assert line.badge in said
+        assert line.text in said
+        assert f">{line.badge}</span><span>{escape(line.text)}</span>" in text
+    assert "Better or worse than ekf: certain (Holm-adjusted p ≤ 0.05)" in said
+    assert "few trials" in said
+
+
+def test_frames_of_all_runs_are_counted_once():
+    bar = display.SweepProgress([10, 10, 10], quiet=True)
+    task = bar._bar.tasks[0]
+    bar.kept(10)
+    bar.frames(4)
+    assert (task.completed, task.fields["runs"]) == (14, "1/3")
+    bar.frames(9)
+    bar.ended(10)  # the last look was before its last frame
+    assert (task.completed, task.fields["runs"]) == (20, "2/3")
+    bar.frames(3)  # the next call of the scheduler
+    assert task.completed == 22
+    bar.frames(30)  # a worker died, and its frames were done twice
+    assert task.completed == 30

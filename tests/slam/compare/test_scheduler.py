@@ -41,6 +41,13 @@ def test_every_job_ends_once_and_errors_are_delivered():
     assert not multiprocessing.active_children()
 
 
+def test_frames_of_all_workers_are_counted():
+    told = []
+    run(LocalScheduler(2, told.append), [job(f"{i}", jobs.frames, 10) for i in range(4)])
+    assert told == sorted(told)
+    assert told[-1] == 40
+
+
 def test_a_killed_worker_loses_nothing(tmp_path):
     work = [job(f"{i}", jobs.double, i) for i in range(4)]
     ended = run(LocalScheduler(2), [job("dies", jobs.die_once, str(tmp_path / "marker"), 7), *work])

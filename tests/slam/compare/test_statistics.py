@@ -9,6 +9,7 @@ import pytest
 from slam.compare.measure import BY_KEY, COMPLETED, object_figures, object_metric
 from slam.compare.statistics import (
     ALPHA,
+    FEWEST,
     HINT_ALPHA,
     Verdict,
     adjusted,
@@ -112,8 +113,18 @@ def test_the_interval_of_a_mean():
     low, high = interval(values)
     assert low < values.mean() < high
     assert high - low == pytest.approx(2 * 1.96 / np.sqrt(50), rel=0.25)
-    assert interval(np.ones(3)) == (1, 1)
-    assert np.isnan(interval(np.ones(1))).all()
+    assert interval(np.ones(FEWEST)) == (1, 1)
+    assert np.isnan(interval(values[: FEWEST - 1])).all()
+
+
+def test_so_few_trials_have_no_interval_and_nothing_is_sure():
+    """Two trials have three resampled means: an interval of them means nothing."""
+    d = difference(ATE, *pairs(2))
+    assert np.isnan([d.low, d.high]).all()
+    assert d.verdict is Verdict.OPEN
+    assert "interval" not in sentence(d, "a", "b")
+    assert f"Intervals of a mean are given from {FEWEST} trials on." in caution(2)
+    assert "Intervals" not in caution(FEWEST, 67)
 
 
 def test_pairs_take_the_difficulty_of_a_trial_out():
@@ -265,19 +276,20 @@ def test_a_headline_names_all_that_is_certain_in_both_directions_and_what_is_ope
         difference(BY_KEY["landmark_error_m"], same, same + noise),
         difference(BY_KEY["landmark_error_90_m"], same, same + noise),
     ]
-    lines = headline(adjusted(differences), "ekf", "smoother")
+    lines = headline(adjusted(differences), "smoother")
     assert [(line.direction, line.verdict) for line in lines] == [
         ("better", Verdict.CERTAIN),
         ("worse", Verdict.CERTAIN),
         ("", Verdict.OPEN),
     ]
     better, worse, rest = (line.text for line in lines)
-    assert better.startswith("smoother is better than ekf, certain (Holm-adjusted p ≤ 0.05): ATE RMSE online ")
+    assert [line.badge for line in lines] == ["better: certain", "worse: certain", "open"]
+    assert better.startswith("smoother: ATE RMSE online ")
     assert "→" in better
     assert "(−1" in better  # per cent of the reference
-    assert worse.startswith("smoother is worse than ekf, certain (Holm-adjusted p ≤ 0.05): RPE RMSE over 1 s ")
+    assert worse.startswith("smoother: RPE RMSE over 1 s ")
     assert "(+1" in worse
-    assert rest == "No difference can be concluded in landmark error median."
+    assert rest == "smoother: landmark error median"
 
 
 def test_runs_that_failed_are_a_difference_of_their_own():

@@ -1,0 +1,95 @@
+"""Features before they are matched: rows of arrays, and for OpenCV's users a sequence of ``cv2.KeyPoint``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SequenceError
+
+if TYPE_CHECKING:
+    import cv2
+
+#: Angle of upright features [rad]: OpenCV's convention, 270 degrees.
+UPRIGHT_ANGLE = 1.5 * np.pi
+
+_NO_ANGLE = -1.0  # of a cv2.KeyPoint [degrees]
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Detected features, a row each, by falling response.
+
+    As a sequence its items are ``cv2.KeyPoint``: ``cv2.drawKeypoints`` and the like take it as it is.
+
+    Attributes:
+        uv: pixels (N, 2), the centre of the first pixel at (0, 0).
+        size: diameter (N,) [px]: the side of the box filter that responded most.
+        angle: orientation (N,) [rad] in 0..2π, y down; `UPRIGHT_ANGLE` where upright; NaN where not measured.
+        response: determinant of the Hessian (N,), on OpenCV's scale for 8-bit images.
+        laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground, 0 where not known.
+        octave: 0-based octave (N,) int8.
+    """
+
+    uv: NDArray[np.float64]
+    size: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    response: NDArray[np.float64]
+    laplacian: NDArray[np.int8]
+    octave: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def __getitem__(self, row: int) -> cv2.KeyPoint:
+        import cv2
+
+        (x, y), angle = self.uv[row], self.angle[row]
+        degrees = float(np.rad2deg(angle)) if np.isfinite(angle) else _NO_ANGLE
+        return cv2.KeyPoint(
+            float(x), float(y), float(self.size[row]), degrees, float(self.response[row]), int(self.octave[row]),
+            int(self.laplacian[row]),
+        )  # fmt: skip
+
+    def __iter__(self) -> Iterator[cv2.KeyPoint]:
+        return (self[row] for row in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"Keypoints({len(self)} features)"
+
+    def select(self, rows: NDArray) -> Keypoints:
+        """The features of these rows (a mask or indices)."""
+        return Keypoints(
+            self.uv[rows], self.size[rows], self.angle[rows], self.response[rows], self.laplacian[rows],
+            self.octave[rows],
+        )  # fmt: skip
+
+    def to_cv2(self) -> tuple[cv2.KeyPoint, ...]:
+        """As OpenCV has them: angles in degrees, −1 where not measured; ``class_id`` is the sign of the Laplacian."""
+        return tuple(self)
+
+    @classmethod
+    def from_cv2(cls, keypoints: Iterable[cv2.KeyPoint]) -> Keypoints:
+        """Of OpenCV's key points, of any detector, in their order.
+
+        Raises:
+            SequenceError: something else is among them, or a place or size is impossible.
+        """
+        if isinstance(keypoints, Keypoints):
+            return keypoints
+        try:
+            rows = [(*k.pt, k.size, k.angle, k.response, k.class_id, k.octave & 0xFF) for k in keypoints]
+        except (TypeError, AttributeError):
+            raise SequenceError("key points must be cv2.KeyPoint objects") from None
+        table = np.array(rows, float).reshape(-1, 7)
+        if not np.isfinite(table).all() or (table[:, 2] <= 0).any():
+            raise SequenceError("a key point has no finite place, or no size")
+        u, v, size, degrees, response, sign, octave = table.T
+        angle = np.where(degrees < 0, np.nan, np.deg2rad(degrees))
+        laplacian = np.where(np.abs(sign) == 1, sign, 0).astype(np.int8)
+        uv = np.stack([u, v], axis=1)
+        return cls(uv, size.copy(), angle, response.copy(), laplacian, octave.astype(np.uint8).astype(np.int8))

@@ -1,0 +1,57 @@
+"""``python -m slam.testing NAME``: how far a back end keeps the contract, check by check."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from slam import registry
+from slam.errors import SlamError, UnknownNameError
+from slam.testing import TIERS, findings
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print a line for each check, and a sentence for each that fails; 1 where one does, 2 for bad input."""
+    parser = argparse.ArgumentParser("python -m slam.testing", description="How far a back end keeps the contract.")
+    parser.add_argument("backend", help="name of a registered back end, or my_package.my_module:MyBackend")
+    parser.add_argument("--tier", choices=list(TIERS), default="good", help="the last tier to check (default: good)")
+    given = parser.parse_args(arguments)
+    try:
+        factory = _resolve(given.backend)
+    except SlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    tier, failures = "", 0
+    for found in findings(factory, given.tier):
+        if found.tier != tier:
+            tier = found.tier
+            print(tier)
+        print(f"  {'fails ' if found.failure else 'passes'}  {found.check}")
+        if found.failure:
+            failures += 1
+            print(f"          {found.failure}.\n          Asked for: {found.demand}")
+    print(f"{failures} failed" if failures else "all passed")
+    return int(failures > 0)
+
+
+def _resolve(name: str) -> Any:
+    """The class of a registered name, or of ``module:Class``, also of a module in the present folder.
+
+    Raises:
+        UnknownNameError: there is none.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        return registry.resolve("backends", name)
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UnknownNameError(f"back end {name!r} cannot be loaded: {error}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""`Surf` in the hands of somebody who knows OpenCV's Feature2D."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+import frontends
+from frontends.surf import Keypoints, Surf
+from slam.errors import SequenceError
+from slam.geometry.rig import StereoRig
+from tests.frontends.test_surf import IMAGE
+
+
+def test_what_feature2d_has_surf_has():
+    sift = cv2.SIFT_create()
+    for surf in (Surf(100), Surf(100, descriptor=16)):
+        assert surf.descriptorType() == sift.descriptorType()
+        assert surf.defaultNorm() == sift.defaultNorm()
+        assert surf.empty() == sift.empty()
+        assert surf.getDefaultName() == sift.getDefaultName().replace("SIFT", "SURF")
+        assert surf.detectAndCompute(IMAGE, None)[1].shape[1] == surf.descriptorSize()
+
+
+def test_detect_gives_what_opencv_takes_as_key_points():
+    found = Surf(100).detect(IMAGE)
+    first = found[0]
+    assert isinstance(first, cv2.KeyPoint)
+    assert first.pt == pytest.approx(tuple(found.uv[0]))
+    assert (first.angle, first.class_id) == (-1, found.laplacian[0])
+    assert len(list(found)) == len(found)
+    drawn = cv2.drawKeypoints(IMAGE, found, None)
+    assert (drawn != cv2.cvtColor(IMAGE, cv2.COLOR_GRAY2BGR)).any()
+    assert cv2.KeyPoint_convert(found).shape == (len(found), 2)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_compute_describes_what_detect_found(upright):
+    surf = Surf(100, upright=upright)
+    keypoints, descriptors = surf.compute(IMAGE, surf.detect(IMAGE))
+    both, expected = surf.detectAndCompute(IMAGE, None)
+    np.testing.assert_array_equal(descriptors, expected)
+    assert [k.pt for k in keypoints] == [k.pt for k in both]
+    again, same = surf.compute(IMAGE, keypoints)  # once through OpenCV's objects, which have single precision
+    assert len(again) == len(keypoints)
+    assert np.median(np.linalg.norm(same - descriptors, axis=1)) < 1e-3
+
+
+def test_compute_describes_the_key_points_of_other_detectors():
+    for detector in (cv2.SIFT_create(), cv2.ORB_create()):
+        keypoints, descriptors = Surf().compute(IMAGE, detector.detect(IMAGE, None))
+        assert len(keypoints) == len(descriptors) > 50
+        np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
+
+
+def test_descriptors_match_under_the_norm_that_surf_names():
+    surf = Surf(100)
+    _, descriptors = surf.detectAndCompute(IMAGE, None)
+    matches = cv2.BFMatcher(surf.defaultNorm()).match(descriptors, descriptors)
+    assert max(match.distance for match in matches) == 0
+
+
+def test_key_points_that_are_impossible():
+    inside, outside, large = cv2.KeyPoint(50, 50, 12), cv2.KeyPoint(-9, 1e9, 12), cv2.KeyPoint(50, 50, 1e9)
+    assert [k.pt for k in Surf().compute(IMAGE, [inside, outside, large])[0]] == [(50, 50)]
+    assert Surf().compute(IMAGE, [])[1].shape == (0, 64)
+    with pytest.raises(SequenceError, match=r"must be cv2\.KeyPoint"):
+        Surf().compute(IMAGE, [(3, 4)])
+    with pytest.raises(SequenceError, match="no finite place"):
+        Surf().compute(IMAGE, [cv2.KeyPoint(float("nan"), 0, 9)])
+    assert repr(Keypoints.from_cv2([inside])) == "Keypoints(1 features)"
+
+
+def test_the_front_end_shows_its_detector():
+    rig = StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
+    frontend = frontends.create("surf", rig, descriptor=16)
+    assert frontend.surf.descriptorSize() == 16

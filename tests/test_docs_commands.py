@@ -1,0 +1,142 @@
+"""Every command that a page shows is run: in the page's order, in one folder, on a few frames of stand-ins."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import slam
+from slam.worlds.export import write_euroc
+from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
+
+pytestmark = pytest.mark.slow
+
+FEW = 4  # frames
+SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
+#: First words of what installs, tests or builds the package itself: `.ci/run` does all of it.
+OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
+#: They end by a signal only; tests/slam/compare/test_cluster.py starts them.
+SERVERS = {"dask"}
+#: What the page shows, and what is run in its place.
+STAND_INS = {
+    "path/to/kitti_or_euroc_folder": "euroc",
+    "my_package.pose_fit:PoseFit": "pose_fit:PoseFit",
+    "truth.txt": "results/trajectory.txt",
+}
+#: Options that get another value, or (None) are left out with theirs.
+SHORTER = {"--trials": "1", "--seeds": "1", "--scheduler": None}
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory):
+    """A folder with what a reader has: a recording in EuRoC's form, two folders of images, and two videos."""
+    root = tmp_path_factory.mktemp("reader")
+    sequence = slam.open_sequence(f"synthetic:desk?frames={FEW}")
+    write_euroc(sequence, root / "euroc")
+    for name, file, unit in (("recording", "calibration.yaml", 1), ("mine", "stereo.yml", 1000)):
+        (root / name).mkdir()
+        write_calibration(root / name / file, sequence.rig, unit)
+    for side in ("left", "right"):
+        images = [getattr(frame, side) for frame in sequence]
+        (root / "recording" / side).mkdir()
+        video = cv2.VideoWriter(str(root / "mine" / f"{side[0]}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, (320, 240))
+        for k, image in enumerate(images):
+            cv2.imwrite(str(root / "recording" / side / f"{k:06}.png"), image)
+            video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+        video.release()
+    return root
+
+
+def write_calibration(path, rig, unit):
+    """The rig in OpenCV's names, lengths in `unit` to the metre."""
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, camera in (("1", rig.left), ("2", rig.right)):
+        file.write(f"M{name}", camera.K)
+        file.write(f"D{name}", np.zeros(5))
+    file.write("R", rig.R)
+    file.write("T", unit * rig.R @ rig.b)
+    file.release()
+
+
+def shortened(words):
+    """The command for stand-ins and a few frames; it opens no window."""
+    words = [STAND_INS.get(word, word) for word in words]
+    out = []
+    for option, word in zip([None, *words], words):
+        if option == "--frames":
+            first, colon, _ = word.partition(":")
+            word = f"{first}:{int(first) + FEW}" if colon else str(4 * FEW)
+        elif word.startswith("synthetic:"):
+            word = re.sub(r"frames=\d+", f"frames={FEW}", word)
+            if "frames=" not in word and "--frames" not in words:
+                word += f"{'&' if '?' in word else '?'}frames={FEW}"
+        out.append(SHORTER.get(option) or word)
+    for option in [option for option, value in SHORTER.items() if value is None and option in out]:
+        del out[out.index(option) : out.index(option) + 2]
+    added = {"demo": ["--frames", "10"], "compare": ["--workers", "1"], "view": ["--to", "shown.rrd"]}
+    return out + (added.get(out[1], []) if out[0] == "slam" else [])
+
+
+def needs_rerun(words):
+    return "--viewer" in words or words[:2] == ["slam", "view"]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if list(commands(page, *SHELLS))], ids=lambda page: page.stem)
+def test_commands_run(page, reader, slam_command, tmp_path, monkeypatch):
+    shutil.copytree(reader, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    if page.name == "objects.md":  # the database that its Python saves
+        (code,) = [block for block in blocks(page, "python") if "ObjectDatabase" in block]
+        exec(compile(code, page.name, "exec", dont_inherit=True), {})
+    for words in commands(page, *SHELLS):
+        if words[0] in OF_THE_PACKAGE | SERVERS or words[:3] == ["python", "-m", "tests.fuzz"]:
+            continue  # hostile input has tests of its own
+        words = shortened(words)
+        if needs_rerun(words) and importlib.util.find_spec("rerun") is None:
+            continue
+        done = slam_command(*words[1:]) if words[0] == "slam" else in_a_process(words, tmp_path)
+        assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout[-800:]}\n{done.stderr[-800:]}"
+
+
+def in_a_process(words, folder):
+    """Run a script of this repository, or a tool that is installed with the tests."""
+    words = [word for word in words if word != "--plot"]  # it would open a window
+    if words[0] == "python":
+        words = [sys.executable, *(str(ROOT / word) if word.startswith("experiments/") else word for word in words[1:])]
+    else:
+        words[0] = shutil.which(words[0]) or words[0]
+    paths = os.pathsep.join([str(ROOT), str(DOCS / "examples")])
+    environment = {**os.environ, "PYTHONPATH": paths, "HOME": str(folder), "MPLBACKEND": "agg"}
+    return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_the_console_of_the_page_on_bad_input(reader, slam_command, tmp_path, monkeypatch):
+    shutil.copytree(reader / "euroc", tmp_path / "recording")
+    monkeypatch.chdir(tmp_path)
+    sensor = tmp_path / "recording" / "mav0" / "cam0" / "sensor.yaml"
+    sensor.write_text("\n".join([*sensor.read_text().splitlines()[:2], "{["]) + "\n")
+    (console,) = blocks(DOCS / "robustness.md", "console")
+    command, line, question, status = console.splitlines()
+    done = slam_command(*command.removeprefix("$ slam ").split())
+    assert question == "$ echo $?"
+    assert done.stderr.replace(f"{tmp_path}/", "").splitlines() == [line]
+    assert done.returncode == int(status)
+
+
+def test_the_console_of_the_page_on_self_calibration(reader, slam_command, tmp_path, monkeypatch):
+    shutil.copytree(reader / "euroc", tmp_path / "KITTI_FOLDER")
+    monkeypatch.chdir(tmp_path)
+    (console,) = blocks(DOCS / "selfcalibration.md", "console")
+    command, question, shown = console.splitlines()
+    assert slam_command(*command.removeprefix("$ slam ").split()).returncode == 0
+    done = in_a_process(shlex.split(question.removeprefix("$ ")), tmp_path)
+    assert done.stdout.startswith(shown.split("…")[0]), done.stderr
