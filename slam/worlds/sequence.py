@@ -15,8 +15,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
-from slam.worlds.appearance import Appearance, ObservationModel, appearance
 from slam.showing import sequence_html, sequence_line
+from slam.worlds.appearance import Appearance, ObservationModel, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import SimulatedFeatures, simulate
