@@ -16,16 +16,26 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
-from slam.object_data import MotionLabels, MovingObject, ObjectObservations
+from slam.object_data import MotionLabels, MovingObject, ObjectEstimate, ObjectObservations
 from slam.objects import membership
-from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, outermost, with_extent
+from slam.objects.bodies import (
+    Body,
+    advanced,
+    counted,
+    from_estimate,
+    from_fit,
+    new_body,
+    outermost,
+    with_evidence,
+    with_extent,
+)
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
 from slam.objects.regions import judge_scene, limit
-from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, record
+from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
@@ -33,6 +43,8 @@ _MERGES = 24  # frames in which a body turns out to be a part of another at once
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
+_REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
+_LIKELY = 0.5  # probability from which a body rather exists than not
 
 
 class MovingObjectDetector:
@@ -206,6 +218,9 @@ class MovingObjectDetector:
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
         gains = membership.regroup(measured, tracks, self.slot, self.config)
+        for id, body in list(self.bodies.items()):
+            gain = median(gains[id]) if len(gains.get(id, ())) else 0.0
+            self.bodies[id] = with_evidence(body, gain)
         for id, gain in gains.items():
             kept = membership.proved(self.bodies[id], gain)
             mine = np.flatnonzero(tracks.body == id)
@@ -294,11 +309,27 @@ class MovingObjectDetector:
         for estimate in estimates:
             body = self.bodies[estimate.id]
             body = from_estimate(body, estimate, self.config.min_speed)
+            if not self._believed(body, estimate):
+                self._forgotten.append(body.id)
+                self.bodies[body.id] = replace(body, estimate=None, refused=0)
+                continue
             self.bodies[body.id] = body
             membership.reject(self.tracks, estimate.rejected)
-            if body.proved:
+            if body.proved and self._worth_reporting(body, estimate):
+                self.bodies[body.id] = counted(body)
                 reported.append(self._report(body))
         return tuple(reported)
+
+    def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
+        """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
+        return body.refused < _REFUSALS and self.models.known(estimate.covariance, estimate.velocity_covariance)
+
+    def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
+        """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
+        c = self.config
+        short = estimate.stamp - body.measured_at <= c.report_unmeasured
+        seldom = body.reported_unmeasured + 1 <= c.unmeasured_share * body.reported
+        return estimate.measured or (short and seldom and body.existence > _LIKELY)
 
     def _observations(self, body: Body, features: StereoFeatures) -> ObjectObservations:
         tracks = self.tracks
@@ -319,5 +350,5 @@ class MovingObjectDetector:
         extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
         return MovingObject(
             body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
-            extent, body.moving, body.found_at,
+            extent, body.moving, body.found_at, body.measured_at, body.existence,
         )  # fmt: skip

@@ -18,6 +18,7 @@ _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # poses tried for a body that is found again
 _LEAST = 3  # points that fix a pose
 _LEAST_ANEW = 4  # points that must agree where a body is found again
+_DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
 def locate(
@@ -44,11 +45,15 @@ def locate(
     if found is None:
         return None
     T_body_left, agrees = found
+    T = np.asarray(T_world_left @ inverse(T_body_left))
+    depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
+    if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
+        return None
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, looks = mine[agrees], rows[agrees]
     tracks.row[good], tracks.missed[good] = looks, 0
     tracks.descriptors[good] = features.descriptors[looks]
-    return np.asarray(T_world_left @ inverse(T_body_left))
+    return T
 
 
 def _fit(
@@ -77,11 +82,16 @@ def _by_looks(
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     local = measured[free]
     points = transform(T_world_left, local)
-    reach = config.max_speed * max(features.stamp - body.seen_at, 0.1) + np.linalg.norm(body.upper - body.lower)
-    near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + 0.2 * np.abs(local[:, 2])
+    reach = _reach(body, features.stamp, config)
+    near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + _DEPTHS * np.abs(local[:, 2])
     allowed = np.broadcast_to(near, (len(mine), len(free)))
     rows, columns = match_far(
         tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.wide_d_match,
         config.wide_ratio,
     )  # fmt: skip
     return mine[rows], columns
+
+
+def _reach(body: Body, stamp: float, config: ObjectsConfig) -> float:
+    """How far from its prediction a body and its points may be at `stamp` [m]: no body is faster than `max_speed`."""
+    return config.max_speed * max(stamp - body.seen_at, 0.1) + float(np.linalg.norm(body.upper - body.lower))
