@@ -280,8 +280,8 @@ class ObjectFilter:
 
 
 def _enough(solution: Solution, body: Body) -> bool:
-    """Whether what is used says something: at least three points, or most of the few that there are."""
-    return bool(solution.used.sum() >= min(3, (len(body.ids) + 1) // 2))
+    """Whether what is used says something: at least two points, or most of the few that there are."""
+    return bool(solution.used.sum() >= min(2, (len(body.ids) + 1) // 2))
 
 
 def _motion(body: Body) -> tuple[Array, Array]:

@@ -153,7 +153,7 @@ class ObjectSmoother:
     ) -> tuple[Agreement, BoolArray, IndexArray]:
         """Where the body is, which of the observations (M,) are of points it has, and their rows there.
 
-        Fewer than three that agree say nothing, but for a body that has few.
+        Fewer than two that agree say nothing, but for a body that has but one or two.
         """
         known, rows = seen.known(window)
         nothing = Agreement(expected.T, np.zeros(len(rows), bool), 1.0)
@@ -163,7 +163,7 @@ class ObjectSmoother:
             expected, self._stereo, self._sigma, self._models.gate_probability, window.points, rows, seen.z[known],
             seen.guess,
         )  # fmt: skip
-        enough = found.used.sum() >= min(3, (len(window.ids) + 1) // 2)
+        enough = found.used.sum() >= min(2, (len(window.ids) + 1) // 2)
         return (found if enough else nothing), known, rows
 
     def _exchange(

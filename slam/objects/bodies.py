@@ -138,7 +138,8 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
     """The body with the back end's belief taken over.
 
     A measured body stays where its points were located: the back end has a frame of its own for it, and points of its
-    own. One that was not measured goes where the back end's goes.
+    own. One that was not measured goes where the back end's goes, once that has measured it often enough to know how fast
+    it is.
     """
     before = estimate if body.estimate is None else body.estimate
     found = estimate.T_world_object if body.estimate is None else body.T_found
@@ -148,8 +149,9 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
     settled = body.seen > _SETTLED
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     T_estimate = estimate.T_world_object
-    T_body_estimate = inverse(body.T) @ T_estimate if body.measured else body.T_body_estimate
-    T = body.T if body.measured else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
+    stays = body.measured or not settled
+    T_body_estimate = inverse(body.T) @ T_estimate if stays else body.T_body_estimate
+    T = body.T if stays else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
     change = adjoint(T_body_estimate)
     at_origin = np.concatenate([v[:3], v[3:] + np.cross(v[:3], T[:3, 3] - T_estimate[:3, 3])])
     return replace(

@@ -29,6 +29,7 @@ from slam.objects.bodies import (
     with_evidence,
     with_extent,
 )
+from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
 from slam.objects.following import follow
@@ -69,13 +70,14 @@ class MovingObjectDetector:
         self._next_body = 1
         self._forgotten: list[int] = []
         self._estimated: set[int] = set()  # bodies that the back end knows
+        self._candidates: list[Candidate] = []
         self.suspects = np.zeros(0, np.int64)
 
     def restart(self) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._estimated = [], set()
+        self._forgotten, self._estimated, self._candidates = [], set(), []
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
@@ -93,6 +95,7 @@ class MovingObjectDetector:
         self._fit(tracks, times)
         self._change_members()
         self._find_bodies(times, T_world_left)
+        self._follow_candidates(times, T_world_left)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._judgement(features)
 
@@ -204,6 +207,12 @@ class MovingObjectDetector:
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
         twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
+        self._found(members, centre, twist, times)
+
+    def _found(self, members: NDArray[np.intp], centre: Array, twist: Array, times: Array) -> None:
+        """Make a body of tracks with a common twist, or let them join the one that they belong to."""
+        c, tracks = self.config, self.tracks
+        assert tracks is not None
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
         body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body)
@@ -211,6 +220,23 @@ class MovingObjectDetector:
             self.bodies[body.id] = body
             self._next_body += 1
         membership.enter(known or body, tracks, members, sure=True)
+
+    def _follow_candidates(self, times: Array, T_world_left: Array) -> None:
+        """Follow the regions that may move; one that has moved for certain becomes a body."""
+        c, tracks = self.config, self.tracks
+        assert tracks is not None
+        rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
+        rows = rows[tracks.count(rows) >= c.min_frames - 1]
+        motion = even_motion(tracks, rows, times, c.max_speed)
+        depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
+        noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+        moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
+        followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
+        self._candidates = [candidate for candidate in followed if not candidate.is_body(c.min_speed)]
+        for candidate in followed:
+            if candidate.is_body(c.min_speed):
+                centre = tracks.position[candidate.members].mean(axis=0)
+                self._found(candidate.members, centre, np.concatenate([np.zeros(3), candidate.state[3:]]), times)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""

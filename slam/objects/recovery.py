@@ -18,6 +18,9 @@ _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # poses tried for a body that is found again
 _LEAST = 3  # points that fix a pose
 _LEAST_ANEW = 4  # points that must agree where a body is found again
+_LEAST_SHIFTED = 2  # points that must agree where only the place is looked for
+_FITS = 11.3  # χ²(3) at 99 %
+_WEAK = 1e-6  # information on a member's point that has none yet [1/m²]
 _DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
@@ -42,6 +45,8 @@ def locate(
         if again is not None and (found is None or again[1].sum() > found[1].sum()):
             found, mine, rows = again, wide, wide_rows
     tracks.row[members] = -1
+    if found is None:
+        found = _shifted(body, tracks, mine, rows, measured, T_world_left, rig, sigma)
     if found is None:
         return None
     T_body_left, agrees = found
@@ -68,6 +73,41 @@ def _fit(
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
     stereo = np.isfinite(z[fit.inliers, 2])
     return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
+
+
+def _shifted(
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], measured: Array, T_world_left: Array,
+    rig: StereoRig, sigma: float,
+) -> tuple[Array, BoolArray] | None:  # fmt: skip
+    """The same with the orientation that is predicted, for bodies of which too few points are seen to turn them.
+
+    At least two points must agree on a shift.
+    """
+    local = measured[rows]
+    deep = np.isfinite(local).all(axis=1)
+    if deep.sum() < _LEAST_SHIFTED:
+        return None
+    R, camera = body.T[:3, :3], T_world_left[:3, :3]
+    gaps = transform(T_world_left, local[deep]) - transform(body.T, tracks.local[mine[deep]])
+    noise = camera @ rig.triangulation_covariance(local[deep], sigma) @ camera.T
+    noise += R @ np.linalg.inv(tracks.local_information[mine[deep]] + _WEAK * np.eye(3)) @ R.T
+    information = np.linalg.inv(noise)
+    agrees = np.ones(len(gaps), bool)
+    for _ in range(len(gaps)):
+        A = information[agrees]
+        shift = np.linalg.solve(A.sum(axis=0), (A @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
+        off = ((gaps - shift)[:, None] @ information @ (gaps - shift)[:, :, None])[:, 0, 0]
+        worst = int(np.argmax(np.where(agrees, off, -1.0)))
+        if off[worst] < _FITS:
+            break
+        agrees[worst] = False
+        if agrees.sum() < _LEAST_SHIFTED:
+            return None
+    T = body.T.copy()
+    T[:3, 3] += shift
+    which = np.zeros(len(rows), bool)
+    which[np.flatnonzero(deep)[agrees]] = True
+    return inverse(T) @ T_world_left, which
 
 
 def _by_looks(
