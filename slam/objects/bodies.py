@@ -138,8 +138,8 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
     """The body with the back end's belief taken over.
 
     A measured body stays where its points were located: the back end has a frame of its own for it, and points of its
-    own. One that was not measured goes where the back end's goes, once that has measured it often enough to know how fast
-    it is.
+    own. One that was not measured goes where the back end's goes, once that has measured it often enough to know how
+    fast it is.
     """
     before = estimate if body.estimate is None else body.estimate
     found = estimate.T_world_object if body.estimate is None else body.T_found
@@ -176,6 +176,14 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
     shift = (T[:3, 3] - body.T_before[:3, 3]) / dt
     velocity = 0.5 * body.velocity + 0.5 * np.concatenate([turn, shift])
     return body.placed(T, slot, True, velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
+
+
+def continued(body: Body, known: Body) -> Body:
+    """A body found anew where it was known already in part: with its id and what has been learnt of its existence."""
+    return replace(
+        body, id=known.id, proved=known.proved, existence=known.existence, age=known.age, reported=known.reported,
+        reported_unmeasured=known.reported_unmeasured, measured_at=known.measured_at,
+    )  # fmt: skip
 
 
 def with_evidence(body: Body, gain: float) -> Body:

@@ -21,6 +21,7 @@ from slam.objects import membership
 from slam.objects.bodies import (
     Body,
     advanced,
+    continued,
     counted,
     from_estimate,
     from_fit,
@@ -217,9 +218,24 @@ class MovingObjectDetector:
         body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body)
         if known is None:
+            body = self._grown(body, members)
             self.bodies[body.id] = body
-            self._next_body += 1
+            self._next_body = max(self._next_body, body.id + 1)
         membership.enter(known or body, tracks, members, sure=True)
+
+    def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
+        """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
+        tracks = self.tracks
+        assert tracks is not None
+        for known in self.bodies.values():
+            mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
+            if known.measured and len(mine) < len(members) and membership.part_of(body, tracks, mine):
+                tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
+                self._forgotten.append(known.id)
+                grown = continued(body, known)
+                membership.enter(grown, tracks, mine, sure=True)
+                return grown
+        return body
 
     def _follow_candidates(self, times: Array, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""

@@ -31,7 +31,8 @@ _MISFITS = 3  # times that a track may disagree with its body before it leaves
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from an even motion, before anything is known [rad], [m]
-_MERGED = 1.0  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
 _FREEDOM = 6.0  # of a body's pose in every frame
 _PROOF = 8.0  # median of the members' χ² from which a body has moved for certain
 _PROBATION = 12  # frames after which it must have
@@ -235,6 +236,18 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         if fixed < 2 * _EXPLAINED * still and not apart:
             return body
     return None
+
+
+def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether the members `rows` of another body, near a newly found one, have moved with that all the time.
+
+    Much more is asked for than of `overlapped`: next to nothing of what the still world leaves unexplained may be left.
+    """
+    if not len(rows) or 2 * (_distances(whole, tracks, rows, _PART) < _NEAR).sum() <= len(rows):
+        return False
+    points, A, known = in_body_axes(whole, tracks, rows)
+    still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
+    return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
 def proved(body: Body, gain: Array) -> Body | None:
