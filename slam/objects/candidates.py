@@ -11,6 +11,7 @@ tracks that made it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,11 @@ _SHARE = 0.6  # of the tracks inside that must agree with it
 _PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
 _RADIUS = 0.05  # of a region where bodies have no least size, as a share of the depth
+
+
+def region_radius(depth: Any, size: float) -> Any:
+    """Radius of the region [m] that a body may fill: half its least size, or a share of its depth."""
+    return np.maximum(0.5 * size, _RADIUS * depth)
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ class MovingTracks:
             size: what bodies measure across at least [m].
             min_speed: of bodies [m/s].
         """
-        radius = np.maximum(0.5 * size, _RADIUS * depth)
+        radius = region_radius(depth, size)
         kept = np.flatnonzero((depth > 0) & (noise < radius))
         m = motion
         some = ConstantVelocity(

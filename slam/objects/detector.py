@@ -30,7 +30,7 @@ from slam.objects.bodies import (
     with_evidence,
     with_extent,
 )
-from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
+from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
 from slam.objects.following import follow
@@ -72,6 +72,7 @@ class MovingObjectDetector:
         self._forgotten: list[int] = []
         self._estimated: set[int] = set()  # bodies that the back end knows
         self._candidates: list[Candidate] = []
+        self._camera: Array = np.zeros(3)
         self.suspects = np.zeros(0, np.int64)
 
     def restart(self) -> None:
@@ -87,6 +88,7 @@ class MovingObjectDetector:
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
+        self._camera = T_world_left[:3, 3]
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -216,12 +218,22 @@ class MovingObjectDetector:
         assert tracks is not None
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
         body = membership.fitted(body, tracks, members, self.slot)
-        known = membership.overlapped(self.bodies, tracks, members, body)
+        known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
         if known is None:
             body = self._grown(body, members)
             self.bodies[body.id] = body
             self._next_body = max(self._next_body, body.id + 1)
         membership.enter(known or body, tracks, members, sure=True)
+
+    def _whole(self, members: NDArray[np.intp]) -> Body | None:
+        """The measured body of which tracks are a part, if it has more of them."""
+        tracks = self.tracks
+        assert tracks is not None
+        for body in self.bodies.values():
+            seen = int((tracks.seen & (tracks.body == body.id)).sum())
+            if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
+                return body
+        return None
 
     def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
         """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
@@ -259,10 +271,10 @@ class MovingObjectDetector:
         tracks = self.tracks
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
-        gains = membership.regroup(measured, tracks, self.slot, self.config)
+        gains = membership.regroup(measured, self._resolved(), tracks, self.slot, self.config)
         for id, body in list(self.bodies.items()):
-            gain = median(gains[id]) if len(gains.get(id, ())) else 0.0
-            self.bodies[id] = with_evidence(body, gain)
+            typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
+            self.bodies[id] = with_evidence(body, typical)
         for id, gain in gains.items():
             kept = membership.proved(self.bodies[id], gain)
             mine = np.flatnonzero(tracks.body == id)
@@ -273,6 +285,16 @@ class MovingObjectDetector:
             else:
                 self.bodies[id] = with_extent(kept, tracks.local[mine[tracks.sure[mine]]])
         self._merge()
+
+    def _resolved(self) -> set[int]:
+        """Ids of the bodies so near that the noise of a depth is less than what they measure across."""
+        near = set()
+        for body in self.bodies.values():
+            depth = float(np.linalg.norm(body.T[:3, 3] - self._camera))
+            noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+            if noise < region_radius(depth, self.config.size):
+                near.add(body.id)
+        return near
 
     def _merge(self) -> None:
         """A body whose members go with an older one is a part of that: at once while young, later only after a while.

@@ -6,7 +6,7 @@ two χ² over the window says which of them it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -127,8 +127,13 @@ def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.missed[rows] = 1
 
 
-def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: ObjectsConfig) -> dict[int, Array]:
+def regroup(
+    bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
+) -> dict[int, Array]:
     """Tracks that go with a body join it, those that do not leave it, in place.
+
+    What lies inside a body joins without proof where the body is `resolved`: farther off, all that is around it seems
+    to lie inside.
 
     Returns:
         by body, by how much χ² it explains its seen members better than the still world (K,).
@@ -144,7 +149,7 @@ def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: Objec
         near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
         if not len(near):
             continue
-        gain = _gain_of_joining(body, tracks, free[near])
+        gain = _gain_of_joining(body, body.id in resolved, tracks, free[near])
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
@@ -152,10 +157,10 @@ def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: Objec
     return gains
 
 
-def _gain_of_joining(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
-    proof = tracks.expelled[rows]
+    proof = tracks.expelled[rows] | (not resolved)
     v = verdict(body, tracks, rows)
     may = (
         v.fits
