@@ -128,6 +128,8 @@ KINDS = {
             angular_acceleration=0.5,
             initial_velocity_sigma=15.0,
             initial_angular_velocity_sigma=0.5,
+            max_speed=50.0,
+            max_turn_rate=3.0,
         ),
     ),
 }

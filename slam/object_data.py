@@ -117,6 +117,8 @@ class MovingObject:
             percentiles, of the points that have moved with it for certain.
         moving: whether it moves now; a body that stops stays an object.
         found_at: when it was found [s]; NaN where that was before the run.
+        measured_at: when it was last measured [s]; NaN where that is not known.
+        existence: probability that it exists.
     """
 
     id: int
@@ -127,6 +129,8 @@ class MovingObject:
     extent: Array
     moving: bool
     found_at: float = float("nan")
+    measured_at: float = float("nan")
+    existence: float = 1.0
 
     def __repr__(self) -> str:
         speed = float(np.linalg.norm(self.estimate.velocity[3:]))

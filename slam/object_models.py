@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from slam.bounds import require_positive
 from slam.errors import ConfigurationError
+from slam.geometry.arrays import Array
 
 #: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
 FORBID_UNKNOWN = {"extra": "forbid"}
@@ -16,7 +20,11 @@ _RANGES = {
     "initial_velocity_sigma": (1e-7, 1e6),
     "initial_angular_velocity_sigma": (1e-7, 1e3),
     "points": (1, 1000),
+    "max_speed": (1e-6, 1e6),
+    "max_acceleration": (1e-6, 1e9),
+    "max_turn_rate": (1e-6, 1e6),
 }
+_SIGMAS = 3.0  # standard deviations that a change of velocity may be off
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,8 @@ class ObjectModels:
         initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of a new body's velocities [m/s],
             [rad/s], whose mean is zero.
         points: so many points of a body are estimated at most; those unseen for longest make room for new ones.
+        max_speed, max_acceleration, max_turn_rate: no body moves beyond these [m/s], [m/s²], [rad/s]: an estimate that
+            says so is refused. The acceleration is that of a collision.
 
     Raises:
         ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
@@ -41,6 +51,9 @@ class ObjectModels:
     initial_velocity_sigma: float = 0.5
     initial_angular_velocity_sigma: float = 1.0
     points: int = 40
+    max_speed: float = 3.0
+    max_acceleration: float = 100.0
+    max_turn_rate: float = 20.0
 
     __pydantic_config__ = FORBID_UNKNOWN
 
@@ -52,3 +65,40 @@ class ObjectModels:
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of the impulses on the linear [m²/s²] and angular [rad²/s²] velocity over `dt` [s]."""
         return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
+
+    def possible(self, velocity: Array, covariance: Array, before: Array, covariance_before: Array, dt: float) -> bool:
+        """Whether a body can move so.
+
+        Args:
+            velocity: [ω, v] (6,) [rad/s], [m/s].
+            covariance: of it (6, 6).
+            before: the velocity (6,) by `dt` [s] earlier.
+            covariance_before: of that (6, 6).
+            dt: time between [s].
+        """
+        noise = _SIGMAS * math.sqrt(np.trace(covariance[3:, 3:]) + np.trace(covariance_before[3:, 3:]))
+        change = float(np.linalg.norm(velocity[3:] - before[3:]))
+        return bool(
+            np.linalg.norm(velocity[3:]) <= self.max_speed
+            and np.linalg.norm(velocity[:3]) <= self.max_turn_rate
+            and change <= self.max_acceleration * dt + noise
+        )
+
+    def known(self, covariance: Array, velocity_covariance: Array) -> bool:
+        """Whether an estimate says more of a body than these limits do.
+
+        Its pose is to be known better than to within what a body goes in a second, or any orientation; its velocity
+        better than to within the largest.
+
+        Args:
+            covariance: of the pose (6, 6), [rotation, translation].
+            velocity_covariance: of [ω, v] (6, 6).
+        """
+        rotation, position = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
+        turning, speed = np.trace(velocity_covariance[:3, :3]), np.trace(velocity_covariance[3:, 3:])
+        return bool(
+            rotation <= math.pi**2
+            and position <= self.max_speed**2
+            and turning <= self.max_turn_rate**2
+            and speed <= self.max_speed**2
+        )

@@ -82,7 +82,7 @@ class ObjectFilter:
             else:
                 body = advanced(body, dt, self._models.objects) if dt > 0 else body
                 if number in seen:
-                    body, sight = self._measure(body, seen[number], camera)
+                    body, sight = self._measure(body, seen[number], camera, dt)
             self._bodies[number] = body
             out.append(_estimate(body, stamp, sight))
         return out
@@ -166,7 +166,7 @@ class ObjectFilter:
         body, _ = self._join(body, o, near, camera)
         return body, Sight(True, np.sort(body.ids))
 
-    def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
+    def _measure(self, body: Body, o: ObjectObservations, camera: CameraBelief, dt: float) -> tuple[Body, Sight]:
         """Correct a body by its known points, then let the new ones join.
 
         Where nothing agrees with the body (or too little), it is not known where it is, and nothing joins.
@@ -175,7 +175,7 @@ class ObjectFilter:
         rows = np.array([place.get(i, -1) for i in o.points.tolist()], np.intp)
         known = rows >= 0
         rows = rows[known]
-        body, used = self._correct(body, o, known, rows, camera)
+        body, used = self._correct(body, o, known, rows, camera, dt)
         if len(rows) and not used.any():
             return body, Sight(rejected=np.sort(o.points[known]))
         failures, seen, sights = body.failures.copy(), body.seen.copy(), body.sights.copy()
@@ -191,9 +191,13 @@ class ObjectFilter:
         return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~np.isin(bad, new)]]))
 
     def _correct(
-        self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief
-    ) -> tuple[Body, BoolArray]:
-        """The body after its update, and which of the observations `known` were used; unchanged where none can be."""
+        self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief,
+        dt: float,
+    ) -> tuple[Body, BoolArray]:  # fmt: skip
+        """The body after its update, and which of the observations `known` were used.
+
+        Unchanged where none can be, or where no body moves as they say.
+        """
         nothing = np.zeros(len(rows), bool)
         if not len(rows):
             return body, nothing
@@ -207,6 +211,8 @@ class ObjectFilter:
             return body, nothing
         after = corrected(wider, camera, covariances, solution.s, solution.B)
         if not (np.isfinite(after.T).all() and (after.covariance.diagonal() > 0).all()):
+            return body, nothing
+        if not self._models.objects.possible(*_motion(after), *_motion(body), dt):
             return body, nothing
         return after, solution.used
 
@@ -274,13 +280,17 @@ class ObjectFilter:
 
 
 def _enough(solution: Solution, body: Body) -> bool:
-    """Whether what is used says something: at least three points, or most of the few that there are."""
-    return bool(solution.used.sum() >= min(3, (len(body.ids) + 1) // 2))
+    """Whether what is used says something: at least two points, or most of the few that there are."""
+    return bool(solution.used.sum() >= min(2, (len(body.ids) + 1) // 2))
+
+
+def _motion(body: Body) -> tuple[Array, Array]:
+    """Velocity [ω, v] (6,) of a body and its covariance (6, 6)."""
+    return body.velocity.copy(), body.covariance[6:RIGID, 6:RIGID].copy()
 
 
 def _estimate(body: Body, stamp: float, sight: Sight) -> ObjectEstimate:
-    P = body.covariance
     return ObjectEstimate(
-        body.id, stamp, body.T.copy(), P[:6, :6].copy(), body.velocity.copy(), P[6:RIGID, 6:RIGID].copy(),
+        body.id, stamp, body.T.copy(), body.covariance[:6, :6].copy(), *_motion(body),
         sight.measured, sight.used, sight.rejected,
     )  # fmt: skip

@@ -110,11 +110,18 @@ class ObjectSmoother:
         return window, Sight(True, np.sort(window.ids))
 
     def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
-        """One more frame; where it cannot be solved with its observations, without them, or else anew."""
+        """One more frame; without its observations where these cannot be solved or no body moves so; else anew."""
         for given in (seen, None):
             with suppress(np.linalg.LinAlgError):
-                return self._solved_step(window, given, path, camera)
+                after, sight = self._solved_step(window, given, path, camera)
+                if self._possible(window, after):
+                    return after, sight if given is seen or seen is None else Sight(rejected=np.sort(seen.ids))
         return self._restarted(window, seen, path, camera)
+
+    def _possible(self, before: Window, after: Window) -> bool:
+        """Whether a body can move as its window says after a further frame."""
+        dt = float(after.stamps[-1] - before.stamps[-1])
+        return self._models.objects.possible(*self._motion(after), *self._motion(before), dt)
 
     def _restarted(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         """The body without its points, velocity and past, where it was last or where the guess has it."""
@@ -146,7 +153,7 @@ class ObjectSmoother:
     ) -> tuple[Agreement, BoolArray, IndexArray]:
         """Where the body is, which of the observations (M,) are of points it has, and their rows there.
 
-        Fewer than three that agree say nothing, but for a body that has few.
+        Fewer than two that agree say nothing, but for a body that has but one or two.
         """
         known, rows = seen.known(window)
         nothing = Agreement(expected.T, np.zeros(len(rows), bool), 1.0)
@@ -156,7 +163,7 @@ class ObjectSmoother:
             expected, self._stereo, self._sigma, self._models.gate_probability, window.points, rows, seen.z[known],
             seen.guess,
         )  # fmt: skip
-        enough = found.used.sum() >= min(3, (len(window.ids) + 1) // 2)
+        enough = found.used.sum() >= min(2, (len(window.ids) + 1) // 2)
         return (found if enough else nothing), known, rows
 
     def _exchange(
@@ -211,6 +218,15 @@ class ObjectSmoother:
         return shape_of(window.points, own)
 
     def _estimate(self, number: int, window: Window, sight: Sight) -> ObjectEstimate:
+        last = FRAME * (len(window) - 1)
+        covariance = window.covariance[last : last + 6, last : last + 6].copy()
+        return ObjectEstimate(
+            number, float(window.stamps[-1]), window.T[-1].copy(), covariance, *self._motion(window),
+            sight.measured, sight.used, sight.rejected,
+        )  # fmt: skip
+
+    def _motion(self, window: Window) -> tuple[Array, Array]:
+        """Velocity [ω, v] (6,) in the newest step, and its covariance (6, 6); of a first frame what is expected."""
         models, P = self._models.objects, window.covariance
         last = FRAME * (len(window) - 1)
         velocity = np.zeros(6)
@@ -220,11 +236,7 @@ class ObjectSmoother:
             mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
             J = np.concatenate([before, after], axis=1)
             spread = J @ P[np.ix_(mine, mine)] @ J.T
-        covariance = P[last : last + 6, last : last + 6].copy()
-        return ObjectEstimate(
-            number, float(window.stamps[-1]), window.T[-1].copy(), covariance, velocity, spread,
-            sight.measured, sight.used, sight.rejected,
-        )  # fmt: skip
+        return velocity, spread
 
 
 @dataclass(frozen=True)

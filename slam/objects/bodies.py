@@ -13,6 +13,7 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, so3_log
 from slam.object_data import ObjectEstimate
 from slam.object_models import ObjectModels
+from slam.objects.existence import FIRST, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
@@ -39,13 +40,19 @@ class Body:
         lower, upper: extent of its points (3,), body coordinates.
         size: what it measures across at least [m].
         reach: its points lie no farther from its origin [m].
-        seen_at: when it was last measured [s].
+        seen_at: when its points were last found together [s].
+        measured_at: when the back end last used them [s].
         seen: number of frames in which it was measured.
         missed: number of frames since it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
         proved: whether it has moved for certain.
         alike: for how many frames it has gone with an older body as if it were a part of that.
+        age: number of frames since it was found.
+        existence: probability that it exists.
+        refused: number of frames running in which the back end did not use what was measured of it.
+        reported: number of frames in which it was reported as measured.
+        reported_unmeasured: number of frames in which it was reported though it was not measured.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -71,6 +78,12 @@ class Body:
     moving: bool = True
     proved: bool = False
     alike: int = 0
+    age: int = 0
+    existence: float = FIRST
+    refused: int = 0
+    measured_at: float = float("nan")
+    reported: int = 0
+    reported_unmeasured: int = 0
     estimate: ObjectEstimate | None = field(default=None, repr=False)
 
     @property
@@ -118,14 +131,15 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     T[:3, 3] += dt * body.velocity[3:]
     linear, angular = models.velocity_variance(dt)
     covariance = body.covariance + dt**2 * np.diag([angular] * 3 + [linear] * 3)
-    return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1)
+    return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1, age=body.age + 1)
 
 
 def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:
     """The body with the back end's belief taken over.
 
     A measured body stays where its points were located: the back end has a frame of its own for it, and points of its
-    own. One that was not measured goes where the back end's goes.
+    own. One that was not measured goes where the back end's goes, once that has measured it often enough to know how
+    fast it is.
     """
     before = estimate if body.estimate is None else body.estimate
     found = estimate.T_world_object if body.estimate is None else body.T_found
@@ -135,8 +149,9 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
     settled = body.seen > _SETTLED
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     T_estimate = estimate.T_world_object
-    T_body_estimate = inverse(body.T) @ T_estimate if body.measured else body.T_body_estimate
-    T = body.T if body.measured else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
+    stays = body.measured or not settled
+    T_body_estimate = inverse(body.T) @ T_estimate if stays else body.T_body_estimate
+    T = body.T if stays else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
     change = adjoint(T_body_estimate)
     at_origin = np.concatenate([v[:3], v[3:] + np.cross(v[:3], T[:3, 3] - T_estimate[:3, 3])])
     return replace(
@@ -147,6 +162,8 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
         covariance=change @ estimate.covariance @ change.T,
         moving=not settled or (certain and speed > min_speed),
         estimate=estimate,
+        measured_at=estimate.stamp if estimate.measured else body.measured_at,
+        refused=body.refused + 1 if body.measured and not estimate.measured else 0,
         found_at=estimate.stamp if body.estimate is None else body.found_at,
         T_found=found,
         T_reported=before.T_world_object,
@@ -159,6 +176,28 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
     shift = (T[:3, 3] - body.T_before[:3, 3]) / dt
     velocity = 0.5 * body.velocity + 0.5 * np.concatenate([turn, shift])
     return body.placed(T, slot, True, velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
+
+
+def continued(body: Body, known: Body) -> Body:
+    """A body found anew where it was known already in part: with its id and what has been learnt of its existence."""
+    return replace(
+        body, id=known.id, proved=known.proved, existence=known.existence, age=known.age, reported=known.reported,
+        reported_unmeasured=known.reported_unmeasured, measured_at=known.measured_at,
+    )  # fmt: skip
+
+
+def with_evidence(body: Body, gain: float) -> Body:
+    """The body after what this frame says of its existence; see `slam.objects.existence`."""
+    if body.measured:
+        return replace(body, existence=when_measured(body.existence, gain))
+    return replace(body, existence=when_missed(body.existence, body.seen, body.age))
+
+
+def counted(body: Body) -> Body:
+    """The body after it was reported."""
+    if body.estimate is not None and body.estimate.measured:
+        return replace(body, reported=body.reported + 1)
+    return replace(body, reported_unmeasured=body.reported_unmeasured + 1)
 
 
 def with_extent(body: Body, local: Array) -> Body:

@@ -36,6 +36,8 @@ class ObjectsConfig:
         confirm: frames for which they must move alike, less those in which they did not; one feature may be newer.
         max_points: most points kept of a body.
         forget_after: a body not seen for so long is forgotten [s].
+        report_unmeasured: a body is reported for so long after it was last measured [s], and
+        unmeasured_share: in no more frames than this share of those in which it was reported as measured.
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
         least_side: of the triangle of features in ``"procedure1"``, its shortest side [m].
         least_sine: of the triangle of features in ``"procedure1"``, the least sine of its angles.
@@ -63,6 +65,8 @@ class ObjectsConfig:
     confirm: int = 3
     max_points: int = 80
     forget_after: float = 8.0
+    report_unmeasured: float = 1.0
+    unmeasured_share: float = 0.05
     margin: float = 0.25
     size: float = 0.0
     database: str = ""

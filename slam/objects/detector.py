@@ -16,16 +16,28 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
-from slam.object_data import MotionLabels, MovingObject, ObjectObservations
+from slam.object_data import MotionLabels, MovingObject, ObjectEstimate, ObjectObservations
 from slam.objects import membership
-from slam.objects.bodies import Body, advanced, from_estimate, from_fit, new_body, outermost, with_extent
+from slam.objects.bodies import (
+    Body,
+    advanced,
+    continued,
+    counted,
+    from_estimate,
+    from_fit,
+    new_body,
+    outermost,
+    with_evidence,
+    with_extent,
+)
+from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
 from slam.objects.regions import judge_scene, limit
-from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, record
+from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
@@ -33,6 +45,8 @@ _MERGES = 24  # frames in which a body turns out to be a part of another at once
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
+_REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
+_LIKELY = 0.5  # probability from which a body rather exists than not
 
 
 class MovingObjectDetector:
@@ -57,13 +71,15 @@ class MovingObjectDetector:
         self._next_body = 1
         self._forgotten: list[int] = []
         self._estimated: set[int] = set()  # bodies that the back end knows
+        self._candidates: list[Candidate] = []
+        self._camera: Array = np.zeros(3)
         self.suspects = np.zeros(0, np.int64)
 
     def restart(self) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._estimated = [], set()
+        self._forgotten, self._estimated, self._candidates = [], set(), []
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
@@ -72,6 +88,7 @@ class MovingObjectDetector:
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
+        self._camera = T_world_left[:3, 3]
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -81,6 +98,7 @@ class MovingObjectDetector:
         self._fit(tracks, times)
         self._change_members()
         self._find_bodies(times, T_world_left)
+        self._follow_candidates(times, T_world_left)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._judgement(features)
 
@@ -192,20 +210,71 @@ class MovingObjectDetector:
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
         twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
+        self._found(members, centre, twist, times)
+
+    def _found(self, members: NDArray[np.intp], centre: Array, twist: Array, times: Array) -> None:
+        """Make a body of tracks with a common twist, or let them join the one that they belong to."""
+        c, tracks = self.config, self.tracks
+        assert tracks is not None
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
         body = membership.fitted(body, tracks, members, self.slot)
-        known = membership.overlapped(self.bodies, tracks, members, body)
+        known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
         if known is None:
+            body = self._grown(body, members)
             self.bodies[body.id] = body
-            self._next_body += 1
+            self._next_body = max(self._next_body, body.id + 1)
         membership.enter(known or body, tracks, members, sure=True)
+
+    def _whole(self, members: NDArray[np.intp]) -> Body | None:
+        """The measured body of which tracks are a part, if it has more of them."""
+        tracks = self.tracks
+        assert tracks is not None
+        for body in self.bodies.values():
+            seen = int((tracks.seen & (tracks.body == body.id)).sum())
+            if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
+                return body
+        return None
+
+    def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
+        """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
+        tracks = self.tracks
+        assert tracks is not None
+        for known in self.bodies.values():
+            mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
+            if known.measured and len(mine) < len(members) and membership.part_of(body, tracks, mine):
+                tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
+                self._forgotten.append(known.id)
+                grown = continued(body, known)
+                membership.enter(grown, tracks, mine, sure=True)
+                return grown
+        return body
+
+    def _follow_candidates(self, times: Array, T_world_left: Array) -> None:
+        """Follow the regions that may move; one that has moved for certain becomes a body."""
+        c, tracks = self.config, self.tracks
+        assert tracks is not None
+        rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
+        rows = rows[tracks.count(rows) >= c.min_frames - 1]
+        motion = even_motion(tracks, rows, times, c.max_speed)
+        depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
+        noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+        moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
+        followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
+        self._candidates = [candidate for candidate in followed if not candidate.is_body(c.min_speed)]
+        for candidate in followed:
+            if candidate.is_body(c.min_speed):
+                centre = tracks.position[candidate.members].mean(axis=0)
+                self._found(candidate.members, centre, np.concatenate([np.zeros(3), candidate.state[3:]]), times)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
         tracks = self.tracks
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
-        gains = membership.regroup(measured, tracks, self.slot, self.config)
+        gains = membership.regroup(measured, self._resolved(), tracks, self.slot, self.config)
+        for id, body in list(self.bodies.items()):
+            typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
+            self.bodies[id] = with_evidence(body, typical)
         for id, gain in gains.items():
             kept = membership.proved(self.bodies[id], gain)
             mine = np.flatnonzero(tracks.body == id)
@@ -216,6 +285,16 @@ class MovingObjectDetector:
             else:
                 self.bodies[id] = with_extent(kept, tracks.local[mine[tracks.sure[mine]]])
         self._merge()
+
+    def _resolved(self) -> set[int]:
+        """Ids of the bodies so near that the noise of a depth is less than what they measure across."""
+        near = set()
+        for body in self.bodies.values():
+            depth = float(np.linalg.norm(body.T[:3, 3] - self._camera))
+            noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+            if noise < region_radius(depth, self.config.size):
+                near.add(body.id)
+        return near
 
     def _merge(self) -> None:
         """A body whose members go with an older one is a part of that: at once while young, later only after a while.
@@ -294,11 +373,27 @@ class MovingObjectDetector:
         for estimate in estimates:
             body = self.bodies[estimate.id]
             body = from_estimate(body, estimate, self.config.min_speed)
+            if not self._believed(body, estimate):
+                self._forgotten.append(body.id)
+                self.bodies[body.id] = replace(body, estimate=None, refused=0)
+                continue
             self.bodies[body.id] = body
             membership.reject(self.tracks, estimate.rejected)
-            if body.proved:
+            if body.proved and self._worth_reporting(body, estimate):
+                self.bodies[body.id] = counted(body)
                 reported.append(self._report(body))
         return tuple(reported)
+
+    def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
+        """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
+        return body.refused < _REFUSALS and self.models.known(estimate.covariance, estimate.velocity_covariance)
+
+    def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
+        """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
+        c = self.config
+        short = estimate.stamp - body.measured_at <= c.report_unmeasured
+        seldom = body.reported_unmeasured + 1 <= c.unmeasured_share * body.reported
+        return estimate.measured or (short and seldom and body.existence > _LIKELY)
 
     def _observations(self, body: Body, features: StereoFeatures) -> ObjectObservations:
         tracks = self.tracks
@@ -319,5 +414,5 @@ class MovingObjectDetector:
         extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
         return MovingObject(
             body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
-            extent, body.moving, body.found_at,
+            extent, body.moving, body.found_at, body.measured_at, body.existence,
         )  # fmt: skip

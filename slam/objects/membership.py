@@ -6,7 +6,7 @@ two χ² over the window says which of them it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -32,6 +32,7 @@ _FAR = 3.0  # so many times the median distance from the median point is no part
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from an even motion, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
+_PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
 _FREEDOM = 6.0  # of a body's pose in every frame
 _PROOF = 8.0  # median of the members' χ² from which a body has moved for certain
 _PROBATION = 12  # frames after which it must have
@@ -126,8 +127,13 @@ def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.missed[rows] = 1
 
 
-def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: ObjectsConfig) -> dict[int, Array]:
+def regroup(
+    bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
+) -> dict[int, Array]:
     """Tracks that go with a body join it, those that do not leave it, in place.
+
+    What lies inside a body joins without proof where the body is `resolved`: farther off, all that is around it seems
+    to lie inside.
 
     Returns:
         by body, by how much χ² it explains its seen members better than the still world (K,).
@@ -143,7 +149,7 @@ def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: Objec
         near = np.flatnonzero(_distances(body, tracks, free, config.margin) < _NEAR)
         if not len(near):
             continue
-        gain = _gain_of_joining(body, tracks, free[near])
+        gain = _gain_of_joining(body, body.id in resolved, tracks, free[near])
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
@@ -151,10 +157,10 @@ def regroup(bodies: Mapping[int, Body], tracks: Tracks, slot: int, config: Objec
     return gains
 
 
-def _gain_of_joining(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
+def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[np.intp]) -> Array:
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
-    proof = tracks.expelled[rows]
+    proof = tracks.expelled[rows] | (not resolved)
     v = verdict(body, tracks, rows)
     may = (
         v.fits
@@ -235,6 +241,18 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         if fixed < 2 * _EXPLAINED * still and not apart:
             return body
     return None
+
+
+def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether the members `rows` of another body, near a newly found one, have moved with that all the time.
+
+    Much more is asked for than of `overlapped`: next to nothing of what the still world leaves unexplained may be left.
+    """
+    if not len(rows) or 2 * (_distances(whole, tracks, rows, _PART) < _NEAR).sum() <= len(rows):
+        return False
+    points, A, known = in_body_axes(whole, tracks, rows)
+    still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
+    return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
 def proved(body: Body, gain: Array) -> Body | None:

@@ -299,4 +299,8 @@ class Procedure1Detector:
         )  # fmt: skip
         local = d.points - d.origin
         extent = np.stack([local.min(axis=0), local.max(axis=0)])
-        return (MovingObject(1, np.sort(self._rows), estimate, step, T @ inverse(found), extent, True),)
+        return (
+            MovingObject(
+                1, np.sort(self._rows), estimate, step, T @ inverse(found), extent, True, measured_at=features.stamp
+            ),
+        )

@@ -18,6 +18,10 @@ _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # poses tried for a body that is found again
 _LEAST = 3  # points that fix a pose
 _LEAST_ANEW = 4  # points that must agree where a body is found again
+_LEAST_SHIFTED = 2  # points that must agree where only the place is looked for
+_FITS = 11.3  # χ²(3) at 99 %
+_WEAK = 1e-6  # information on a member's point that has none yet [1/m²]
+_DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
 def locate(
@@ -42,13 +46,19 @@ def locate(
             found, mine, rows = again, wide, wide_rows
     tracks.row[members] = -1
     if found is None:
+        found = _shifted(body, tracks, mine, rows, measured, T_world_left, rig, sigma)
+    if found is None:
         return None
     T_body_left, agrees = found
+    T = np.asarray(T_world_left @ inverse(T_body_left))
+    depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
+    if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
+        return None
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, looks = mine[agrees], rows[agrees]
     tracks.row[good], tracks.missed[good] = looks, 0
     tracks.descriptors[good] = features.descriptors[looks]
-    return np.asarray(T_world_left @ inverse(T_body_left))
+    return T
 
 
 def _fit(
@@ -65,6 +75,41 @@ def _fit(
     return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
 
 
+def _shifted(
+    body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], measured: Array, T_world_left: Array,
+    rig: StereoRig, sigma: float,
+) -> tuple[Array, BoolArray] | None:  # fmt: skip
+    """The same with the orientation that is predicted, for bodies of which too few points are seen to turn them.
+
+    At least two points must agree on a shift.
+    """
+    local = measured[rows]
+    deep = np.isfinite(local).all(axis=1)
+    if deep.sum() < _LEAST_SHIFTED:
+        return None
+    R, camera = body.T[:3, :3], T_world_left[:3, :3]
+    gaps = transform(T_world_left, local[deep]) - transform(body.T, tracks.local[mine[deep]])
+    noise = camera @ rig.triangulation_covariance(local[deep], sigma) @ camera.T
+    noise += R @ np.linalg.inv(tracks.local_information[mine[deep]] + _WEAK * np.eye(3)) @ R.T
+    information = np.linalg.inv(noise)
+    agrees = np.ones(len(gaps), bool)
+    for _ in range(len(gaps)):
+        A = information[agrees]
+        shift = np.linalg.solve(A.sum(axis=0), (A @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
+        off = ((gaps - shift)[:, None] @ information @ (gaps - shift)[:, :, None])[:, 0, 0]
+        worst = int(np.argmax(np.where(agrees, off, -1.0)))
+        if off[worst] < _FITS:
+            break
+        agrees[worst] = False
+        if agrees.sum() < _LEAST_SHIFTED:
+            return None
+    T = body.T.copy()
+    T[:3, 3] += shift
+    which = np.zeros(len(rows), bool)
+    which[np.flatnonzero(deep)[agrees]] = True
+    return inverse(T) @ T_world_left, which
+
+
 def _by_looks(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, measured: Array,
     T_world_left: Array, config: ObjectsConfig,
@@ -77,11 +122,16 @@ def _by_looks(
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     local = measured[free]
     points = transform(T_world_left, local)
-    reach = config.max_speed * max(features.stamp - body.seen_at, 0.1) + np.linalg.norm(body.upper - body.lower)
-    near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + 0.2 * np.abs(local[:, 2])
+    reach = _reach(body, features.stamp, config)
+    near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + _DEPTHS * np.abs(local[:, 2])
     allowed = np.broadcast_to(near, (len(mine), len(free)))
     rows, columns = match_far(
         tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.wide_d_match,
         config.wide_ratio,
     )  # fmt: skip
     return mine[rows], columns
+
+
+def _reach(body: Body, stamp: float, config: ObjectsConfig) -> float:
+    """How far from its prediction a body and its points may be at `stamp` [m]: no body is faster than `max_speed`."""
+    return config.max_speed * max(stamp - body.seen_at, 0.1) + float(np.linalg.norm(body.upper - body.lower))

@@ -38,8 +38,9 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = max(1, round(width / picture.shape[1]))
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    labels: list[tuple[int, int, int, int]] = []
     for thing in result.objects:
-        _draw_object(picture, thing, result, rig, scale)
+        _draw_object(picture, thing, result, rig, scale, labels)
     moving = np.zeros(len(result.features), bool)
     moving[result.moving_features] = True
     beacons = result.matched_features[~moving[result.matched_features]]
@@ -52,42 +53,67 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     return picture
 
 
-def _draw_object(picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int) -> None:
-    """Box, axes, number and speed of one body; thinner where it is not seen in this frame."""
+def _draw_object(
+    picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int,
+    labels: list[tuple[int, int, int, int]],
+) -> None:  # fmt: skip
+    """Box, axes, number and speed of one body; a dashed box alone, called not seen, where it is not measured.
+
+    `labels` are the rectangles of the labels drawn before; the new one is put clear of them, and appended.
+    """
     import cv2
 
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
     lower, upper = thing.extent
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
     colour = _BOXES[(thing.id - 1) % len(_BOXES)]
-    thickness = 2 if thing.estimate.measured else 1
+    measured = thing.estimate.measured
+    thickness = 2 if measured else 1
     for a, b in _EDGES:
         _line(picture, rig, transform(T_left_object, np.linspace(corners[a], corners[b], _PARTS)), colour, thickness,
-              scale)  # fmt: skip
+              scale, dashed=not measured)  # fmt: skip
     length = 0.6 * max(float((upper - lower).max()), 1e-3)
-    for axis, axis_colour in enumerate(_AXES):
+    for axis, axis_colour in enumerate(_AXES if measured else ()):
         ends = np.linspace(np.zeros(3), length * np.eye(3)[axis], _PARTS)
         _line(picture, rig, transform(T_left_object, ends), axis_colour, 2 * thickness, scale)
     top = rig.left.project(transform(T_left_object, corners))
     if np.isfinite(top).all():
         u, v = top.min(axis=0)
         speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
-        text = f"{thing.id}  {speed:.2f} m/s" if thing.moving else f"{thing.id}  at rest"
-        at = _pixel(u, v - 3, scale)
+        state = f"{speed:.2f} m/s" if thing.moving else "at rest"
+        text = f"{thing.id}  {state if measured else 'not seen'}"
+        at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _RING, 3, cv2.LINE_AA)
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
 
 
+def _clear_place(
+    at: tuple[int, int], text: str, shape: tuple[int, ...], labels: list[tuple[int, int, int, int]]
+) -> tuple[int, int]:
+    """Where a label's lower left corner goes: inside the picture, below the labels that it would cover [px]."""
+    import cv2
+
+    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 3)
+    u = min(max(at[0], 0), max(shape[1] - width, 0))
+    v = min(max(at[1], height), shape[0] - base)
+    for left, top, right, bottom in sorted(labels, key=lambda label: label[1]):
+        if u < right and u + width > left and v - height < bottom and v + base > top:
+            v = bottom + height
+    labels.append((u, v - height, u + width, v + base))
+    return u, v
+
+
 def _line(
-    picture: np.ndarray, rig: StereoRig, points: Array, colour: tuple[int, int, int], thickness: int, scale: int
-) -> None:
+    picture: np.ndarray, rig: StereoRig, points: Array, colour: tuple[int, int, int], thickness: int, scale: int,
+    dashed: bool = False,
+) -> None:  # fmt: skip
     """A polyline through points (N, 3) in left-camera coordinates; pieces behind the camera are left out."""
     import cv2
 
     uv = rig.left.project(points)
     limit = 20 * rig.width
     good = np.asarray((np.abs(np.nan_to_num(uv, nan=2.0 * limit)) < limit).all(axis=1))
-    for i in range(len(points) - 1):
+    for i in range(0, len(points) - 1, 2 if dashed else 1):
         if good[i] and good[i + 1]:
             cv2.line(
                 picture,

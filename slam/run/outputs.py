@@ -162,7 +162,8 @@ def _object_row(number: int, thing: MovingObject) -> list[Any]:
     e = thing.estimate
     numbers = [*_pose_numbers(e.T_world_object), *e.velocity[3:], *e.velocity[:3]]
     numbers += [*_pose_numbers(thing.motion), *e.covariance[np.triu_indices(6)]]
-    flags = [int(thing.moving), int(e.measured)]
+    seen = f"{thing.measured_at:.9f}" if np.isfinite(thing.measured_at) else ""
+    flags = [int(thing.moving), int(e.measured), seen, f"{thing.existence:.6f}"]
     return [number, f"{e.stamp:.9f}", thing.id, *flags, *(f"{x:.9g}" for x in numbers)]
 
 

@@ -81,6 +81,8 @@ OBJECT_TABLE = (
     Columns(
         ("moving", "measured"), "", "1 where the body moves now, else 0; 1 where it was measured in this frame, else 0"
     ),
+    Columns(("last_measured",), "s", "time of the last frame in which it was measured; empty where that is not known"),
+    Columns(("existence",), "", "probability that it exists"),
     Columns(("x", "y", "z"), "m", "position of the body's origin in the world"),
     Columns(("roll", "pitch", "yaw"), "rad", "orientation, from body to world axes: R = Rz(yaw) Ry(pitch) Rx(roll)"),
     Columns(("vx", "vy", "vz"), "m/s", "velocity of the body's origin, along the axes of the world"),

@@ -324,3 +324,40 @@ def test_a_body_that_cannot_be_solved_starts_anew(monkeypatch):
     estimates = [e for _, e in follow(create("smoother", scene), scene)]
     assert not estimates[5].measured and np.trace(estimates[5].covariance) > 0.1
     assert all(len(e.used) > 15 for e in estimates[6:]) and all(e.measured for e in estimates[7:])
+
+
+@BOTH
+def test_a_motion_that_no_body_makes_is_refused(name):
+    """Two bodies are confused: all points lie 3 m away at once. The body is predicted, never thrown."""
+    scene = box_scene(seed=5, frames=20)
+    away = np.array([12.0, 0.0])
+
+    def thrown(k, o):
+        if k < 10:
+            return o
+        far = replace(o, uv_left=o.uv_left + (k - 9) * away, uv_right=o.uv_right + (k - 9) * away)
+        return replace(far, T_world_object=None)
+
+    estimates = outcome(name, replace(scene, models=slow(scene.models)), rule=thrown).estimates
+    speeds = [np.linalg.norm(e.velocity[3:]) for e in estimates]
+    assert all(e.measured for e in estimates[:10])
+    assert max(speeds) <= 0.6 and not all(e.measured for e in estimates[10:])
+
+
+def slow(models):
+    """The same models, for bodies of at most 0.6 m/s."""
+    return replace(models, objects=replace(models.objects, max_speed=0.6))
+
+
+def test_what_a_body_can_do():
+    models, known = ObjectModels(max_speed=2.0, max_acceleration=10.0, max_turn_rate=3.0), 1e-6 * np.eye(6)
+    still, fast, turning = np.zeros(6), np.array([0, 0, 0, 1.5, 0, 0]), np.array([0, 3.1, 0, 0, 0, 0])
+    assert models.possible(fast, known, fast, known, 0.1)
+    assert not models.possible(2 * fast, known, 2 * fast, known, 0.1)
+    assert not models.possible(turning, known, still, known, 0.1)
+    assert not models.possible(fast, known, still, known, 0.1)
+    assert models.possible(fast, known, still, known, 0.2)
+    assert models.possible(fast, known, still, 0.1 * np.eye(6), 0.1)  # it may have been that fast before
+    assert models.known(known, known)
+    assert not models.known(np.diag([1, 1, 1, 4, 4, 4.0]), known)
+    assert not models.known(known, np.full((6, 6), np.nan))

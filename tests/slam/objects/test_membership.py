@@ -78,13 +78,13 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
     tracks = table(seen)
     body = body_along(poses, np.arange(16), tracks)
-    gains = membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    gains = membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     lid = np.arange(12, 16)
     assert (tracks.body[:12] == 1).all()
     assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
     assert len(gains[1]) == 12
     record(tracks, lid, SLOT, seen[lid, SLOT], np.broadcast_to(np.eye(3) / SIGMA**2, (4, 3, 3)), np.full(4, 3, np.int8))
-    membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     assert (tracks.body[lid] == -1).all()
 
 
@@ -108,7 +108,7 @@ def test_poses_fitted_to_still_points_prove_nothing() -> None:
         body = new_body(1, AHEAD, np.zeros(6), TIMES, 0.0, 0.0)
         body = membership.fitted(body, tracks, np.arange(6), SLOT)
         membership.enter(body, tracks, np.arange(6), sure=True)
-        gain = membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1]
+        gain = membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1]
         kept = membership.proved(body, gain)
         proofs.append(kept is not None and kept.proved)
     assert sum(proofs) <= 1  # 5 % of the bodies
@@ -119,7 +119,7 @@ def test_poses_fitted_to_moving_points_prove_a_body() -> None:
     body = new_body(1, AHEAD, MOVING, TIMES, 0.0, 0.0)
     body = membership.fitted(body, tracks, np.arange(6), SLOT)
     membership.enter(body, tracks, np.arange(6), sure=True)
-    kept = membership.proved(body, membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())[1])
+    kept = membership.proved(body, membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1])
     assert kept is not None and kept.proved
 
 
@@ -129,5 +129,5 @@ def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
     still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
     tracks = table(seen_from(still, local, 10))
     body = body_along(still, np.arange(8), tracks)
-    membership.regroup({1: body}, tracks, SLOT, ObjectsConfig())
+    membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     assert tracks.sure[:8].all() and not tracks.sure[8]

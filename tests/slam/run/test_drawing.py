@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,8 @@ import pytest
 import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.run.drawing import FramePictures, draw_objects
+from slam.object_data import MovingObject, ObjectEstimate
+from slam.run.drawing import FramePictures, _clear_place, draw_objects
 from tests.fuzz.runs import disk_of
 
 
@@ -84,3 +87,26 @@ def test_a_picture_is_whole_or_not_there(steps, tmp_path):
     with pytest.raises(SlamError, match=r"png: cannot be written: File too large"), disk_of(500):
         FramePictures(tmp_path / "out").show(frame, result, system)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_labels_do_not_cover_each_other_and_stay_inside():
+    labels: list[tuple[int, int, int, int]] = []
+    for at in [(50, 40), (60, 45), (55, 38), (700, -20)]:
+        _clear_place(at, "3  14.50 m/s", (240, 640, 3), labels)
+    for i, a in enumerate(labels):
+        assert a[0] >= 0 and a[1] >= 0 and a[2] <= 640
+        assert not any(a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for b in labels[:i])
+
+
+def test_a_body_that_is_not_seen_is_drawn_otherwise(steps):
+    system, ((frame, result), _) = steps
+    T, none = np.eye(4), np.zeros(0, np.int64)
+    T[:3, 3] = 0, 0, 2
+    estimate = ObjectEstimate(1, 0.0, T, np.eye(6), np.zeros(6), np.eye(6), True, none, none)
+    body = MovingObject(1, none, estimate, T, T, np.array([[-0.3] * 3, [0.3] * 3]), False)
+    gone = replace(body, estimate=replace(estimate, measured=False))
+    empty, seen, unseen = (
+        draw_objects(frame.left, replace(result, objects=things), system.rig) for things in ((), (body,), (gone,))
+    )
+    assert (seen != empty).any() and (unseen != empty).any()
+    assert 0 < (unseen != empty).sum() < 0.7 * (seen != empty).sum()

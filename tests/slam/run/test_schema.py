@@ -30,7 +30,9 @@ def body(id, seed):
     T = pose(rotation(rng.normal(size=3) / 3), rng.normal(size=3))
     none = np.zeros(0, np.int64)
     e = ObjectEstimate(id, 0.1 * seed, T, A @ A.T, rng.normal(size=6), A @ A.T, bool(seed % 2), none, none)
-    return MovingObject(id, none, e, pose(rotation(rng.normal(size=3) / 9), rng.normal(size=3)), T, A[:2, :3], id == 1)
+    return MovingObject(
+        id, none, e, pose(rotation(rng.normal(size=3) / 9), rng.normal(size=3)), T, A[:2, :3], id == 1, 0.1, 0.05, 0.75
+    )
 
 
 BODIES = {2: (body(1, 1),), 3: (body(1, 2), body(4, 3))}
@@ -98,6 +100,7 @@ def test_rows_of_objects_are_what_the_system_said(done):
         e = thing.estimate
         assert (row["frame"], row["id"], row["stamp"]) == (number, thing.id, pytest.approx(e.stamp))
         assert (row["moving"], row["measured"]) == (thing.moving, e.measured)
+        assert (row["last_measured"], row["existence"]) == (0.05, 0.75)
         assert [row[c] for c in ("wx", "wy", "wz", "vx", "vy", "vz")] == pytest.approx(list(e.velocity), rel=1e-6)
         for T, names in (
             (e.T_world_object, ("x", "y", "z", "roll", "pitch", "yaw")),

@@ -1,0 +1,70 @@
+"""What is reported of bodies that are not measured, and what becomes of those that the back end no longer knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam import registry
+from slam.config import SystemConfig
+from slam.data import StereoFeatures
+from tests.slam.objects.double import FitBackend
+
+FIRST, GONE = 50, 100  # frames: the box moves from 60 on, and is covered from 100 on
+
+
+class Spoilt(FitBackend):
+    """Says of all bodies from a frame on that nothing is known of them."""
+
+    spoilt = False
+
+    def update_objects(self, observations):
+        out = super().update_objects(observations)
+        return [replace(e, covariance=1e6 * np.eye(6)) for e in out] if self.spoilt else out
+
+
+@pytest.fixture
+def moving_box():
+    sequence = slam.open_sequence("synthetic:box?density=300")
+    config = SystemConfig.for_kind(sequence.kind, None).with_settings(["objects.unmeasured_share=0.1"])
+    backend = Spoilt(registry.create("backends", "ekf", sequence.rig, models=config.models))
+    system = slam.StereoSlam(sequence.rig, None, backend, config=config)
+
+    def step(k, covered=False):
+        seen = sequence.simulate(k)
+        features = seen.features
+        if covered:
+            names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+            keep = seen.objects == 0
+            features = StereoFeatures(features.stamp, *(getattr(features, name)[keep] for name in names))
+        return system.process_features(features)
+
+    return step, backend
+
+
+def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
+    step, _ = moving_box
+    rows = [thing for k in range(FIRST, GONE) for thing in step(k).objects]
+    measured = sum(thing.estimate.measured for thing in rows)
+    assert measured > 20 and rows[-1].existence > 0.99
+    assert rows[-1].measured_at == rows[-1].estimate.stamp
+    after = [thing for k in range(GONE, GONE + 40) for thing in step(k, covered=True).objects]
+    assert 1 <= len(after) <= 0.1 * measured
+    last = rows[-1].measured_at
+    assert all(not thing.estimate.measured and thing.measured_at == last for thing in after)
+    sure = [rows[-1].existence, *(thing.existence for thing in after)]
+    assert (np.diff(sure) < 0).all() and sure[-1] > 0.5
+
+
+def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(moving_box):
+    step, backend = moving_box
+    ids = {thing.id for k in range(FIRST, GONE - 10) for thing in step(k).objects}
+    backend.spoilt = True
+    assert not step(GONE - 10).objects
+    backend.spoilt = False
+    after = [thing for k in range(GONE - 9, GONE) for thing in step(k).objects]
+    assert after and {thing.id for thing in after} <= ids
+    assert min(thing.found_at for thing in after) > 0
