@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from slam.sequences.rigs import load_rig as load_rig
     from slam.system import StereoSlam as StereoSlam
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.1.0"
 
 _PUBLIC = {
     "EstimatorModels": "slam.models",

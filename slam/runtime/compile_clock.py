@@ -3,38 +3,48 @@
 from __future__ import annotations
 
 import time
-from threading import Lock
+from dataclasses import dataclass
+from threading import RLock
+
+
+@dataclass(frozen=True)
+class _State:
+    """Compilations under way (they nest, and threads compile at the same time), since when, and the time before [s]."""
+
+    under_way: int = 0
+    since: float = 0.0
+    seconds: float = 0.0
 
 
 class CompileClock:
-    """Runs while any thread compiles: the others wait for it, or for the same processor."""
+    """Runs while any thread compiles: the others wait for it, or for the same processor.
+
+    An interrupt may leave the lock locked: its own thread goes on all the same, and reading the clock needs no lock.
+    """
 
     def __init__(self) -> None:
-        self._lock = Lock()
-        self._under_way = 0  # compilations nest, and threads compile at the same time
-        self._since = 0.0
-        self._seconds = 0.0
+        self._lock = RLock()
+        self._state = _State()
 
     def start(self) -> bool:
         """A compilation begins; whether no other was under way."""
         with self._lock:
-            self._under_way += 1
-            if self._under_way == 1:
-                self._since = time.perf_counter()
-            return self._under_way == 1
+            s = self._state
+            self._state = _State(s.under_way + 1, s.since if s.under_way else time.perf_counter(), s.seconds)
+            return not s.under_way
 
     def stop(self) -> bool:
         """A compilation has ended; whether none is under way any more."""
         with self._lock:
-            self._under_way -= 1
-            if not self._under_way:
-                self._seconds += time.perf_counter() - self._since
-            return not self._under_way
+            s = self._state
+            done = 0.0 if s.under_way > 1 else time.perf_counter() - s.since
+            self._state = _State(s.under_way - 1, s.since, s.seconds + done)
+            return s.under_way == 1
 
     def seconds(self) -> float:
         """Wall time in which something was compiled [s]."""
-        with self._lock:
-            return self._seconds + (time.perf_counter() - self._since if self._under_way else 0.0)
+        s = self._state
+        return s.seconds + (time.perf_counter() - s.since if s.under_way else 0.0)
 
 
 #: Of this process.
