@@ -26,6 +26,8 @@ SHELLS = ("sh", "shell", "bash")  # consoles have tests of their own
 OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "python3", ".", ".ci/run"}
 #: They end by a signal only; tests/slam/compare/test_cluster.py starts them.
 SERVERS = {"dask"}
+#: A camera, recordings of ROS, and timings.
+NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/")
 #: What the page shows, and what is run in its place.
 STAND_INS = {
     "path/to/kitti_or_euroc_folder": "euroc",
@@ -100,6 +102,8 @@ def test_commands_run(page, reader, slam_command, tmp_path, monkeypatch):
     for words in commands(page, *SHELLS):
         if words[0] in OF_THE_PACKAGE | SERVERS or words[:3] == ["python", "-m", "tests.fuzz"]:
             continue  # hostile input has tests of its own
+        if any(NOT_AT_HAND.search(word) for word in words):
+            continue  # tests/slam/sequences plays the device and writes such recordings; benchmarks take minutes
         words = shortened(words)
         if needs_rerun(words) and importlib.util.find_spec("rerun") is None:
             continue

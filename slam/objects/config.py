@@ -36,8 +36,9 @@ class ObjectsConfig:
         confirm: frames for which they must move alike, less those in which they did not; one feature may be newer.
         max_points: most points kept of a body.
         forget_after: a body not seen for so long is forgotten [s].
-        report_unmeasured: a body is reported for so long after it was last measured [s], and
-        unmeasured_share: in no more frames than this share of those in which it was reported as measured.
+        report_unmeasured: a body is reported for so long after it was last measured [s].
+        unmeasured_share: a body is reported as not measured in no more frames than this share of those in which it was
+            reported as measured.
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
         least_side: of the triangle of features in ``"procedure1"``, its shortest side [m].
         least_sine: of the triangle of features in ``"procedure1"``, the least sine of its angles.

@@ -39,7 +39,7 @@ def stamped(stamps):
     return [replace(FRAME, index=k, stamp=stamp) for k, stamp in enumerate(stamps)]
 
 
-@pytest.mark.parametrize("world", worlds.names())
+@pytest.mark.parametrize("world", [name for name in worlds.names() if name != "drive"])  # which needs a file
 def test_worlds_are_right(world):
     sequence = slam.open_sequence(f"synthetic:{world}?frames=2")
     found = pair_geometry(sequence.rig, *images(next(iter(sequence))), 1.5)
