@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import slam
+from slam.geometry.trajectory import Trajectory
 from slam.worlds.export import write_euroc
 from tests.test_docs import DOCS, PAGES, ROOT, blocks, commands
 
@@ -40,7 +41,7 @@ SHORTER = {"--trials": "1", "--seeds": "1", "--scheduler": None}
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory):
-    """A folder with what a reader has: a recording in EuRoC's form, two folders of images, and two videos."""
+    """A folder with what a reader has: a recording in EuRoC's form, folders of images, videos, and a path."""
     root = tmp_path_factory.mktemp("reader")
     sequence = slam.open_sequence(f"synthetic:desk?frames={FEW}")
     write_euroc(sequence, root / "euroc")
@@ -55,6 +56,10 @@ def reader(tmp_path_factory):
             cv2.imwrite(str(root / "recording" / side / f"{k:06}.png"), image)
             video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
         video.release()
+    (root / "poses").mkdir()
+    straight = np.tile(np.eye(4), (60, 1, 1))
+    straight[:, 2, 3] = np.arange(60)
+    Trajectory(0.1 * np.arange(60), straight).write_kitti(root / "poses" / "00.txt")
     return root
 
 
