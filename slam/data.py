@@ -303,7 +303,8 @@ class FrameResult:
             they were not.
         T_map_odom: pose (4, 4) of the frame that the back end estimates in, which never jumps, in the map; the identity
             before the first loop.
-        loop: index of the frame whose place this one shows again, where that closed a loop; else None.
+        loop: index of the frame whose place this one shows again, where that closed a loop; −1 for a place of the map
+            that the system was started with; None where no loop was closed.
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of that place that came back into the map.
     """

@@ -253,8 +253,12 @@ class StereoSlam:
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
             step = replace(step, estimate=self._considered(estimate))
-            atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path)
+            restarts = len(self.restarted)
+            atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
             change = self._mapper.give_back(self.backend, change, step, returned)
+            back = np.sort(change.returned.ids)
+            self._uncertainty.change(back[:0], np.zeros((0, 3)), back)
+            self._uncertainty.change(back, self.backend.positions(back), back[:0])
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
@@ -377,9 +381,12 @@ class StereoSlam:
         new = self._relocalizer.start(T)
         search.fill(new)
         self._mapper.next_id = search.known.next_id
+        landmarks = self.landmarks
         if found is not None:
-            self.landmarks = self._mapper.insert(new, search.known.rows, found.place)
-        self.backend, self._given, self._relocalizer.search = new, self.calibration.applied, None
+            landmarks = self._mapper.insert(new, search.known.rows, found.place)
+        self.landmarks, self.backend, self._given, self._relocalizer.search = (
+            landmarks, new, self.calibration.applied, None,
+        )  # fmt: skip
         return True
 
     def _localize(

@@ -48,15 +48,27 @@ def consistency_figures(own: Trajectory, true: Trajectory, covariances: Array, n
     from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)))
     low, high = chi_square_band(_DOF, max(len(from_start), 1))
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
+    closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
     for length in STRETCHES:
         last = np.searchsorted(along, along + length).astype(np.intp)
         starts = np.flatnonzero(last < len(own))
+        starts = starts[closed[starts] == closed[last[starts]]]
         values = stretch_nees(own, true, covariances, noise, starts, last[starts])
         if len(values):
             figures[f"NEES over {length:g} m"] = _mean(values)
     figures.update(_scale(own, true, covariances, noise))
     return figures
+
+
+def _closings(covariances: Array) -> RowArray:
+    """Number of rows (N,) so far in which the position has become surer by half at once, as where a loop is closed.
+
+    A stretch with one inside has no covariance that follows from those of its ends.
+    """
+    size = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+    with np.errstate(invalid="ignore"):
+        return np.concatenate([[0], np.cumsum(size[1:] < 0.5 * size[:-1])]).astype(np.intp)
 
 
 def stretch_nees(

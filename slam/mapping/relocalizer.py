@@ -73,7 +73,7 @@ class Relocalizer:
         """
         if self._backend is None:
             raise ConfigurationError("a system that starts in a known map needs its back end by name")
-        if not len(known):
+        if not len(known) and not known.keyframes:
             raise SlamError(f"{known.source}: the map holds no landmarks, so the camera cannot be found in it")
         self.search = MapSearch(known, self._rig, self._localizer, self._models.initial_pose)
         self.search.fill(backend)

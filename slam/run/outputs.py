@@ -64,13 +64,13 @@ class RunFiles:
     ) -> None:
         self._stack.close()
 
-    def write_frame(self, number: int, result: FrameResult, loop: int | None = None) -> None:
+    def write_frame(self, number: int, result: FrameResult, loop: int | str = "") -> None:
         """Append one frame to trajectory.txt, frames.csv and objects.csv.
 
         Args:
             number: of the frame in its sequence.
             result: of its step.
-            loop: number of the frame whose place it shows again, where it closed a loop.
+            loop: number of the frame whose place it shows again, where it closed a loop, or ``map``.
 
         Raises:
             SlamError: a row cannot be written whole; those before stay.
@@ -82,7 +82,7 @@ class RunFiles:
         row += [len(result.matched), len(r.used), len(r.rejected)]
         row += [len(result.added), len(result.erased), result.map_size]
         deviations = _deviations(e) if result.located else [float("nan")] * 4
-        row += [int(result.keyframe), "" if loop is None else loop]
+        row += [int(result.keyframe), loop]
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         line = tum_line(e.stamp, e.T_world_left) if result.located else ""

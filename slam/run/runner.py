@@ -218,7 +218,7 @@ def _drive(
         try:
             for number, result in results:
                 record.add(number, result)
-                files.write_frame(number, result, None if result.loop is None else record.numbers[result.loop])
+                files.write_frame(number, result, _loop(result, record))
                 if score is not None:
                     score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
@@ -239,6 +239,13 @@ def _drive(
                     files.write_json("summary.json", summary)
             last.report(stopped_by)
     return summary
+
+
+def _loop(result: FrameResult, record: RunRecord) -> int | str:
+    """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
+    if result.loop is None:
+        return ""
+    return record.numbers[result.loop] if result.loop >= 0 else "map"
 
 
 def _write_copies(

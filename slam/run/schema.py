@@ -57,7 +57,11 @@ FRAME_TABLE = (
     Columns(("predicted", "matched"), "", "number of landmarks predicted to be in view; of those matched to a feature"),
     Columns(("used", "rejected"), "", "number of matches that the back end used; that it rejected"),
     Columns(("added", "erased", "map_size"), "", "number of landmarks added; erased; in the map after the frame"),
-    Columns(("keyframe", "loop"), "", "1 for a keyframe, else 0; the frame whose place was seen again, closing a loop"),
+    Columns(
+        ("keyframe", "loop"),
+        "",
+        "1 for a keyframe, else 0; the frame whose place was seen again, closing a loop (`map`: of the known map)",
+    ),
     Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
     Columns(
         ("nis", "nis_dof"), "", "normalised innovation squared of the measurements used, and its degrees of freedom"

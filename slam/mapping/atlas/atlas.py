@@ -35,6 +35,7 @@ class Atlas:
         T_map_odom: pose (4, 4) of the back end's frame in the map.
         pending: the last loop that was seen, whether the pose graph holds it or not.
         confirmed: whether a keyframe just before it had seen the same return.
+        restarts: how often another back end had taken over when the last keyframe was made.
         known: number of keyframes that are from an earlier run: the first ones, in the map that this run started in.
     """
 
@@ -47,6 +48,7 @@ class Atlas:
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     pending: Loop | None = None
     confirmed: bool = False
+    restarts: int = 0
     known: int = 0
 
     def __len__(self) -> int:

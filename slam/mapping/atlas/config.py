@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
 
-_RANGES = {"features": (1, 100_000), "candidates": (0, 10_000), "inliers": (3, 100_000), "agreeing": (1, 1000)}
+_RANGES = {"features": (1, 100_000), "candidates": (0, 10_000), "inliers": (3, 100_000), "agreeing": (1, 2)}
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,9 @@ class AtlasConfig:
             are not compared.
         candidates: number of keyframes that are compared in detail with a new one.
         inliers: features that must agree on a pose for two keyframes to show the same place.
-        spread: least standard deviation of their pixels, as a share of the image's width.
-        agreeing: successive keyframes that must see the same return, before it is believed.
+        spread: least standard deviation of their pixels, in the direction in which they are spread most, as a share of
+            the image's width.
+        agreeing: keyframes that must see the same return, at once or within three, before it is believed: 1 or 2.
         gate_sigmas: a return is refused where it contradicts the path by more than this many standard deviations.
         give_back: landmarks of a place seen again return to the back end, where it can place landmarks.
     """

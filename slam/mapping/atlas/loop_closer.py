@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, log, transform
+from slam.geometry.se3 import Array, adjoint, hat, inverse, log, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.chain import Chain
@@ -19,7 +19,6 @@ from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covarianc
 from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
 from slam.mapping.atlas.places import Vectors
 from slam.mapping.mapper import KnownPlace, Returned, Step
-from slam.mapping.relocalizer import POSITION_SIGMA, ROTATION_SIGMA
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
@@ -28,7 +27,9 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 _VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared in detail
 _PATIENCE = 3  # keyframes within which another one must see the same return
 _MINIMAL = 6  # features that give a pose with a covariance
-_UNKNOWN_WAY = 1000.0  # [m] between the end of an earlier run and the beginning of this one
+_UNKNOWN_WAY = 1000.0  # [m] between the end of an earlier run and this one, or where the camera was kidnapped
+_UNKNOWN_MOTION = 1.0, 100.0  # standard deviations of the motion there [rad], [m]: it says nothing
+_LARGEST = 6e4  # number that a keyframe's descriptors hold
 _HYPOTHESES = 300  # poses tried: one in a hundred places is missed where a quarter of its matches are right
 
 
@@ -68,7 +69,7 @@ class LoopCloser:
 
     @one_blas_thread
     def update(
-        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
+        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory], restarts: int
     ) -> tuple[Atlas, Returned | None]:
         """The atlas after a frame, and what it shows again where a loop was closed.
 
@@ -77,18 +78,20 @@ class LoopCloser:
             step: what the frame brought.
             added: landmarks that joined the map in it.
             path: gives the path in odom so far.
+            restarts: how often another back end has taken over so far, as the camera had been kidnapped.
         """
         if not self._config.enabled or (step.state.unmatched and len(atlas)) or not self._is_keyframe(atlas, step):
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[added.rows] = added.ids
         step = replace(step, features=self._rectify(step.features))
-        new = self._keyframe(atlas, step, landmark_of)
+        new = self._keyframe(atlas, step, landmark_of, restarts > atlas.restarts)
         if new is None:
             return atlas, None
         candidates = self._candidates(atlas, new, step.features, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
-        atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=atlas.index.with_new(descriptors))
+        index = atlas.index.with_new(descriptors)
+        atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=index, restarts=restarts)
         best = self._best_sighting(atlas, candidates, step.features, step.index)
         return (atlas, None) if best is None else self._close(atlas, *best, step.features, path)
 
@@ -105,10 +108,12 @@ class LoopCloser:
             return None
         features = self._rectify(features)
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
-        best = self._best_sighting(atlas, self._ranked(atlas, likely, features), features, seed)
-        if best is None:
+        loops = [loop for loop, _ in self._sightings(atlas, self._ranked(atlas, likely, features), features, seed)]
+        if not loops:
             return None
-        loop, _ = best
+        loop = max(loops, key=lambda one: one.inliers)
+        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other in loops):
+            return None
         T_odom_keyframe = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
         return Found(T_odom_keyframe @ loop.T_first_second, self._place(atlas.keyframes[loop.first], T_odom_keyframe))
 
@@ -147,7 +152,7 @@ class LoopCloser:
         pending = atlas.pending
         return pending is not None and pending.second == len(atlas) - 1 and not atlas.confirmed
 
-    def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
+    def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray, moved_blindly: bool) -> Keyframe | None:
         """The frame as a keyframe; None where too few features have a depth."""
         features, moving = step.features, step.labels.moving
         rows, points = kept_features(self._rig, features, landmark_of, moving, self._sigma, self._config.features)
@@ -155,11 +160,11 @@ class LoopCloser:
             return None
         T, P = step.estimate.T_world_left, step.estimate.covariance
         travelled = 0.0
-        added: Array = np.diag(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3) ** 2)
+        added: Array = np.diag(np.repeat(_UNKNOWN_MOTION, 3) ** 2)
         if len(atlas):
             last = atlas.keyframes[-1]
             travelled = last.travelled + _UNKNOWN_WAY
-        if len(atlas) > atlas.known:
+        if len(atlas) > atlas.known and not moved_blindly:
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
             z, _ = self._rig.project_stereo(points, jacobian=False)
@@ -175,7 +180,7 @@ class LoopCloser:
             travelled,
             float(np.median(points[:, 2])),
             points.astype(np.float32),
-            features.descriptors[rows].astype(np.float16),
+            np.clip(features.descriptors[rows], -_LARGEST, _LARGEST).astype(np.float16),
             features.laplacian[rows],
             landmark_of[rows],
         )
@@ -225,18 +230,26 @@ class LoopCloser:
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
     ) -> tuple[Loop, Sighting] | None:
         """The candidate with which most features agree on a pose."""
-        best: tuple[int, Sighting] | None = None
+        found = self._sightings(atlas, candidates, features, seed)
+        return max(found, key=lambda one: one[0].inliers, default=None)
+
+    def _sightings(
+        self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
+    ) -> list[tuple[Loop, Sighting]]:
+        """The candidates with which enough features agree on a pose, as loops to the newest keyframe."""
+        X = self._rectified.T_left_rectified
+        A, found = adjoint(X), []
         for k in candidates.tolist():
             seen = sighting(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
-            if seen is not None and (best is None or len(seen.matches) > len(best[1].matches)):
-                best = k, seen
-        if best is None:
-            return None
-        first, seen = best
-        X = self._rectified.T_left_rectified
-        A = adjoint(X)
-        T, P = X @ seen.T_keyframe_left @ inverse(X), A @ seen.covariance @ A.T
-        return Loop(first, len(atlas) - 1, T, P, len(seen.matches)), seen
+            if seen is not None:
+                T, P = X @ seen.T_keyframe_left @ inverse(X), A @ seen.covariance @ A.T
+                found.append((Loop(k, len(atlas) - 1, T, P, len(seen.matches)), seen))
+        return found
+
+    def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
+        """Whether two sightings put the camera at places nearer to each other than what it sees there."""
+        T, U = (atlas.pose_in_map(loop.first) @ loop.T_first_second for loop in (one, other))
+        return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
         self, atlas: Atlas, loop: Loop, seen: Sighting, features: StereoFeatures, path: Callable[[], Trajectory]
@@ -290,9 +303,13 @@ class LoopCloser:
         m, X = seen.matches, self._rectified.T_left_rectified
         back = X @ inverse(seen.T_keyframe_left)
         points = keyframe.points[m.landmarks].astype(float)
+        near = transform(inverse(seen.T_keyframe_left), points)
+        J = np.concatenate([hat(near), np.broadcast_to(-np.eye(3), (len(near), 3, 3))], axis=2)
         P = self._rig.triangulation_covariance(points, self._sigma)
-        covariances = back[:3, :3] @ P @ back[:3, :3].T
-        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(back, points), covariances)
+        turn = inverse(seen.T_keyframe_left)[:3, :3]
+        P = X[:3, :3] @ (turn @ P @ turn.T + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
+        symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
+        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(back, points), symmetric)
 
 
 def _distance(expected: Array, found: Array, covariance: Array) -> float:

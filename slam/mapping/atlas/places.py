@@ -1,7 +1,7 @@
 """Which keyframe shows a place like this one: vectors of locally aggregated descriptors (VLAD; Jégou et al., 2010).
 
 A keyframe's descriptors are shared out to the nearest of some words, and their differences from it are added up: a
-vector of fixed length. The words are learnt from the first keyframes of a run, by k-means with a fixed seed.
+vector of fixed length. The words are learnt from the first keyframes of a run, by k-means from evenly chosen ones.
 """
 
 from __future__ import annotations

@@ -205,3 +205,17 @@ def test_a_camera_carried_to_a_place_of_long_ago_is_found(sequence):
     truth = inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses[14]
     assert np.linalg.norm(results[-1].estimate.T_world_left[:3, 3] - truth[:3, 3]) < 0.3
     assert (np.concatenate([r.matched for r in results[8:]]) <= old).any()
+
+
+def test_the_way_of_a_camera_that_was_carried_off_is_not_known(sequence):
+    system = system_for(sequence, "ekf", ("map.max_landmarks=60",))
+    for k in range(60):
+        system.process_features(sequence.observations(k))
+    before = len(system.atlas)
+    blind = [StereoFeatures.empty(6.0 + 0.1 * i, 16) for i in range(6)]
+    carried = [replace(sequence.observations(5 + i), stamp=6.6 + 0.1 * i) for i in range(10)]
+    for features in [*blind, *carried]:
+        system.process_features(features)
+    after = system.atlas.keyframes[before]
+    assert np.sqrt(np.trace(after.step_covariance[3:, 3:])) > 50.0
+    assert np.sqrt(np.trace(system.atlas.keyframes[before - 1].step_covariance[3:, 3:])) < 1.0
