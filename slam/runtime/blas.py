@@ -28,26 +28,34 @@ def _found(modules: int) -> tuple[list[LibController], list[LibController]]:
 
 
 class _Limit:
-    """The number of BLAS threads of the process is 1 as long as any thread is inside."""
+    """The number of BLAS threads of the process is 1 as long as any thread is inside.
+
+    What is done with the lock stands on the lock's own line: an interrupt comes before it or within, where the lock is
+    given back, but not between the end of a block and that.
+    """
 
     def __init__(self) -> None:
-        self._lock = RLock()  # one that an interrupt leaves locked does not stop its own thread
+        self._lock = RLock()
         self._inside = 0
         self._changed: _Changed = []
 
     def enter(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._changed = _with_more(_libraries()[0])
-                _set([(library, 1) for library, _ in self._changed])
-            self._inside += 1
+        with self._lock: self._enter()  # noqa: E701  # fmt: skip
 
     def leave(self) -> None:
-        with self._lock:
-            self._inside -= 1
-            if not self._inside:
-                _set(self._changed)
-                self._changed = []
+        with self._lock: self._leave()  # noqa: E701  # fmt: skip
+
+    def _enter(self) -> None:
+        if not self._inside:
+            self._changed = _with_more(_libraries()[0])
+            _set([(library, 1) for library, _ in self._changed])
+        self._inside += 1
+
+    def _leave(self) -> None:
+        self._inside -= 1
+        if not self._inside:
+            _set(self._changed)
+            self._changed = []
 
 
 _limit = _Limit()

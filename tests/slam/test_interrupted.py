@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,6 +20,7 @@ from slam.data import FrameStatus
 from slam.errors import MeasurementError
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
+from slam.runtime.blas import one_blas_thread
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
@@ -169,3 +171,12 @@ def test_the_same_frame_again_is_refused_in_plain_words_and_the_map_is_whole():
     assert len(system.snapshot()) == len(system.landmarks) == len(before)
     system.process_features(replace(fresh, stamp=1.1 + k / 30))
     assert_agree(system)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_lock_is_left():
+    """After all these interrupts another thread still gets the locks of the process."""
+    yield
+    done = threading.Event()
+    threading.Thread(target=lambda: (one_blas_thread(lambda: None)(), done.set()), daemon=True).start()
+    assert done.wait(10.0)
