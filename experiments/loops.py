@@ -181,8 +181,10 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
             axis.plot(*poses[:, [0, 2], 3].T, style, lw=1.2, label=label)
         at = [run.atlas.keyframes[loop.second].frame for loop in run.atlas.loops]
         axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=5, label="loops closed")
-        axis.set(title=f"{name}, {backend}", aspect="equal", xlabel="right [m]", ylabel="forward [m]")
-    axes[0, 0].legend(fontsize=8)
+        axis.set(
+            title=f"{name}, {backend}", aspect="equal", adjustable="datalim", xlabel="right [m]", ylabel="forward [m]"
+        )
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
     figure.savefig(out / "loops.png", dpi=110)
 
 
