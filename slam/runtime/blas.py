@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import lru_cache, wraps
 from threading import RLock
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 from threadpoolctl import LibController, ThreadpoolController
 
@@ -27,32 +28,38 @@ def _found(modules: int) -> tuple[list[LibController], list[LibController]]:
     return [library for library in found if library not in own], own
 
 
+class _Call:
+    """A call that is under way."""
+
+
 class _Limit:
     """The number of BLAS threads of the process is 1 as long as any thread is inside.
 
     What is done with the lock stands on the lock's own line: an interrupt comes before it or within, where the lock is
-    given back, but not between the end of a block and that.
+    given back, but not between the end of a block and that. Calls that an interrupt ended on their way in or out leave
+    no more than a token, which goes with them.
     """
 
     def __init__(self) -> None:
         self._lock = RLock()
-        self._inside = 0
+        self._inside: WeakSet[_Call] = WeakSet()
         self._changed: _Changed = []
 
-    def enter(self) -> None:
-        with self._lock: self._enter()  # noqa: E701  # fmt: skip
+    def enter(self, call: _Call) -> None:
+        with self._lock: self._enter(call)  # noqa: E701  # fmt: skip
 
-    def leave(self) -> None:
-        with self._lock: self._leave()  # noqa: E701  # fmt: skip
+    def leave(self, call: _Call) -> None:
+        with self._lock: self._leave(call)  # noqa: E701  # fmt: skip
 
-    def _enter(self) -> None:
+    def _enter(self, call: _Call) -> None:
         if not self._inside:
-            self._changed = _with_more(_libraries()[0])
-            _set([(library, 1) for library, _ in self._changed])
-        self._inside += 1
+            more = _with_more(_libraries()[0])
+            self._changed = [*self._changed, *more]
+            _set([(library, 1) for library, _ in more])
+        self._inside.add(call)
 
-    def _leave(self) -> None:
-        self._inside -= 1
+    def _leave(self, call: _Call) -> None:
+        self._inside.discard(call)
         if not self._inside:
             _set(self._changed)
             self._changed = []
@@ -72,13 +79,14 @@ def one_blas_thread(function: _F) -> _F:
     @wraps(function)
     def limited(*args: Any, **kwargs: Any) -> Any:
         changed = _with_more(_libraries()[1])
-        _limit.enter()
+        call = _Call()
+        _limit.enter(call)
         try:
             _set([(library, 1) for library, _ in changed])
             return function(*args, **kwargs)
         finally:
             _set(changed)
-            _limit.leave()
+            _limit.leave(call)
 
     return limited  # type: ignore[return-value]
 
