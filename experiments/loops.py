@@ -53,7 +53,7 @@ class Drive:
         atlas: at the end.
         final: the last word on the path.
         truth: in the axes of its first pose (F, 4, 4).
-        memory: bytes that each frame leaves for good.
+        memory: bytes that each frame leaves, the results that are kept here included.
     """
 
     results: list[FrameResult] = field(default_factory=list)

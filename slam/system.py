@@ -23,10 +23,10 @@ from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
 from slam.mapping.relocalizer import Relocalizer
 from slam.objects.modes import ObjectDetector, detector_for
-from slam.one_thread import OneThread
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
+from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
@@ -123,7 +123,7 @@ class StereoSlam:
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
         self.atlas = Atlas()
-        self._loop_closer = LoopCloser(rig, c.atlas, c.association, c.models)
+        self._loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = _Last()
         self._stages = Stages()
@@ -253,18 +253,24 @@ class StereoSlam:
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
             step = replace(step, estimate=self._considered(estimate))
-            restarts = len(self.restarted)
-            atlas, returned = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
-            change = self._mapper.give_back(self.backend, change, step, returned)
-            back = np.sort(change.returned.ids)
-            self._uncertainty.change(back[:0], np.zeros((0, 3)), back)
-            self._uncertainty.change(back, self.backend.positions(back), back[:0])
+            atlas, change = self._close_loops(step, change)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
             self._last.after(step, change), change.landmarks, atlas, Stages(),
         )  # fmt: skip
         return result
+
+    def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
+        """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""
+        restarts = len(self.restarted)
+        atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
+        if seen_again is not None:
+            change = self._mapper.give_back(self.backend, change, step, seen_again)
+            back = np.sort(change.returned.ids)
+            self._uncertainty.change(back[:0], np.zeros((0, 3)), back)  # what they were before counts no more
+            self._uncertainty.change(back, self.backend.positions(back), back[:0])
+        return atlas, change
 
     def roll_back(self) -> None:
         """After a step that an exception ended: take back what it did to the map, in the back end as well.

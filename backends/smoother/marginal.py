@@ -22,7 +22,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from backends.smoother.solver import FAILURES, SolverError
 from backends.smoother.variables import size_of
-from slam.geometry.se3 import Array, adjoint, hat, inverse, nearest_rotation
+from slam.geometry.se3 import Array, adjoint, hat, inverse, nearest_rotation, points_by_pose
 
 #: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
 _JITTER = (1e-13, 1e-11, 1e-9)
@@ -131,7 +131,7 @@ class MarginalPrior:
                     by_reference -= J @ now.inverse().compose(poses[0]).AdjointMap()
                     jacobians[i] = J
                 if len(local):
-                    carried = np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+                    carried = points_by_pose(local)
                     by_reference += self.R[:, columns:] @ carried.reshape(-1, 6)
                     turned = by_landmark @ R_world_reference.T
                     for i in range(len(local)):

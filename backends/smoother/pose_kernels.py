@@ -160,7 +160,11 @@ def _whiten(whitener, m, r, J, white, G):
 
 @helper
 def _solve(M, v):
-    """``M⁻¹ v`` into v (6,) by M = L D Lᵀ, which overwrites the lower triangle of M (6, 6)."""
+    """``M⁻¹ v`` into v (6,) by M = L D Lᵀ, which overwrites the lower triangle of M (6, 6).
+
+    As in `slam.geometry.pnp_kernels`: kernels of two files share no helper, as the cache of one file's kernels does not
+    notice that the other file has changed.
+    """
     for i in range(6):
         for j in range(i + 1):
             for h in range(j):

@@ -11,7 +11,7 @@ from backends.smoother.measurement_log import IndexArray, Path
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from backends.smoother.uncertainty import PoseSet, quadratic
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, adjoint, hat, inverse
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.models import EstimatorModels
 
 
@@ -128,7 +128,7 @@ def predict_points(predicted: PredictedPose, points: Array, own: Array, by_windo
     """
     R, t = predicted.T[:3, :3], predicted.T[:3, 3]
     local = (points - t) @ R
-    by_camera = np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(points), 3, 3))], axis=2)
+    by_camera = points_by_pose(local)
     return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, R.T @ own @ R)
 
 

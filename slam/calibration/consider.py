@@ -25,7 +25,7 @@ import numpy as np
 from slam.calibration.model import RigModel
 from slam.data import Estimate
 from slam.geometry.arrays import Array, IdArray
-from slam.geometry.se3 import adjoint, hat, inverse, transform
+from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 
 #: Standard deviation of the baseline's length, as a share of it. It scales the whole world, so images never show it:
 #: the squares of a calibration board are known to some tenths of a percent.
@@ -108,7 +108,7 @@ class RigUncertainty:
         local = transform(inverse(self._T_world), positions[new])
         R = self._T_world[:3, :3]
         back = np.linalg.inv(self._by_point(local))
-        by_rig = R @ (back @ self._field(local) + _by_pose(local) @ self._pose)
+        by_rig = R @ (back @ self._field(local) - points_by_pose(local) @ self._pose)
         covariance = R @ back @ self._noise @ np.swapaxes(back, 1, 2) @ R.T
         both = _Landmarks(
             np.concatenate([kept.ids, ids[new]]),
@@ -138,7 +138,7 @@ class RigUncertainty:
             marks.by_rig[:, :, -1] += marks.by_rig[:, :, :-2] @ step
         elif len(marks.ids):
             local = transform(inverse(self._T_world), positions(marks.ids))
-            marks.by_rig[:, :, -1] = (self._T_world[:3, :3] @ _by_pose(local) @ self._pose[:, -1:])[:, :, 0]
+            marks.by_rig[:, :, -1] = (-self._T_world[:3, :3] @ points_by_pose(local) @ self._pose[:, -1:])[:, :, 0]
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
@@ -160,7 +160,7 @@ class RigUncertainty:
     def _solve(self, R: Array, local: Array, landmarks: _Landmarks) -> None:
         """Sensitivity of the pose from landmarks at `local` (M, 3) [m] in the rectified left camera's coordinates."""
         H = self._by_point(local)
-        A = -H @ _by_pose(local)
+        A = H @ points_by_pose(local)
         b = self._field(local) - H @ (R.T @ landmarks.by_rig)
         P = R.T @ landmarks.covariance @ R / landmarks.seen[:, None, None]
         W = np.linalg.inv(self._noise + H @ P @ np.swapaxes(H, 1, 2))
@@ -188,8 +188,3 @@ class RigUncertainty:
         f, z, none = self._model.focal, local[:, 2], np.zeros(len(local))
         rows = [[f + none, none, -x], [none, f + none, -y], [none, none, -d]]
         return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) / z[:, None, None])
-
-
-def _by_pose(local: Array) -> Array:
-    """∂y/∂ξ (M, 3, 6) in camera axes of points (M, 3) [m] that move with the camera: [−[h]ₓ, I]."""
-    return np.concatenate([-hat(local), np.broadcast_to(np.eye(3), (len(local), 3, 3))], axis=2)

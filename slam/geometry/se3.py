@@ -179,6 +179,11 @@ def adjoint(T: Array) -> Array:
     return out
 
 
+def points_by_pose(local: Array) -> Array:
+    """Derivatives (N, 3, 6) of fixed points, at `local` (N, 3) in a frame, by the frame's pose: ``[hat(p), −1]``."""
+    return np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+
+
 def rotation_angle(R: Array) -> Array:
     """Geodesic angles (...,) [rad] of rotation matrices (..., 3, 3)."""
     return np.linalg.norm(so3_log(R), axis=-1)

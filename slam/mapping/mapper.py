@@ -147,13 +147,13 @@ class Mapper:
             backend.remove(erased)
         return MapChange(landmarks, added, erased)
 
-    def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned | None) -> MapChange:
+    def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned) -> MapChange:
         """Let landmarks of a place seen again rejoin the map, where the back end can place them.
 
         Under their old ids, where they had one. What the back end still had of them, where it had last left them, is
         erased first. Features that are landmarks of the map already are left alone.
         """
-        if returned is None or not isinstance(backend, MapBackend):
+        if not isinstance(backend, MapBackend):
             return change
         taken = np.concatenate([step.matches.rows, change.added.rows])
         free = np.flatnonzero(~np.isin(returned.rows, taken))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, hat, inverse, transform
+from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.landmarks import LandmarkRows
 from slam.tracking.association import match_everywhere, pairs_in_boxes
 from slam.tracking.localizer import LandmarkMatches, Localizer
@@ -114,7 +114,7 @@ def _step(
     z_now, J_now = rig.left.project_with_jacobian(local)
     z_then, J_then = rig.left.project_with_jacobian((R @ local[:, :, None])[:, :, 0] + t)
     J_then = J_then @ R  # by the point in the second camera
-    by_motion = J_then @ np.concatenate([-hat(local), np.broadcast_to(np.eye(3), R.shape)], axis=2)
+    by_motion = J_then @ -points_by_pose(local)
     noise = by_motion @ P @ np.swapaxes(by_motion, 1, 2) + sigma**2 * np.eye(2)
     bad = ~(np.isfinite(noise).all(axis=(1, 2)) & np.isfinite(J_now).all(axis=(1, 2)))
     noise[bad], J_now[bad], J_then[bad] = np.eye(2), 0, 0
@@ -145,7 +145,7 @@ def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma:
     Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinitely vague where they do not fix it.
     """
     _, J = rig.project_stereo(local)
-    by_pose = J @ np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+    by_pose = J @ points_by_pose(local)
     by_pose[~has_stereo, 2] = 0
     rows = np.nan_to_num(by_pose).reshape(-1, 6) / sigma
     return np.asarray(np.linalg.inv(rows.T @ rows + 1e-6 * np.eye(6)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.se3 import Array, exp, hat, transform
+from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.track_kernels import (
@@ -99,7 +99,7 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
         y = _means(points, A)
-        J = np.concatenate([-hat(y), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], axis=2)
+        J = -points_by_pose(y)
         JA = np.swapaxes(J, 1, 2)[:, None] @ A
         normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
-
-_DEPTH_ERROR = 0.2  # largest relative standard deviation of a depth, as of a new landmark's (`MapConfig`)
 
 
 @dataclass(frozen=True)
@@ -64,30 +62,36 @@ def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: 
     return bool(rig.left.in_image(uv).mean() < config.keyframe_share)
 
 
-def kept_features(
-    rig: StereoRig, features: StereoFeatures, landmark_of: IdArray, moving: NDArray[np.intp], sigma: float, most: int
-) -> tuple[NDArray[np.intp], Array]:
-    """Rows of the features that a keyframe keeps, and their points (F, 3) [m] in left-camera coordinates.
-
-    Those whose depth is known and that do not move; landmarks first, then the strongest.
+def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, max_error: float) -> NDArray[np.intp]:
+    """Rows of the features whose depth is known, to a relative standard deviation of `max_error`.
 
     Args:
         rig: the cameras.
-        features: of the frame (N rows).
-        landmark_of: id of the landmark that each feature is (N,), −1 for none.
-        moving: rows of features that move.
+        features: of a frame.
         sigma: noise of uL, vL, uR [px].
-        most: how many are kept at most.
+        max_error: largest relative standard deviation.
     """
     points = rig.triangulate(features.uv_left, features.uv_right)
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     deviation = np.sqrt(rig.triangulation_covariance(points[known], sigma)[:, 2, 2])
-    good: BoolArray = deviation < _DEPTH_ERROR * points[known, 2]
-    good &= ~np.isin(known, moving)
-    rows = known[good]
-    order = np.lexsort((-features.response[rows], landmark_of[rows] < 0))[:most]
-    rows = np.sort(rows[order])
-    return rows, points[rows]
+    return known[deviation < max_error * points[known, 2]]
+
+
+def kept_features(
+    rows: NDArray[np.intp], response: Array, landmark_of: IdArray, moving: NDArray[np.intp], most: int
+) -> NDArray[np.intp]:
+    """Those rows of features that a keyframe keeps: none that move; landmarks first, then the strongest.
+
+    Args:
+        rows: of features with a depth.
+        response: of all features (N,).
+        landmark_of: id of the landmark that each feature is (N,), −1 for none.
+        moving: rows of features that move.
+        most: how many are kept at most.
+    """
+    rows = rows[~np.isin(rows, moving)]
+    order = np.lexsort((-response[rows], landmark_of[rows] < 0))[:most]
+    return np.sort(rows[order])
 
 
 def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array, floor: Array) -> Array:

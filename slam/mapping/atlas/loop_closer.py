@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, hat, inverse, log, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed
+from slam.mapping.atlas.keyframes import Keyframe, features_with_depth, kept_features, step_covariance, view_has_changed
 from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
 from slam.mapping.atlas.places import Vectors
 from slam.mapping.mapper import KnownPlace, Returned, Step
@@ -56,15 +56,21 @@ class LoopCloser:
         config: settings.
         association: settings of the search by descriptor.
         models: noise of uL, vL, uR [px].
+        max_depth_error: largest relative standard deviation of a kept feature's depth, as of a new landmark's.
     """
 
     def __init__(
-        self, rig: StereoRig, config: AtlasConfig, association: AssociationConfig, models: EstimatorModels
+        self,
+        rig: StereoRig,
+        config: AtlasConfig,
+        association: AssociationConfig,
+        models: EstimatorModels,
+        max_depth_error: float,
     ) -> None:
         self._rectified = rig.rectified
         self._rig = rig.rectified.rig
         self._config = config
-        self._sigma = models.pixel_sigma
+        self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         self._localizer = Localizer(self._rig, replace(association, wide_hypotheses=_HYPOTHESES), models)
 
     @one_blas_thread
@@ -93,7 +99,7 @@ class LoopCloser:
         index = atlas.index.with_new(descriptors)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=index, restarts=restarts)
         best = self._best_sighting(atlas, candidates, step.features, step.index)
-        return (atlas, None) if best is None else self._close(atlas, *best, step.features, path)
+        return (atlas, None) if best is None else self._close(atlas, *best, path)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, seed: int) -> Found | None:
@@ -155,7 +161,9 @@ class LoopCloser:
     def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray, moved_blindly: bool) -> Keyframe | None:
         """The frame as a keyframe; None where too few features have a depth."""
         features, moving = step.features, step.labels.moving
-        rows, points = kept_features(self._rig, features, landmark_of, moving, self._sigma, self._config.features)
+        known = features_with_depth(self._rig, features, self._sigma, self._max_depth_error)
+        rows = kept_features(known, features.response, landmark_of, moving, self._config.features)
+        points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         if len(rows) < _MINIMAL:
             return None
         T, P = step.estimate.T_world_left, step.estimate.covariance
@@ -236,7 +244,10 @@ class LoopCloser:
     def _sightings(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
     ) -> list[tuple[Loop, Sighting]]:
-        """The candidates with which enough features agree on a pose, as loops to the newest keyframe."""
+        """The candidates with which enough features agree on a pose, as loops that end at the present camera.
+
+        Their second number is that of the newest keyframe, which the camera is unless it is lost.
+        """
         X = self._rectified.T_left_rectified
         A, found = adjoint(X), []
         for k in candidates.tolist():
@@ -252,7 +263,7 @@ class LoopCloser:
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
-        self, atlas: Atlas, loop: Loop, seen: Sighting, features: StereoFeatures, path: Callable[[], Trajectory]
+        self, atlas: Atlas, loop: Loop, seen: Sighting, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
         from slam.mapping.atlas.pose_graph import relative_pose, solve
@@ -300,16 +311,14 @@ class LoopCloser:
 
     def _returned(self, keyframe: Keyframe, seen: Sighting) -> Returned:
         """The old keyframe's features that agree, in the coordinates of the present left camera."""
-        m, X = seen.matches, self._rectified.T_left_rectified
-        back = X @ inverse(seen.T_keyframe_left)
+        m, X, back = seen.matches, self._rectified.T_left_rectified, inverse(seen.T_keyframe_left)
         points = keyframe.points[m.landmarks].astype(float)
-        near = transform(inverse(seen.T_keyframe_left), points)
-        J = np.concatenate([hat(near), np.broadcast_to(-np.eye(3), (len(near), 3, 3))], axis=2)
-        P = self._rig.triangulation_covariance(points, self._sigma)
-        turn = inverse(seen.T_keyframe_left)[:3, :3]
-        P = X[:3, :3] @ (turn @ P @ turn.T + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
+        near, R = transform(back, points), back[:3, :3]
+        J = points_by_pose(near)
+        P = R @ self._rig.triangulation_covariance(points, self._sigma) @ R.T
+        P = X[:3, :3] @ (P + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
         symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
-        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(back, points), symmetric)
+        return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
 
 
 def _distance(expected: Array, found: Array, covariance: Array) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from slam.data import StereoFeatures
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, hat, inverse, transform
+from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
@@ -119,7 +119,7 @@ def refined_pose(
     for _ in range(_ROUNDS):
         local = transform(inverse(T), points)
         z, H = rig.project_stereo(local)
-        J = H @ np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+        J = H @ points_by_pose(local)
         HR = H @ T[:3, :3].T
         S, error = pixel_sigma**2 * np.eye(3) + HR @ P @ np.swapaxes(HR, 1, 2), measured - z
         J[missing, 2] = error[missing, 2] = 0

@@ -171,7 +171,7 @@ def test_an_interrupted_keyframe_leaves_the_atlas_as_it_was(sequence, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(system._mapper, "give_back", interrupt)
+        patch.setattr("slam.system.frame_result", interrupt)
         with pytest.raises(KeyboardInterrupt):
             system.process_features(sequence.observations(8))
     assert system.atlas is before

@@ -10,7 +10,14 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, kept_features, step_covariance, view_has_changed, what_was_added
+from slam.mapping.atlas.keyframes import (
+    Keyframe,
+    features_with_depth,
+    kept_features,
+    step_covariance,
+    view_has_changed,
+    what_was_added,
+)
 from slam.mapping.atlas.loops import refined_pose, sighting
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
@@ -41,10 +48,15 @@ def view(T_world_left: Array, points: Array, descriptors: Array, seed: int) -> S
     return StereoFeatures(0.0, left, right, one, 0 * one, one, one.astype(np.int8), descriptors[seen])
 
 
+def rows_of(*rows: int) -> np.ndarray:
+    return np.array(rows, np.intp)
+
+
 def keyframe(features: StereoFeatures) -> Keyframe:
     """The frame as a keyframe."""
     nothing = np.full(len(features), -1)
-    rows, points = kept_features(RIG, features, nothing, np.zeros(0, np.intp), SIGMA, 400)
+    rows = kept_features(features_with_depth(RIG, features, SIGMA, 0.2), features.response, nothing, rows_of(), 400)
+    points = RIG.triangulate(features.uv_left[rows], features.uv_right[rows])
     return Keyframe(
         0, 0.0, np.eye(4), np.eye(6), np.zeros((6, 6)), 0.0, float(np.median(points[:, 2])),
         points.astype(np.float32), features.descriptors[rows].astype(np.float16), features.laplacian[rows],
@@ -104,7 +116,7 @@ def test_matches_in_one_spot_are_not_enough():
 def test_moving_features_are_not_kept():
     features = view(np.eye(4), *world(0), 0)
     nothing = np.full(len(features), -1)
-    rows, _ = kept_features(RIG, features, nothing, np.arange(10), SIGMA, 400)
+    rows = kept_features(np.arange(len(features)), features.response, nothing, np.arange(10), 400)
     assert rows.min() == 10
 
 
@@ -112,7 +124,7 @@ def test_landmarks_are_kept_first():
     features = view(np.eye(4), *world(0), 0)
     landmark_of = np.full(len(features), -1)
     landmark_of[-5:] = np.arange(5)
-    rows, _ = kept_features(RIG, features, landmark_of, np.zeros(0, np.intp), SIGMA, 5)
+    rows = kept_features(np.arange(len(features)), features.response, landmark_of, rows_of(), 5)
     assert rows.tolist() == list(range(len(features) - 5, len(features)))
 
 

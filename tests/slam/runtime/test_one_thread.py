@@ -10,7 +10,7 @@ import pytest
 
 import slam
 from slam.errors import SlamError
-from slam.one_thread import OneThread
+from slam.runtime.one_thread import OneThread
 from slam.system import StereoSlam
 from tests.slam.digest import FIRST, WORLD, state
 
