@@ -162,8 +162,10 @@ class Solver:
         if root is not None and set(keys) <= set(root[0]):
             return _covariance_in(*root, keys)
         if len(keys) == 1:
-            return np.asarray(self._isam.marginalCovariance(keys[0]))
-        return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
+            P = np.asarray(self._isam.marginalCovariance(keys[0]))
+        else:
+            P = np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
+        return np.asarray(0.5 * (P + P.T))  # what is hardly known comes back symmetric to some digits only
 
     def values(self) -> gtsam.Values:
         """All variables, solved to the last."""

@@ -105,7 +105,7 @@ class RunData:
 def _loops(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
     """Rows of the final path (L, 2) whose places are the same."""
     stamps = {row["frame"]: float(row["stamp"]) for row in frames}
-    pairs = [(stamps[row["frame"]], stamps[row["loop"]]) for row in frames if row.get("loop", "").isdigit()]
+    pairs = [(stamps[row["frame"]], stamps[row["loop"]]) for row in frames if (row.get("loop") or "").isdigit()]
     return np.searchsorted(final.stamps, np.array(pairs).reshape(-1, 2) - 1e-9).clip(0, max(len(final) - 1, 0))
 
 

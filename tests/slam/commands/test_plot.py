@@ -142,3 +142,13 @@ assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "summary.png").exists()
+
+
+def test_a_row_of_frames_that_lost_its_end_has_no_loop(runs, tmp_path):
+    folder = shutil.copytree(runs / "a", tmp_path / "cut")
+    rows = [line.split(",") for line in (folder / "frames.csv").read_text(encoding="utf-8").splitlines()]
+    loop = rows[0].index("loop")
+    moved = [row[:loop] + row[loop + 1 :] + row[loop : loop + 1] for row in rows]  # the last column, so that it can go
+    moved[1].pop()
+    (folder / "frames.csv").write_text("\n".join(map(",".join, moved)) + "\n", encoding="utf-8")
+    assert len(RunData.read(folder, "cut").loops) == 0
