@@ -24,6 +24,7 @@ _SPACING = 0.5  # a view waits from when the last one has lost this part of what
 _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
 _MOST_ROWS = 250  # of a frame: more say little more
 _MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
+_KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
 _RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
 
 
@@ -49,6 +50,8 @@ class SelfCalibration:
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         start = np.linalg.inv(self._prior)
+        self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
+        self._unknown = _mean_variance(self._far, start)
         self._solution = Solution(np.zeros(n), start, start)
         self._waiting: list[View] = []
         self._open: Evidence | None = None  # of a pair that is not complete
@@ -70,19 +73,18 @@ class SelfCalibration:
     def apply(self, least: float = 0.0) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
 
-        Nothing is corrected before motion has been seen: rows alone say too little of the disparity. Where disparities
-        would change by less than `least` standard deviations (root mean square over the image), features are corrected
-        as before.
+        Nothing is corrected before motion has taken half of the prior's variance from the disparities: rows alone say
+        too little of them, and what they seem to say is then mostly the prior. Where disparities would change by less
+        than `least` standard deviations (root mean square over the image), features are corrected as before.
         """
-        mean = self._solution.mean
-        step = mean - self.applied.parameters
-        if not self.config.enabled or not step.any():
+        if not self.config.enabled:
             return None
-        if least:
-            far = self.model.field(self.model.far())[:, 2]
-            variance = np.einsum("ni,ij,nj->n", far, self._solution.inner, far).mean()
-            if np.square(far @ step).mean() <= least**2 * variance:
-                return None
+        variance = _mean_variance(self._far, self._solution.inner)
+        known = variance <= _KNOWN * self._unknown
+        mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
+        step = mean - self.applied.parameters
+        if not step.any() or np.square(self._far @ step).mean() <= least**2 * variance:
+            return None
         before, self.applied = self.applied, RigCorrection(self.model, mean.copy())
         return Revision(before, self.applied)
 
@@ -157,3 +159,8 @@ class SelfCalibration:
         if self._open is not None:
             evidence.append(self._open.scaled(1 / self._motion.inflation))
         self._solution = solve(self._prior, offset_sigma(self.model), residual_variance(), evidence)
+
+
+def _mean_variance(changes: Array, covariance: Array) -> float:
+    """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
+    return float(np.einsum("ni,ij,nj->n", changes, covariance, changes).mean())
