@@ -21,6 +21,7 @@ from slam.errors import MeasurementError
 from slam.geometry.arrays import Array
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
+from slam.geometry.arrays import IndexArray as IndexArray
 from slam.object_data import MovingObject
 from slam.showing import count, of_shapes, point
 

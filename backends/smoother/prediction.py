@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.measurement_log import IndexArray, Path
+from backends.smoother.path import Path
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from backends.smoother.uncertainty import PoseSet, quadratic
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.models import EstimatorModels
 

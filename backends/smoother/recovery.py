@@ -3,7 +3,7 @@
 The prediction is then at fault, and not they. It may be so far off that the solution is not found from there: then the
 pose on which the landmarks agree, wherever they stand, is a better place to start from. Or the camera is where its own
 past says it cannot be: the poses were wrong for a while, in a stretch with next to nothing to see. Then the problem
-starts anew with that pose among the landmarks (`PoseGraph.start_anew`), and the poses before it stay as they are.
+starts anew with that pose among the landmarks (`FactorGraph.start_anew`), and the poses before it stay as they are.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the problem shall start anew in any case (`PoseGraph.lost`).
+        lost: whether the problem shall start anew in any case (`Belief.lost`).
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):

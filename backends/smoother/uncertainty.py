@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backends.smoother.measurement_log import IndexArray, Landmarks, Measurements
+from backends.smoother.landmarks import Landmarks
+from backends.smoother.measurement_log import Measurements
 from backends.smoother.stereo import RectifiedStereo
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
 #: Landmarks are refined until another step would lessen their sum of squares by less than this, in at most so many.
