@@ -41,6 +41,7 @@ from slam.objects.metrics import labels_in_images, score_for
 
 BACKENDS = ("ekf", "smoother")
 FACTORS = (0.5, 2.0)
+_ORDER = ("backends", "slam/objects", "slam/tracking", "slam/mapping", "slam/geometry", "slam/calibration")
 _PERTURBATIONS = 6  # runs of the default with noise, for the scatter
 _PIXEL_NOISE = 0.05  # [px]
 _LOST = 20.0  # times the error of the default: the run has lost its way
@@ -334,6 +335,7 @@ def main() -> int:
     names = frozenset(p.name for p in wanted)
     count = 1 if arguments.quick else len(cases())
     defaults = [Default.of(i, b, names) for i in range(count) for b in BACKENDS]
+    wanted.sort(key=lambda p: [p.file.startswith(room) for room in _ORDER].index(True))
     wanted = [p for p in wanted if any(is_read(p, d.read) for d in defaults)][: 1 if arguments.quick else None]
     if "scatter" not in table:
         table["scatter"] = scatter(defaults, 1 if arguments.quick else _PERTURBATIONS)
