@@ -277,6 +277,11 @@ class FrameStatus(StrEnum):
     PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
     FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
 
+    @property
+    def measured(self) -> bool:
+        """Whether the pose was measured; accuracy is that of such frames alone."""
+        return self in (FrameStatus.STARTED, FrameStatus.TRACKED)
+
 
 @dataclass(frozen=True)
 class FrameResult:
