@@ -13,7 +13,7 @@ from backends.ekf.covariance import POSE
 from backends.ekf.landmarks import far_charts
 from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
 from backends.ekf.motion import motion_noise
-from backends.ekf.recovery import agreement, landmarks_pose
+from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import FilterState
 from slam.checks import require_guess, require_stamp
@@ -28,6 +28,7 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
+from slam.tracking.agreement import landmarks_pose
 
 #: By how much an impulse may exceed its standard deviation where most observations say so.
 _SURPRISES = (3.0, 10.0)
@@ -268,7 +269,8 @@ class EkfBackend:
     def _landmarks_pose(self, problem: Problem, slots: IndexArray) -> Array | None:
         """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""
         T = self._state.pose() if problem.guess is None else self._state.pose_after(problem.guess)
-        T_world_left = landmarks_pose(self.rig, self._state.landmarks.points[slots], problem, T, len(self._stamps))
+        points = self._state.landmarks.points[slots]
+        T_world_left = landmarks_pose(self.rig, points, problem.z, self.models, T, len(self._stamps))
         return None if T_world_left is None else self._state.change_to(T_world_left)
 
     def _require_started(self, what: str) -> None:

@@ -18,7 +18,7 @@ from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.objects import ObjectSmoother
 from backends.smoother.prediction import PredictedPoints, PredictedPose, normalised_innovation, residual_noise
-from backends.smoother.recovery import Agreement, agreement, landmarks_pose, world_covariance
+from backends.smoother.recovery import Agreement, agreement, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.checks import require_guess, require_stamp
@@ -33,6 +33,7 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
+from slam.tracking.agreement import landmarks_pose
 
 
 class SmootherBackend:

@@ -25,6 +25,7 @@ from backends.smoother.variables import pose_key
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
+from slam.tracking.agreement import CONFIRMED
 
 
 class Belief:
@@ -100,11 +101,11 @@ class Belief:
 
         No linearisation holds for the landmarks that it measured then.
         """
-        window, path, enough = self.window(), self._log.path, recovery.CONFIRMED
+        window, path = self.window(), self._log.path
         if not len(window) or not path.measured or not recovery.unknown_turn(window.covariance[-6:, -6:]):
             return False
         newest = path.measured[-1]
-        if np.count_nonzero(self._log.measurements.frame == newest) < enough:
+        if np.count_nonzero(self._log.measurements.frame == newest) < CONFIRMED:
             return False
         with suppress(SolverError):  # the oldest pose, where it is held, may be turned in the world by any angle
             return recovery.unknown_turn(self._graph.solver.joint_covariance([pose_key(newest)]))
