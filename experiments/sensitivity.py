@@ -52,10 +52,11 @@ _UNCOVERED = 0.5  # share of the default's frames with a body below which bodies
 
 @dataclass(frozen=True)
 class Case:
-    """A short sequence: its text, and how many frames of it."""
+    """A short sequence: its text, how many frames of it, and its name in the table."""
 
     text: str
     frames: int
+    name: str
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ class Errors:
 
 def cases() -> list[Case]:
     """Two worlds with moving bodies, and a drive where the data are there."""
-    found = [Case("synthetic:box?frames=20", 20), Case("synthetic:street?frames=16", 16)]
+    found = [Case("synthetic:box?frames=20", 20, "box"), Case("synthetic:street?frames=16", 16, "street")]
     data = os.environ.get("SLAM_DATA")
     drive = Path(data) / "kitti_odometry" / "sequences" / "06" if data else None
-    return found + ([Case(str(drive), 15)] if drive is not None and drive.is_dir() else [])
+    return found + ([Case(str(drive), 15, "KITTI 06")] if drive is not None and drive.is_dir() else [])
 
 
 @cache
@@ -133,6 +134,11 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
 
 
 # --- which constants a run reads ---
+
+
+def name_of(parameter: Parameter) -> str:
+    """The key of a constant in the table."""
+    return f"{parameter.module}:{parameter.name}"
 
 
 @cache
@@ -336,12 +342,15 @@ def main() -> int:
     count = 1 if arguments.quick else len(cases())
     defaults = [Default.of(i, b, names) for i in range(count) for b in BACKENDS]
     wanted.sort(key=lambda p: [p.file.startswith(room) for room in _ORDER].index(True))
-    wanted = [p for p in wanted if any(is_read(p, d.read) for d in defaults)][: 1 if arguments.quick else None]
+    unread = [p for p in wanted if not any(is_read(p, d.read) for d in defaults)]
+    wanted = [p for p in wanted if p not in unread][: 1 if arguments.quick else None]
     if "scatter" not in table:
         table["scatter"] = scatter(defaults, 1 if arguments.quick else _PERTURBATIONS)
-    table["cases"] = [f"{c.text.rsplit('/', 1)[-1]}" for c in cases()[:count]]
+    table["cases"] = [c.name for c in cases()[:count]]
+    table["ratios"] |= {name_of(p): [{"camera": "not read", "bodies": "not read"}] * len(FACTORS) for p in unread}
+    table["complete"] = False
     for parameter in wanted:
-        name = f"{parameter.module}:{parameter.name}"
+        name = name_of(parameter)
         if name in table["ratios"]:
             continue
         table["ratios"][name] = [{"camera": "fails", "bodies": "fails"}] * len(FACTORS)  # where the process ends here
@@ -349,7 +358,9 @@ def main() -> int:
         table["ratios"][name] = [ratios(parameter, factor, defaults) for factor in FACTORS]
         file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
         print(name, table["ratios"][name], flush=True)
-    print(f"{len(table['ratios'])} constants are read; scatter {table['scatter']}")
+    table["complete"] = not arguments.only and not arguments.quick
+    file.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    print(f"{len(table['ratios'])} constants; scatter {table['scatter']}")
     return 0
 
 

@@ -202,11 +202,11 @@ class Covariance:
         Phi[rows] += by_pose @ Phi[:POSE]
 
     def append(self, J: Array, noise: Array) -> None:
-        """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
+        """Add landmarks that depend on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
 
         Args:
             J: derivatives (M, 3, 6) of the landmarks by [r, φ].
-            noise: covariances (M, 3, 3) of what does not hang on it.
+            noise: covariances (M, 3, 3) of what is independent of it.
         """
         by_pose, new = J.reshape(-1, POSE), np.arange(self.count, self.count + len(J))
         cross = by_pose @ self._local[:POSE]

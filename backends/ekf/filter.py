@@ -30,8 +30,8 @@ from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.agreement import landmarks_pose
 
-#: By how much an impulse may exceed its standard deviation where most observations say so.
-_SURPRISES = (3.0, 10.0)
+#: Process-noise inflation: factors of the impulses' standard deviation, tried where most observations disagree.
+_INFLATION = (3.0, 10.0)
 _PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
 _VAGUE = 1e3  # deviation of an innovation, in those of a pixel, above which all of P is brought up to date
@@ -102,7 +102,9 @@ class EkfBackend:
         self._state.make_local(slots)
         problem = self._problem(observations, slots, guess)
         try:
-            found = agreement(problem, self._surprises(), lambda: self._landmarks_pose(problem, slots), self.models)
+            found = agreement(
+                problem, self._inflated_noises(), lambda: self._landmarks_pose(problem, slots), self.models
+            )
             if found is None:
                 reason = "no observation, or only a minority, agrees with the prediction"
                 return UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids)
@@ -259,12 +261,12 @@ class EkfBackend:
             None if guess is None else state.change_to(guess), state.by_world(slots) if state.consistent else None,
         )  # fmt: skip
 
-    def _surprises(self) -> list[Array]:
-        """Motion noises (12, 12) beyond what the model expects of the last step."""
+    def _inflated_noises(self) -> list[Array]:
+        """Motion noises (12, 12) of the last step, inflated."""
         if len(self._stamps) < 2:
             return []
         noise = motion_noise(self.models, self._stamps[-1] - self._stamps[-2])
-        return [factor**2 * noise for factor in _SURPRISES]
+        return [factor**2 * noise for factor in _INFLATION]
 
     def _landmarks_pose(self, problem: Problem, slots: IndexArray) -> Array | None:
         """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""

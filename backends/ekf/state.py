@@ -217,7 +217,7 @@ class FilterState:
         """What the bodies need to know of the camera."""
         return CameraBelief(self.pose(), self.pose_jacobian(), self.covariance.columns(np.zeros(0, np.intp)))
 
-    # --- displacements of the whole world, which nothing measures ---
+    # --- displacements of the whole world, which are unobservable ---
 
     def by_world(self, slots: IndexArray) -> Array:
         """Derivatives (6 + 3M, 6) of [r, φ, landmarks] by a displacement of the world."""
@@ -233,7 +233,7 @@ class FilterState:
     def _transport(self, before: Array) -> None:
         """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
 
-        Nothing measures a displacement of camera and landmarks together. What it changes in each coordinate depends on
+        A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
         the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
         that goes on with the same covariance believes to have measured such displacements, in time very well (Huang,
         Mourikis and Roumeliotis, 2010). So the error is taken to be the displacement, in old coordinates and in new,

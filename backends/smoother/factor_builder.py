@@ -101,9 +101,9 @@ class FactorBuilder:
         track.restart()
 
     def _known(self, slot: int) -> Known | None:
-        """What was known of a landmark beforehand, as long as what it hangs on is in the solver."""
+        """What was known of a landmark beforehand, as long as the pose that it is relative to is in the solver."""
         known = self.log.history.known.get(int(self.log.landmarks.serial[slot]))
-        return None if known is None or known.hangs_before(self.log.history.first) else known
+        return None if known is None or known.is_before(self.log.history.first) else known
 
     def _enter_known(self, change: Change, slots: IndexArray) -> None:
         """Give landmarks that were known beforehand variables of their own, where they have none yet."""

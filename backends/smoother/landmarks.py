@@ -78,8 +78,8 @@ class Known:
     frame: int | None = None
     seen: bool = True
 
-    def hangs_before(self, first: int) -> bool:
-        """Whether it hangs on a camera before frame `first`."""
+    def is_before(self, first: int) -> bool:
+        """Whether it is relative to the camera of a frame before `first`."""
         return self.frame is not None and self.frame < first
 
 

@@ -76,7 +76,7 @@ class History:
         places: where each of those was believed to be at first.
         variables: number of landmark variables that were ever made, for their names.
         known: what was known of landmarks beforehand, by serial number.
-        restarted: the poses of so many frames from the first on hang on each other as they are, without measurements.
+        restarted: so many of the first frames keep their relative poses as they are: their measurements are forgotten.
     """
 
     def __init__(self) -> None:
@@ -171,14 +171,14 @@ class MeasurementLog:
         marks.last[slots] = frame
         fixed = marks.prior[slots].any(axis=(1, 2))  # they are known in the world
         marks.covariance[slots[~fixed]] = covariances[~fixed]
-        hanging = slots[~fixed]
-        local = (marks.position[hanging] - T[:3, 3]) @ T[:3, :3]
-        covariances = T[:3, :3].T @ marks.covariance[hanging] @ T[:3, :3]
-        marks.older[hanging] = np.linalg.inv(marks.covariance[hanging])
+        relative = slots[~fixed]
+        local = (marks.position[relative] - T[:3, 3]) @ T[:3, :3]
+        covariances = T[:3, :3].T @ marks.covariance[relative] @ T[:3, :3]
+        marks.older[relative] = np.linalg.inv(marks.covariance[relative])
         # What is not known by as much as its distance is measured anew, as if it were new.
         known = np.trace(covariances, axis1=1, axis2=2) < (local**2).sum(axis=1)
-        hanging, local, covariances = hanging[known], local[known], covariances[known]
-        for serial, position, covariance in zip(marks.serial[hanging].tolist(), local, covariances):
+        relative, local, covariances = relative[known], local[known], covariances[known]
+        for serial, position, covariance in zip(marks.serial[relative].tolist(), local, covariances):
             history.known[serial] = Known(position, covariance, frame, seen=False)
         self._forget_unused_measurements()
 
@@ -222,7 +222,7 @@ class MeasurementLog:
         self.measurements.keep(used[:-1])
 
     def forget_measurements(self) -> None:
-        """Let all poses hang on each other as they are; landmarks stay where they are and are measured anew."""
+        """Keep all relative poses and the landmarks' positions as they are, without the measurements behind them."""
         history = self.history
         history.finished, history.explicit, history.places, history.owner = [], {}, {}, {}
         history.restarted = self.path.count

@@ -27,7 +27,7 @@ def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[
     for key, all_rows in log.history.explicit.items():
         add_landmark(change, make, log, key, np.array(all_rows, np.intp), log.history.places[key])
         known = log.history.known.get(log.history.owner[key])
-        if known is not None and not known.hangs_before(log.history.first):
+        if known is not None and not known.is_before(log.history.first):
             change.factors.add(make.known(key, known))
     places = []
     for track in log.landmarks.tracks.values():

@@ -112,7 +112,7 @@ class Collector:
         """All figures.
 
         Args:
-            final: the last word on the path.
+            final: the path as estimated at the end.
             ids: landmarks in the map at the end (N,).
             positions: where they are (N, 3) [m].
             summary: of the run, for what it says of objects; may be empty.

@@ -142,7 +142,7 @@ def _adjoints(T: Array) -> Array:
 def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma: float) -> Array:
     """How well a frame's measurements of landmarks at `local` (M, 3) fix the camera before them: covariance (6, 6).
 
-    Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinitely vague where they do not fix it.
+    Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinite where they do not fix it.
     """
     _, J = rig.project_stereo(local)
     by_pose = J @ points_by_pose(local)

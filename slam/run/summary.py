@@ -77,7 +77,7 @@ class Replayed:
     record: RunRecord
 
     def trajectory(self) -> Trajectory:
-        """The back end's last word on every frame."""
+        """The back end's final estimate of every frame's pose."""
         return self.backend.trajectory()
 
     def estimate(self) -> Estimate:
