@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from backends.smoother import SmootherBackend
 from backends.smoother.config import SmootherConfig
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
 from backends.smoother.solver import FAILURES, Change
 from backends.smoother.variables import landmark_key, pose_key
-from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform

@@ -88,7 +88,7 @@ def accuracy_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
 
 
 def consistency_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
-    """Each mean beside its band; the mean over a run has the band of one frame, as its frames hang together."""
+    """Each mean beside its band; the mean over a run has the band of one frame, as its frames are correlated."""
     n = len(done)
     low, high = chi_square_band(6, n)
     for name in BACKENDS:

@@ -1,4 +1,4 @@
-"""What faults do to a run: blackout, dropped frames, dropped right images, and a camera that is carried off.
+"""What faults do to a run: blackout, dropped frames, dropped right images, and a kidnapped camera.
 
     python experiments/faults.py [--quick] [--out DIR]
 
@@ -33,7 +33,7 @@ from slam.system import StereoSlam
 BACKENDS = ("ekf", "smoother")
 HEADER = (
     "fault", "back end", "states", "error before [cm]", "mean after [cm]", "peak after [cm]", "end [cm]",
-    "frames until recognised", "right associations [%]", "added while lost",
+    "frames until relocalised", "right associations [%]", "added while lost",
 )  # fmt: skip
 
 
@@ -66,8 +66,8 @@ def faults(quick: bool) -> list[Fault]:
         Fault(f"{dark / 30:.2g} s of blackout", f"frames={2 * n + dark}&black={n}:{n + dark}", n - 1, n + dark),
         Fault("30 % of frames dropped", f"frames={2 * n}&drop=0.3", n // 2, n // 2 + 1),
         Fault("30 % of right images dropped", f"frames={2 * n}&dropright={chosen}", n, n + 1),
-        Fault("carried off to a known place", "frames=900", n - 1, n, (n, 12 if quick else 30)),
-        Fault("carried off to an unknown place", "frames=900", n - 1, n, (n, 450)),
+        Fault("kidnapped to a known place", "frames=900", n - 1, n, (n, 12 if quick else 30)),
+        Fault("kidnapped to an unknown place", "frames=900", n - 1, n, (n, 450)),
     ]
     return [every[1], every[3], every[4]] if quick else every
 

@@ -51,7 +51,7 @@ class Drive:
     Attributes:
         results: of the frames, without their features.
         atlas: at the end.
-        final: the last word on the path.
+        final: the path as estimated at the end.
         truth: in the axes of its first pose (F, 4, 4).
         memory: bytes that each frame leaves, the results that are kept here included.
     """
@@ -170,7 +170,7 @@ def worlds(given: argparse.Namespace) -> dict[str, str]:
 
 
 def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
-    """The paths from above: true, without loops, and the last word; loops as circles."""
+    """The paths from above: true, without loops, and as estimated at the end; loops as circles."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, len(runs), figsize=(5 * len(runs), 5), squeeze=False, layout="constrained")

@@ -30,10 +30,16 @@ Every number in the algorithms that is not a setting, with what it is and where 
 """
 
 SENSITIVITY = """\
-The columns ½ and 2 say what happens to the position error where the number is half and twice as large: the ratio to the
-error with the default, the worse of both back ends, as the geometric mean over short runs of three worlds and a drive
-(`python experiments/sensitivity.py`). The runs with small perturbations of the pixels scatter by the factor that stands
-above the table: what lies inside that does not matter. "fails" means that a run did not end or lost its way.
+The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position,
+and that of the bodies' motion, each as a ratio to the error with the default. It is the worse of both back ends, and
+the geometric mean over short runs of {cases} (`python experiments/sensitivity.py`). Under small perturbations of the
+pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose ratios lie within does not matter
+there.
+
+- "same": the same bytes.
+- "fails": a run did not end, or lost the camera or the bodies.
+- "not read": none of these runs comes to the code that reads the number, as that for faults and long runs.
+- Empty: not measured. Such numbers are compiled into kernels, read on import, or belong to the front end{rest}.
 """
 
 
@@ -122,10 +128,9 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
     ratios = sensitivity.get("ratios", {})
     lines = [INTRODUCTION]
     if ratios:
-        lines += [
-            SENSITIVITY,
-            f"Scatter of the default under perturbation: a factor of {sensitivity['scatter']:.2f}.\n",
-        ]
+        rest = "" if sensitivity["complete"] else ", or their runs are still to be made"
+        cases = ", ".join(f"`{case}`" for case in sensitivity["cases"])
+        lines.append(SENSITIVITY.format(cases=cases, rest=rest, **sensitivity["scatter"]))
     titles = ["file", "name", "value", "what it is", *(["½", "2"] if ratios else [])]
     rule = ["---", "---", "---:", "---", *(["---:", "---:"] if ratios else [])]
     for room in ROOMS:
@@ -134,7 +139,7 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
             continue
         lines += [f"## {room}\n", _row(titles), _row(rule)]
         for p in chosen:
-            measured = ratios.get(f"{p.module}:{p.name}", ["", ""]) if ratios else []
+            measured = ratios.get(f"{p.module}:{p.name}", [{}, {}]) if ratios else []
             cells = [p.file.removeprefix(room + "/"), f"`{p.name}`", str(p.value), p.comment.replace("|", "\\|")]
             lines.append(_row([*cells, *map(_ratio, measured)]))
         lines.append("")
@@ -145,10 +150,10 @@ def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _ratio(value: Any) -> str:
-    if value == "":
-        return ""
-    return "fails" if value is None else f"{value:.2f}"
+def _ratio(measured: dict[str, float | str]) -> str:
+    """The ratios of the camera's and the bodies' errors, or what happened instead."""
+    values = [f"{v:.2f}" if isinstance(v, float) else v for v in measured.values()]
+    return " / ".join(values[:1] if len(set(values)) == 1 and isinstance(measured["camera"], str) else values)
 
 
 def main() -> int:

@@ -90,7 +90,7 @@ EXPERIMENTS = (
     Experiment(
         "policies", "Policies of map management", arguments=("--frames", "930:1050", "--seeds", "6", "--processes", "1")
     ),
-    Experiment("faults", "Blackout, dropped frames, a camera that is carried off"),
+    Experiment("faults", "Blackout, dropped frames, a kidnapped camera"),
     Experiment("frame_rate", "What a frame rate costs in accuracy"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
     Experiment("loops", "Long drives that come back: loops closed"),

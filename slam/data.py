@@ -21,6 +21,7 @@ from slam.errors import MeasurementError
 from slam.geometry.arrays import Array
 from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
+from slam.geometry.arrays import IndexArray as IndexArray
 from slam.object_data import MovingObject
 from slam.showing import count, of_shapes, point
 
@@ -275,6 +276,11 @@ class FrameStatus(StrEnum):
     LOST = "lost"  #: no match for several frames: the pose is predicted only, and may be far off
     PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
     FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
+
+    @property
+    def measured(self) -> bool:
+        """Whether the pose was measured; accuracy is that of such frames alone."""
+        return self in (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class LandmarkRows:
         seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
         out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
         unseen: number of frames since it was last measured (N,), of those in which any landmark was measured and this
-            one was not held back.
+            one was not left out as possibly moving.
     """
 
     ids: IdArray

@@ -22,9 +22,9 @@ class EkfConfig:
             updates where the first is not linear to within the noise.
         landmarks: coordinates of a landmark in the state: ``"inverse_depth"`` by the camera that saw it first, or
             ``"euclidean"`` in the world, as the papers do. See `backends.ekf.landmarks`.
-        consistent: keep what nothing measures, where the world's origin is and which way it faces, from seeming to be
-            measured, by referring the covariance to the corrected state after each update. With stereo measurements
-            only.
+        consistent: keep the unobservable pose of the whole map (where the world's origin is and which way it faces)
+            from seeming to be measured: the covariance is transported to the corrected state after each update. With
+            stereo measurements only.
 
     The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``, printed as it is there.
 

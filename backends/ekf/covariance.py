@@ -21,16 +21,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 from scipy.linalg.lapack import dpstrf
 
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
 CAMERA = 12  #: size of the camera's state [r, φ, v, ω]
 POSE = 6  #: its part [r, φ] that measurements depend on
-
-SlotArray = NDArray[np.intp]
 
 _LOCAL = 150  # rows of the local part that are never too many
 _WHOLE = 2.5  # all are local where the state has at most so many times the rows of what is measured,
@@ -105,7 +103,7 @@ class Covariance:
         np.fill_diagonal(full, lower.diagonal())
         return full
 
-    def of_landmarks(self, slots: SlotArray) -> tuple[Array, Array]:
+    def of_landmarks(self, slots: IndexArray) -> tuple[Array, Array]:
         """Marginal covariances (M, 3, 3) of landmarks, and their covariances (M, 3, 6) with the camera's [r, φ]."""
         place = self._place[slots]
         near, far = place >= 0, place < 0
@@ -122,11 +120,11 @@ class Covariance:
         return blocks, cross
 
     @property
-    def local(self) -> SlotArray:
+    def local(self) -> IndexArray:
         """Slots of the local landmarks, in the order in which they became so."""
         return self._slots
 
-    def make_local(self, slots: SlotArray) -> SlotArray:
+    def make_local(self, slots: IndexArray) -> IndexArray:
         """Let landmarks join the local part, which is stored first where it gets too large; returns who has joined.
 
         Where a good part of all is measured, all become local: that costs less than to carry the rest along.
@@ -146,26 +144,26 @@ class Covariance:
             self._Phi, self._Psi = self._Phi[:, :0], self._Psi[:0, :0]
         return far
 
-    def marginal(self, slots: SlotArray) -> Array:
+    def marginal(self, slots: IndexArray) -> Array:
         """The covariance (6 + 3M, 6 + 3M) of ``g = [r, φ, landmarks]``; these are local."""
         g = self._rows(slots)
         return self._local[g[:, None], g]
 
-    def columns(self, slots: SlotArray) -> Array:
+    def columns(self, slots: IndexArray) -> Array:
         """Covariance (size, 6 + 3M) of the whole state with ``g = [r, φ, landmarks]``; these are local."""
         g = self._rows(slots)
         out = self._X[: self.size] @ self._Phi[g].T
         out[self._own_rows()] = self._local[:, g]
         return np.asarray(out)
 
-    def times(self, slots: SlotArray, s: Array) -> Array:
+    def times(self, slots: IndexArray, s: Array) -> Array:
         """``P[:, g] s`` (size,), g as above."""
         g = self._rows(slots)
         out = self._X[: self.size] @ (s @ self._Phi[g])
         out[self._own_rows()] = s @ self._local[g]
         return np.asarray(out)
 
-    def subtract(self, slots: SlotArray, whitened: Callable[[Array], Array]) -> None:
+    def subtract(self, slots: IndexArray, whitened: Callable[[Array], Array]) -> None:
         """``P ← P − Wᵀ W`` with ``W = B P[g, :]``, g as above; `whitened` gives ``B X`` (K, N) for X (6 + 3M, N)."""
         g = self._rows(slots)
         W = whitened(self._local[g])
@@ -204,11 +202,11 @@ class Covariance:
         Phi[rows] += by_pose @ Phi[:POSE]
 
     def append(self, J: Array, noise: Array) -> None:
-        """Landmarks that hang on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
+        """Add landmarks that depend on the camera's [r, φ] (paper A, Eq. 10): ``Y = g(r, φ) + noise``. They are local.
 
         Args:
             J: derivatives (M, 3, 6) of the landmarks by [r, φ].
-            noise: covariances (M, 3, 3) of what does not hang on it.
+            noise: covariances (M, 3, 3) of what is independent of it.
         """
         by_pose, new = J.reshape(-1, POSE), np.arange(self.count, self.count + len(J))
         cross = by_pose @ self._local[:POSE]
@@ -224,7 +222,7 @@ class Covariance:
             self._resize()
         self._join(new, cross, own, by_pose @ self._Phi[:POSE])
 
-    def drop(self, slots: SlotArray) -> tuple[SlotArray, SlotArray]:
+    def drop(self, slots: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Take landmarks out; the last ones move into their slots.
 
         Args:
@@ -261,18 +259,18 @@ class Covariance:
 
     # --- the local part ---
 
-    def _rows(self, slots: SlotArray) -> SlotArray:
+    def _rows(self, slots: IndexArray) -> IndexArray:
         """Rows (6 + 3M,) of [r, φ, landmarks] in the local part."""
         g = np.empty(POSE + 3 * len(slots), np.intp)
         g[:POSE] = np.arange(POSE)
         g[POSE:].reshape(-1, 3)[:] = CAMERA + 3 * self._place[slots][:, None] + _THREE
         return g
 
-    def _own_rows(self) -> SlotArray:
+    def _own_rows(self) -> IndexArray:
         """Rows of the whole state that the local part holds."""
         return np.concatenate([np.arange(CAMERA), (CAMERA + 3 * self._slots[:, None] + _THREE).reshape(-1)])
 
-    def _fetch(self, slots: SlotArray) -> None:
+    def _fetch(self, slots: IndexArray) -> None:
         """Landmarks of the rest join the local part."""
         rows = (CAMERA + 3 * slots[:, None] + _THREE).reshape(-1)
         X = self._X[rows]
@@ -285,7 +283,7 @@ class Covariance:
         self._Phi[:, :n], self._Psi[:n, :n] = Phi, Psi
         self._join(slots, X @ Phi.T, stored[rows] + by_base @ X.T, np.concatenate([by_base, np.eye(k)], axis=1))
 
-    def _join(self, slots: SlotArray, cross: Array, own: Array, Phi: Array) -> None:
+    def _join(self, slots: IndexArray, cross: Array, own: Array, Phi: Array) -> None:
         """Enlarge the local part by landmarks with covariances `cross` with it and `own`."""
         old = len(self._local)
         larger = np.empty((old + len(own), old + len(own)))
@@ -319,7 +317,7 @@ class Covariance:
 
     # --- the stored matrix ---
 
-    def _gather(self, slots: SlotArray) -> Array:
+    def _gather(self, slots: IndexArray) -> Array:
         """Columns (capacity, 3M) of P⁰."""
         P, starts = self._P, CAMERA + 3 * slots
         rows = np.empty((3 * len(slots), len(P)))  # the transposed result: each row is written in one go

@@ -16,11 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray
+from slam.data import IdArray, IndexArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, hat
-
-SlotArray = NDArray[np.intp]
 
 _FARTHEST = 1e-6  # least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
@@ -171,7 +169,7 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def slots(self, ids: IdArray | Sequence[int]) -> SlotArray:
+    def slots(self, ids: IdArray | Sequence[int]) -> IndexArray:
         """Slots (M,) of landmarks; raises MeasurementError for one that is not in the map."""
         try:
             return np.array([self._slots[int(i)] for i in ids], np.intp)
@@ -196,7 +194,7 @@ class Landmarks:
         self.gauge_jacobian = np.concatenate([self.gauge_jacobian, gauge_jacobian])
         return inverse
 
-    def remove(self, ids: IdArray, holes: SlotArray, movers: SlotArray) -> None:
+    def remove(self, ids: IdArray, holes: IndexArray, movers: IndexArray) -> None:
         """Forget landmarks; `holes` are filled from `movers`, as the covariance has done (`Covariance.drop`)."""
         left, gone = len(self) - len(ids), set(ids.tolist())
         moved = dict(zip(self.ids[movers].tolist(), holes.tolist()))
@@ -215,7 +213,7 @@ class Landmarks:
         self.state = self.coordinates.moved(self.state, change)
         self.points = self.coordinates.points(self.anchors, self.state)
 
-    def transport(self, slots: SlotArray) -> Array:
+    def transport(self, slots: IndexArray) -> Array:
         """Let `gauge_jacobian` be that of the present coordinates; returns the change (M, 3, 6)."""
         now = self._derivatives(self.anchors[slots], self.state[slots], self.points[slots])[1]
         change = now - self.gauge_jacobian[slots]
@@ -228,7 +226,7 @@ class Landmarks:
         inverse = self.coordinates.inverse_jacobian(anchors, c)
         return inverse, np.concatenate([inverse, -inverse @ hat(points)], axis=2)
 
-    def jacobian(self, slots: SlotArray) -> Array:
+    def jacobian(self, slots: IndexArray) -> Array:
         """Derivatives (M, 3, 3) of positions by coordinates."""
         return self.coordinates.jacobian(self.anchors[slots], self.state[slots])
 

@@ -13,21 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import bdtrc, gammainc, gammaincinv
+from scipy.special import bdtrc
 
 from backends.ekf.covariance import POSE
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
-from slam.geometry.pnp import find_consensus
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.tracking.gating import chi_square_limits
-
-ENOUGH = 6  #: observations that can be judged to agree with each other
-_HEEDED = 3  # one in so many observations is enough to agree with a prediction
-_CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
-_HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
-_AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
+from slam.tracking.agreement import CONFIRMED, ENOUGH, HEEDED, share_by_chance
 
 #: The change of [r, φ] (6,) to a pose on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
@@ -87,22 +79,17 @@ def _heeded(problem: Problem, gated: Gated, noise: Array | None) -> Agreement | 
     if solution is None:
         return None
     used, few = int(solution.used.sum()), len(problem.z) < ENOUGH
-    if not few and _HEEDED * used < len(problem.z) and _by_chance(gated, used, problem):
+    if not few and HEEDED * used < len(problem.z) and _by_chance(gated, used, problem):
         return None
     return Agreement(problem, solution, noise)
 
 
 def _by_chance(gated: Gated, used: int, problem: Problem) -> bool:
-    """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
-
-    Wrong observations are taken to be spread about their predictions as those that are rejected: that says what share
-    of them passes the gate.
-    """
+    """Whether so many wrong observations may pass the gate as agree, at the gate's own level."""
     rejected = gated.distances[~gated.used & np.isfinite(gated.distances)]
     if not len(rejected):
         return True
-    spread = float(np.median(rejected)) / (2 * gammaincinv(1.5, 0.5))  # in units of the innovation covariances
-    share = gammainc(1.5, float(gated.limits.max()) / spread / 2)
+    share = share_by_chance(rejected, float(gated.limits.max()))
     return bool(bdtrc(used - 1, len(problem.z), share) > 1 - problem.gate_probability)
 
 
@@ -126,7 +113,7 @@ def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, A
 
 def _restarted(problem: Problem, search: Search, models: EstimatorModels) -> Agreement | None:
     """With a camera that is where the landmarks say, wherever it was before; None where most do not agree with it."""
-    least = max(_CONFIRMED, _half(problem))
+    least = max(CONFIRMED, _half(problem))
     change = search() if len(problem.z) >= least else None
     if change is None:
         return None
@@ -160,19 +147,3 @@ def restart_noise(change: Array, models: EstimatorModels) -> Array:
         ], 3,
     )  # fmt: skip
     return np.diag(sigmas**2)
-
-
-def landmarks_pose(rig: StereoRig, points: Array, problem: Problem, T_world_left: Array, seed: int) -> Array | None:
-    """The pose (4, 4) on which most landmarks agree, and at least five; None where there is none.
-
-    Args:
-        rig: the cameras.
-        points: the landmarks (M, 3) in the world [m].
-        problem: the update.
-        T_world_left: pose (4, 4) to begin with.
-        seed: of the random choice.
-    """
-    threshold = problem.sigma * np.sqrt(_AS_NEW * chi_square_limits(np.array([3]), problem.gate_probability)[0])
-    found = find_consensus(rig, points, problem.z, T_world_left, float(threshold), _HYPOTHESES, seed)
-    enough = found.inliers.sum() >= max(_CONFIRMED, _half(problem))
-    return found.T_world_left if enough and np.isfinite(found.T_world_left).all() else None

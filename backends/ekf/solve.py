@@ -67,9 +67,9 @@ class Problem:
 
     @cached_property
     def displacement(self) -> Displacement | None:
-        """What nothing measures, or None where the landmarks are known exactly.
+        """The unobservable part of a change: a displacement of the whole world. None where landmarks are known exactly.
 
-        It is that of all landmarks which explains their change best, given how well they are known to each other.
+        Of all displacements it is the one that explains the landmarks' change best, given their covariance.
         """
         if self.gauge_jacobian is None:
             return None

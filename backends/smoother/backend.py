@@ -1,4 +1,4 @@
-"""The smoother back end: the protocol on top of the pose graph."""
+"""The smoother back end: the protocol on top of the factor graph and the belief that follows from it."""
 
 from __future__ import annotations
 
@@ -11,25 +11,18 @@ import gtsam
 import numpy as np
 
 from backends.smoother import pose_only
+from backends.smoother.belief import Belief
 from backends.smoother.config import SmootherConfig
-from backends.smoother.graph import FactorMaker
-from backends.smoother.measurement_log import IndexArray, MeasurementLog
+from backends.smoother.factor_graph import FactorGraph
+from backends.smoother.factors import FactorMaker
+from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.objects import ObjectSmoother
-from backends.smoother.pose_graph import PoseGraph
-from backends.smoother.prediction import (
-    PredictedPoints,
-    PredictedPose,
-    first_pose,
-    normalised_innovation,
-    predict_points,
-    predict_pose,
-    residual_noise,
-)
-from backends.smoother.recovery import Agreement, agreement, landmarks_pose, world_covariance
+from backends.smoother.prediction import PredictedPoints, PredictedPose, normalised_innovation, residual_noise
+from backends.smoother.recovery import Agreement, agreement, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
 from slam.checks import require_guess, require_stamp
-from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import CopyError, MeasurementError
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
@@ -40,13 +33,14 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
+from slam.tracking.agreement import landmarks_pose
 
 
 class SmootherBackend:
     """ISAM2 over smart stereo factors: all poses are estimated together and revised with every frame.
 
     The motion model is the papers' (see `backends.smoother.motion`). Which landmarks are eliminated and which are
-    variables: see `backends.smoother.pose_graph`. Covariances: see `backends.smoother.uncertainty`.
+    variables: see `backends.smoother.factor_builder`. Covariances: see `backends.smoother.uncertainty`.
 
     Args:
         rig: the cameras; measurements of any rig are rectified first.
@@ -63,15 +57,15 @@ class SmootherBackend:
         self.config = from_options(SmootherConfig, "smoother", options)
         self._stereo = RectifiedStereo.of(rig)
         self._make = FactorMaker(self._stereo, models)
-        self._graph = PoseGraph(self._make, self.config)
+        self._graph = FactorGraph(self._make, self.config)
+        self._belief = Belief(self._graph, models)
         self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
         self._contradicted = 0  # updates in succession that disagreed with the path
-        self._predicted: PredictedPose | None = None  # while the newest pose is not in the graph yet
 
     @property
     def measurement_log(self) -> MeasurementLog:
         """Poses, measurements and landmarks as they are believed now; not to be changed."""
-        return self._graph.measurement_log
+        return self._graph.log
 
     @property
     def factor_maker(self) -> FactorMaker:
@@ -97,18 +91,15 @@ class SmootherBackend:
         self._commit()
         stamps = self.measurement_log.path.stamps
         require_stamp("smoother", stamp, float(stamps[-1]) if len(stamps) else None)
-        if not len(stamps) and len(self.measurement_log.landmarks):
-            predicted = first_pose(self.models, float(stamp))
-        elif not len(stamps):
+        if not len(stamps) and not len(self.measurement_log.landmarks):
             T, none = self.models.initial_pose, np.zeros((0, 2))
             with self._whole():
                 self._graph.append_pose(stamp, T)
-                P = self._graph.window().covariance.copy()
+                P = self._belief.window().covariance.copy()
                 return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
-        else:
-            predicted = predict_pose(self.models, self.measurement_log.path, self._graph.window(), stamp)
+        predicted = self._belief.predicted(stamp)
         in_view = self._in_view(predicted)
-        self._predicted = predicted  # last: an interrupted call has predicted nothing
+        self.measurement_log.path.predicted = predicted  # last: an interrupted call has predicted nothing
         return in_view
 
     @one_blas_thread
@@ -117,11 +108,11 @@ class SmootherBackend:
         self._require_started("update")
         require_guess("smoother", guess)
         slots = self.measurement_log.landmarks.slots(observations.ids)
-        predicted = self._predicted
+        predicted = self.measurement_log.path.predicted
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         z, P = self._stereo.measure(observations), predicted.covariance
-        points = self._points(predicted, slots)
+        points = self._belief.points(predicted, slots)
         try:
             found = self._solve_pose(predicted, points, slots, observations, guess)
         except np.linalg.LinAlgError as error:
@@ -132,7 +123,7 @@ class SmootherBackend:
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
         if found.jump is not None:
             predicted = replace(predicted, noise=predicted.noise + np.diag(found.jump))
-        solved = self._points(replace(predicted, T=T), slots[used])
+        solved = self._belief.points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         try:
             nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
@@ -140,10 +131,10 @@ class SmootherBackend:
             nis, dof = float("nan"), 0
         with self._whole():
             if found.jump is not None:
-                failure = self._graph.start_anew(predicted.stamp, T, world_covariance(P), slots[used], z[used])
+                before = self._belief.covariances_from_measured()
+                failure = self._graph.start_anew(predicted.stamp, T, world_covariance(P), before, slots[used], z[used])
             else:
                 failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
-            self._predicted = None
             if failure:
                 return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
             return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
@@ -177,16 +168,12 @@ class SmootherBackend:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
         self._graph.mend()
-        if landmarks and self._predicted is None:
+        if landmarks and self.measurement_log.path.predicted is None:
             self._graph.converge()
-        window, marks = self._graph.window(), self.measurement_log.landmarks
+        stamp, T, P = self._belief.newest()
+        marks = self.measurement_log.landmarks
         slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
-        covariances = self._graph.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
-        if self._predicted is not None:
-            stamp, T, P = self._predicted.stamp, self._predicted.T.copy(), self._predicted.covariance
-        else:
-            path = self.measurement_log.path
-            stamp, T, P = float(path.stamps[-1]), path.poses[-1].copy(), window.covariance[-6:, -6:].copy()
+        covariances = self._belief.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
         return Estimate(stamp, T, P, marks.ids[slots], marks.position[slots], covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -241,7 +228,7 @@ class SmootherBackend:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
         self._commit()
-        return self._objects.update(observations, self.measurement_log.path, self._graph.last_poses)
+        return self._objects.update(observations, self.measurement_log.path, self._belief.last_poses)
 
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.ObjectBackend.remove_objects`."""
@@ -266,37 +253,31 @@ class SmootherBackend:
     def _whole(self) -> Iterator[None]:
         """What is done within either happens or, where it is interrupted, does not: the measurement log is restored."""
         self._graph.mend()
-        restore, predicted = snapshot(self.measurement_log), self._predicted
+        restore = snapshot(self.measurement_log)
         try:
             yield
         except BaseException:
             self._graph.interrupted()
             restore()
-            self._predicted = predicted
             raise
 
     def _commit(self) -> None:
         """Put a predicted pose without measurements into the graph."""
-        if self._predicted is not None:
-            stamp, T = self._predicted.stamp, self._predicted.T
+        predicted = self.measurement_log.path.predicted
+        if predicted is not None:
             with self._whole():
-                self._graph.append_pose(stamp, T)
-                self._predicted = None
+                self._graph.append_pose(predicted.stamp, predicted.T)
 
     def _in_view(self, predicted: PredictedPose) -> Prediction:
         """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
         T, marks, rig = predicted.T, self.measurement_log.landmarks, self.rig
         slots = marks.used()
         slots = slots[rig.left.in_view((marks.position[slots] - T[:3, 3]) @ T[:3, :3])]
-        points = self._points(predicted, slots)
+        points = self._belief.points(predicted, slots)
         uv, J = rig.left.project_with_jacobian(points.local)
         right = rig.right.project((points.local + rig.b) @ rig.R.T)
         S = J @ points.covariance(predicted) @ np.swapaxes(J, 1, 2) + self.models.pixel_sigma**2 * np.eye(2)
         return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
-
-    def _points(self, predicted: PredictedPose, slots: IndexArray) -> PredictedPoints:
-        marks, by_window = self.measurement_log.landmarks, self._graph.landmarks_by_window(slots)
-        return predict_points(predicted, marks.position[slots], marks.covariance[slots], by_window)
 
     def _solve_pose(
         self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, observations: Observations,
@@ -306,7 +287,8 @@ class SmootherBackend:
         marks, z = self.measurement_log.landmarks, self._stereo.measure(observations)
         noise = residual_noise(self._stereo, self._make.sigma, points, z)
         known = marks.prior[slots].any()  # what is known in the world does not move with the poses
-        information = np.linalg.inv(predicted.covariance if known else predicted.covariance_to(self._last_measured()))
+        P = predicted.covariance if known else predicted.covariance_to(self._belief.last_measured())
+        information = np.linalg.inv(P)
         problem = pose_only.PoseProblem(
             self._stereo, marks.position[slots], z, noise, predicted.T, information, self.models.gate_probability
         )
@@ -315,16 +297,11 @@ class SmootherBackend:
             rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
             return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
 
-        start, lost = predicted.T if guess is None else guess, len(predicted.window) > 0 and self._graph.lost()
-        return agreement(problem, start, search, self._contradicted, lost)
-
-    def _last_measured(self) -> int:
-        """Place in the window of the newest pose that measured landmarks, or of the last: nearly all hang on it."""
-        frames, measured = self._graph.window().frames, self.measurement_log.path.measured
-        return int(np.searchsorted(frames, measured[-1])) if measured else len(frames) - 1
+        start = predicted.T if guess is None else guess
+        return agreement(problem, start, search, self._contradicted, self._belief.lost())
 
     def _require_started(self, what: str) -> None:
-        if not self.measurement_log.path.count and self._predicted is None:
+        if not self.measurement_log.path.count and self.measurement_log.path.predicted is None:
             raise MeasurementError(f"smoother: {what} before the first predict")
 
     def _require_new(self, ids: IdArray) -> None:

@@ -7,10 +7,12 @@ from collections.abc import Collection
 import numpy as np
 
 from backends.smoother.config import SmootherConfig
-from backends.smoother.graph import FactorMaker
-from backends.smoother.measurement_log import IndexArray, Known, MeasurementLog, Track
+from backends.smoother.factors import FactorMaker
+from backends.smoother.landmarks import Known, Track
+from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.solver import Change
 from backends.smoother.variables import landmark_key, landmark_threshold, pose_key
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
 #: A landmark unseen for so many frames is seen again: a smart factor over the gap would touch all poses between.
@@ -30,32 +32,23 @@ class FactorBuilder:
     Args:
         make: makes the factors.
         config: limits and thresholds.
-        measurement_log: what is on record.
+        log: what is on record.
     """
 
-    def __init__(self, make: FactorMaker, config: SmootherConfig, measurement_log: MeasurementLog) -> None:
-        self.measurement_log = measurement_log
+    def __init__(self, make: FactorMaker, config: SmootherConfig, log: MeasurementLog) -> None:
+        self.log = log
         self._make = make
         self._config = config
-
-    @property
-    def oldest(self) -> int:
-        """The first frame whose pose is in the solver."""
-        return self.measurement_log.history.first
-
-    def newest(self) -> list[int]:
-        """Frames of the window."""
-        return self.measurement_log.path.newest(self._config.window, self.oldest).tolist()
 
     def eliminate_late(self, change: Change, first: int = 0, gone: Collection[int] = ()) -> None:
         """Have the landmarks of late eliminated late, and the newest poses last.
 
         Without poses before frame `first` and without the landmark variables `gone`.
         """
-        marks, frame = self.measurement_log.landmarks, self.measurement_log.path.count - 1
+        marks, frame = self.log.landmarks, self.log.path.count - 1
         landmarks, poses = change.late
-        poses.update(pose_key(i) for i in self.newest() if i >= first)
-        oldest = max(first, self.oldest)
+        poses.update(pose_key(i) for i in self.log.window(self._config.window).tolist() if i >= first)
+        oldest = max(first, self.log.history.first)
         if oldest:  # that one is held, and its covariance is asked for
             poses.add(pose_key(oldest))
         recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
@@ -63,8 +56,8 @@ class FactorBuilder:
 
     def grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> list[tuple[Track, int]]:
         """Put measurements into factors; returns tracks with the places of their new smart factors in the change."""
-        make, marks, frame = self._make, self.measurement_log.landmarks, self.measurement_log.path.count - 1
-        key, explicit = pose_key(frame), self.measurement_log.history.explicit
+        make, marks, frame = self._make, self.log.landmarks, self.log.path.count - 1
+        key, explicit = pose_key(frame), self.log.history.explicit
         self._enter_known(change, slots)
         variables, again = marks.variable[slots], (frame - marks.last[slots] > _GAP).tolist()
         room = self._config.explicit - int((variables >= 0).sum())
@@ -78,7 +71,7 @@ class FactorBuilder:
                 continue
             track = marks.tracks[slot]
             if long_unseen and room <= 0:
-                self.measurement_log.finish(track)
+                self.log.finish(track)
             track.append(row, point, key, stereo)
             if not track.informative:
                 continue
@@ -95,28 +88,28 @@ class FactorBuilder:
 
     def _well_known(self, slot: int) -> bool:
         """Whether a landmark's position is known to a tenth of its distance: else it is no good as a variable."""
-        marks = self.measurement_log.landmarks
-        offset = marks.position[slot] - self.measurement_log.path.poses[-1][:3, 3]
+        marks = self.log.landmarks
+        offset = marks.position[slot] - self.log.path.poses[-1][:3, 3]
         return bool(np.trace(marks.covariance[slot]) < 0.01 * (offset @ offset))
 
     def _make_variable(self, change: Change, slot: int, track: Track) -> None:
         """Give a landmark a variable of its own, with all that its track holds."""
         key = self._new_variable(change, slot)
-        self.measurement_log.history.explicit[key] = track.rows
+        self.log.history.explicit[key] = track.rows
         for point, pose in zip(track.points, track.keys):
             change.factors.add(self._make.explicit(point, pose, key))
         track.restart()
 
     def _known(self, slot: int) -> Known | None:
-        """What was known of a landmark beforehand, as long as what it hangs on is in the solver."""
-        known = self.measurement_log.history.known.get(int(self.measurement_log.landmarks.serial[slot]))
-        return None if known is None or known.hangs_before(self.measurement_log.history.first) else known
+        """What was known of a landmark beforehand, as long as the pose that it is relative to is in the solver."""
+        known = self.log.history.known.get(int(self.log.landmarks.serial[slot]))
+        return None if known is None or known.is_before(self.log.history.first) else known
 
     def _enter_known(self, change: Change, slots: IndexArray) -> None:
         """Give landmarks that were known beforehand variables of their own, where they have none yet."""
-        if not self.measurement_log.history.known:
+        if not self.log.history.known:
             return
-        marks = self.measurement_log.landmarks
+        marks = self.log.landmarks
         for slot in slots[marks.variable[slots] < 0].tolist():
             known = self._known(slot)
             if known is None or len(marks.tracks[slot]):
@@ -125,13 +118,13 @@ class FactorBuilder:
             change.factors.add(self._make.known(key, known))
             if known.frame is not None:
                 change.late[1].add(pose_key(known.frame))
-            self.measurement_log.history.explicit[key] = []
+            self.log.history.explicit[key] = []
 
     def _new_variable(self, change: Change, slot: int) -> int:
         """A variable for a landmark, placed where the landmark is believed to be."""
-        history, marks = self.measurement_log.history, self.measurement_log.landmarks
+        history, marks = self.log.history, self.log.landmarks
         place = marks.position[slot].copy()
-        distance = float(np.linalg.norm(place - self.measurement_log.path.poses[-1][:3, 3]))
+        distance = float(np.linalg.norm(place - self.log.path.poses[-1][:3, 3]))
         threshold = landmark_threshold(self._make.stereo, distance, self._config.relinearise)
         key = landmark_key(history.variables, threshold)
         history.variables += 1
@@ -141,8 +134,8 @@ class FactorBuilder:
 
     def finish_tracks(self, slots: IndexArray) -> None:
         """Finish the smart factors that are long enough."""
-        marks = self.measurement_log.landmarks
+        marks = self.log.landmarks
         for slot in slots[marks.variable[slots] < 0].tolist():
             track = marks.tracks[slot]
             if len(track.rows) >= track.limit:
-                self.measurement_log.finish(track)
+                self.log.finish(track)

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import gtsam
 
+from backends.smoother.landmarks import Track
 from backends.smoother.marginal import Held, MarginalPrior, marginal_prior
-from backends.smoother.measurement_log import MeasurementLog, Track
+from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of
 
@@ -42,13 +43,13 @@ class Rest:
     slots: dict[int, int]
 
 
-def overdue(measurement_log: MeasurementLog, lag: int) -> int | None:
+def overdue(log: MeasurementLog, lag: int) -> int | None:
     """Frame of the oldest pose that shall stay, where it is time that others leave."""
-    first = measurement_log.path.count - lag
-    return first if first >= measurement_log.history.first + max(1, lag // _SHARE) else None
+    first = log.path.count - lag
+    return first if first >= log.history.first + max(1, lag // _SHARE) else None
 
 
-def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, most: int) -> Rest:
+def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> Rest:
     """Marginalise the poses before frame `first`, and landmark variables last measured before it.
 
     Those of landmarks that are not in the map any more leave, and those of others where there are more than `most`.
@@ -57,8 +58,8 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
     Raises:
         SolverError: what leaves cannot be marginalised.
     """
-    history, kept = measurement_log.history, Change()
-    gone = _old_landmarks(measurement_log, first, most)
+    history, kept = log.history, Change()
+    gone = _old_landmarks(log, first, most)
     leaving = {*map(pose_key, range(history.first, first)), *gone}
     touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
     for slot, factor in solver.factors():
@@ -76,21 +77,21 @@ def without_old(measurement_log: MeasurementLog, solver: Solver, first: int, mos
         values = _solved_together(kept.factors, touched, values)
     ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
     prior = marginal_prior(touched, values, sorted(leaving), ordered)
-    held = held_pose(measurement_log, prior, values)
+    held = held_pose(log, prior, values)
     kept.factors.add(prior.factor())
     if held is not None:
         kept.factors.add(held.factor())
-    for key in [*map(pose_key, range(first, measurement_log.path.count)), *history.explicit]:
+    for key in [*map(pose_key, range(first, log.path.count)), *history.explicit]:
         if key not in leaving:
             put(kept.values, key, values)
     oldest = pose_key(first)
-    finished = [track for track in measurement_log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
+    finished = [track for track in log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
     return Rest(first, gone, finished, prior, held, kept, slots)
 
 
-def held_pose(measurement_log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
+def held_pose(log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
     """The oldest pose, held where it stands; None where landmarks that are known in the world tell where that is."""
-    if any(known.frame is None for known in measurement_log.history.known.values()):
+    if any(known.frame is None for known in log.history.known.values()):
         return None
     return prior.held(values.atPose3(prior.poses[0]).matrix())
 
@@ -116,9 +117,9 @@ def _solved_together(
         raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
 
 
-def _old_landmarks(measurement_log: MeasurementLog, first: int, most: int) -> list[int]:
+def _old_landmarks(log: MeasurementLog, first: int, most: int) -> list[int]:
     """Landmark variables to leave: last measured before frame `first`, those of erased landmarks and the surplus."""
-    marks, history, frame = measurement_log.landmarks, measurement_log.history, measurement_log.measurements.frame
+    marks, history, frame = log.landmarks, log.history, log.measurements.frame
     used = marks.used()
     mapped = dict(zip(marks.serial[used].tolist(), marks.last[used].tolist()))
     old = []

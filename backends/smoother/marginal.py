@@ -72,8 +72,8 @@ class Held:
 
         `by_held` (..., n, 6) is the covariance with the held pose, `held` (6, 6) the held pose's own in the solver.
         """
-        K = by_held @ np.linalg.inv(held)
-        return np.asarray(P + K @ (self.covariance - held) @ np.swapaxes(K, -1, -2))
+        Kt = np.linalg.solve(held, np.swapaxes(by_held, -1, -2))
+        return np.asarray(P + np.swapaxes(Kt, -1, -2) @ (self.covariance - held) @ Kt)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.smoother.measurement_log import IndexArray, Path
+from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, velocities
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
@@ -20,6 +20,7 @@ from backends.smoother.objects_window import (
     with_points,
     without_points,
 )
+from backends.smoother.path import Path
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.uncertainty import PoseSet
 from slam.data import BoolArray, IdArray, Observations

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_NEAREST = 1e-6  # no depth below this [m] is projected
+NEAREST = 1e-6  # no depth below this [m] is projected
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision
 _SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken
 
@@ -20,7 +20,7 @@ def _residual(camera, R_left, point, z, T, r, J):
     b = T[0, 1] * x + T[1, 1] * y + T[2, 1] * depth
     c = T[0, 2] * x + T[1, 2] * y + T[2, 2] * depth
     q = R_left[2, 0] * a + R_left[2, 1] * b + R_left[2, 2] * c
-    if not q >= _NEAREST:
+    if not q >= NEAREST:
         for i in range(3):
             r[i] = np.nan
             for k in range(6):

@@ -15,7 +15,7 @@ from backends.smoother import pose_kernels as kernels
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, inverse
-from slam.tracking.gating import chi_square_gate
+from slam.tracking.gating import chi_square_gate, whiteners
 
 _STEPS = 12  # of Gauss-Newton at most
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
@@ -76,7 +76,7 @@ def _gate(problem: PoseProblem, T: Array) -> BoolArray:
 
 def _whiteners(noise: Array, z: Array) -> Array:
     """Inverse Cholesky factors (M, 3, 3); the third row is zero where there is no right pixel."""
-    W = np.linalg.inv(np.linalg.cholesky(noise))
+    W = whiteners(noise)
     W[np.isnan(z[:, 2]), 2] = 0
     return W
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.measurement_log import IndexArray, Path
+from backends.smoother.path import Path
 from backends.smoother.stereo import RectifiedStereo, by_pose
 from backends.smoother.uncertainty import PoseSet, quadratic
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.models import EstimatorModels
+from slam.tracking.gating import whiteners
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class PredictedPose:
         T: predicted pose (4, 4).
         by_window: its Jacobian (6, 6 W) by the poses of the window.
         noise: covariance (6, 6) of what the motion adds.
-        window: the poses it hangs on.
+        window: the poses that it is predicted from.
     """
 
     stamp: float
@@ -162,7 +163,7 @@ def normalised_innovation(
     r = z - h
     missing = ~np.isfinite(r)
     own = J @ points.own @ np.swapaxes(J, 1, 2) + sigma**2 * np.eye(3)
-    W = np.linalg.inv(np.linalg.cholesky(own))
+    W = whiteners(own)
     W[missing[:, 2], 2] = 0
     r = r + by_pose(J, points.local) @ step
     r[missing] = 0

@@ -5,43 +5,44 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from backends.smoother.graph import FactorMaker, to_pose3
-from backends.smoother.measurement_log import IndexArray, MeasurementLog, Path, Track
+from backends.smoother.factors import FactorMaker, to_pose3
+from backends.smoother.landmarks import Track
+from backends.smoother.measurement_log import MeasurementLog
+from backends.smoother.path import Path
 from backends.smoother.solver import FAILURES, Change, SolverError
 from backends.smoother.variables import pose_key
+from slam.data import IndexArray
 from slam.geometry.se3 import Array, inverse
 
 _ITERATIONS = 30  # of Levenberg-Marquardt at most
 
 
-def whole_problem(make: FactorMaker, measurement_log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:
+def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:
     """All factors and first values, and the tracks with the places of their smart factors."""
     change = Change()
-    add_poses(change, make, measurement_log, measurement_log.history.restarted)
-    for rows in measurement_log.history.finished:
-        points = [make.point(z) for z in measurement_log.measurements.z[rows].tolist()]
-        change.factors.add(make.smart(points, pose_keys(measurement_log, rows)))
-    for key, all_rows in measurement_log.history.explicit.items():
-        add_landmark(
-            change, make, measurement_log, key, np.array(all_rows, np.intp), measurement_log.history.places[key]
-        )
-        known = measurement_log.history.known.get(measurement_log.history.owner[key])
-        if known is not None and not known.hangs_before(measurement_log.history.first):
+    add_poses(change, make, log, log.history.restarted)
+    for rows in log.history.finished:
+        points = [make.point(z) for z in log.measurements.z[rows].tolist()]
+        change.factors.add(make.smart(points, pose_keys(log, rows)))
+    for key, all_rows in log.history.explicit.items():
+        add_landmark(change, make, log, key, np.array(all_rows, np.intp), log.history.places[key])
+        known = log.history.known.get(log.history.owner[key])
+        if known is not None and not known.is_before(log.history.first):
             change.factors.add(make.known(key, known))
     places = []
-    for track in measurement_log.landmarks.tracks.values():
+    for track in log.landmarks.tracks.values():
         if track.informative:
             places.append((track, change.factors.size()))
             change.factors.add(make.smart(track.points, track.keys))
     return change, places
 
 
-def add_poses(change: Change, make: FactorMaker, measurement_log: MeasurementLog, restarted: int = 0) -> None:
+def add_poses(change: Change, make: FactorMaker, log: MeasurementLog, restarted: int = 0) -> None:
     """All poses that are variables, with what ties them to each other and to the world.
 
     Those of the first `restarted` frames stand to each other as they are on record.
     """
-    path, first, prior = measurement_log.path, measurement_log.history.first, measurement_log.history.prior
+    path, first, prior = log.path, log.history.first, log.history.prior
     if prior is not None:
         change.factors.add(prior.factor())
     for i in range(first, path.count):
@@ -86,15 +87,15 @@ def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:
     return values
 
 
-def pose_keys(measurement_log: MeasurementLog, rows: IndexArray) -> list[int]:
+def pose_keys(log: MeasurementLog, rows: IndexArray) -> list[int]:
     """Pose variables of measurements."""
-    return [pose_key(i) for i in measurement_log.measurements.frame[rows].tolist()]
+    return [pose_key(i) for i in log.measurements.frame[rows].tolist()]
 
 
 def add_landmark(
-    change: Change, make: FactorMaker, measurement_log: MeasurementLog, key: int, rows: IndexArray, place: Array
+    change: Change, make: FactorMaker, log: MeasurementLog, key: int, rows: IndexArray, place: Array
 ) -> None:
     """A landmark that is a variable, first placed at `place` (3,) in world coordinates."""
-    for z, pose in zip(measurement_log.measurements.z[rows].tolist(), pose_keys(measurement_log, rows)):
+    for z, pose in zip(log.measurements.z[rows].tolist(), pose_keys(log, rows)):
         change.factors.add(make.explicit(make.point(z), pose, key))
     change.values.insert(key, place)

@@ -3,7 +3,7 @@
 The prediction is then at fault, and not they. It may be so far off that the solution is not found from there: then the
 pose on which the landmarks agree, wherever they stand, is a better place to start from. Or the camera is where its own
 past says it cannot be: the poses were wrong for a while, in a stretch with next to nothing to see. Then the problem
-starts anew with that pose among the landmarks (`PoseGraph.start_anew`), and the poses before it stay as they are.
+starts anew with that pose among the landmarks (`FactorGraph.start_anew`), and the poses before it stay as they are.
 """
 
 from __future__ import annotations
@@ -13,25 +13,18 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.special import bdtrc, comb, gammainc, gammaincinv
+from scipy.special import bdtrc, comb
 
 from backends.smoother import pose_only
 from slam.data import BoolArray
-from slam.geometry.pnp import find_consensus
-from slam.geometry.rig import StereoRig
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse
-from slam.models import EstimatorModels
+from slam.tracking.agreement import CONFIRMED, ENOUGH, HEEDED, share_by_chance
 from slam.tracking.gating import chi_square_limits, squared_distances
 
-_ENOUGH = 6  # observations that can be judged to agree with each other
-_HEEDED = 3  # one in so many observations is enough to agree with a prediction
-_FITTED = 3  # observations that fix a pose: it fits them whatever they are
-CONFIRMED = 5  # observations that agree on a pose by more than chance: three fix it
-_HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
 _ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
-_AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
 
 
 @dataclass(frozen=True)
@@ -66,7 +59,7 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the problem shall start anew in any case (`PoseGraph.lost`).
+        lost: whether the problem shall start anew in any case (`Belief.lost`).
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):
@@ -77,7 +70,7 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
     contradicted = 0 if found is None else contradicted + 1
     if found is not None and (found.jump is None or contradicted >= _LASTING):
         return found
-    if len(used) >= _ENOUGH and _HEEDED * used.sum() < len(used) and _by_chance(problem, T, used):
+    if len(used) >= ENOUGH and HEEDED * used.sum() < len(used) and _by_chance(problem, T, used):
         used = np.zeros_like(used)
     return Agreement(T, used, None, contradicted)
 
@@ -103,38 +96,19 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
 def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:
     """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
 
-    Wrong observations are taken to be spread about their predictions as those that are rejected: that says what share
-    of them passes the gate. Three agree with the pose that was made to fit them, and it may have been made to fit any
-    three: the number of others that agree is judged for all triples together
-    (an a contrario test, as in Moisan & Stival, IJCV 2004).
+    Three observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
+    fit any three: the number of others that agree is judged for all triples together (an a contrario test, as in
+    Moisan & Stival, IJCV 2004).
     """
     distances = squared_distances(pose_only.residuals(problem, T)[0], problem.noise)
     rejected = distances[~used & np.isfinite(distances)]
     if not len(rejected):
         return True
-    spread = float(np.median(rejected)) / (2 * gammaincinv(1.5, 0.5))  # in units of the residuals' covariances
-    share = gammainc(1.5, chi_square_limits(np.array([3]), problem.probability)[0] / spread / 2)
-    others, many = int(used.sum()) - _FITTED, len(used) - _FITTED
-    return bool(others < 1 or comb(len(used), _FITTED) * bdtrc(others - 1, many, share) > 1 - problem.probability)
-
-
-def landmarks_pose(
-    rig: StereoRig, points: Array, z: Array, models: EstimatorModels, T_world_left: Array, seed: int
-) -> Array | None:
-    """The pose (4, 4) on which most landmarks agree, and at least five; None where there is none.
-
-    Args:
-        rig: the cameras.
-        points: the landmarks (M, 3) in the world [m].
-        z: measurements (M, 3) = (uL, vL, uR) in the rig's own pixels.
-        models: pixel noise and gate.
-        T_world_left: pose (4, 4) to begin with.
-        seed: of the random choice.
-    """
-    threshold = models.pixel_sigma * np.sqrt(_AS_NEW * chi_square_limits(np.array([3]), models.gate_probability)[0])
-    found = find_consensus(rig, points, z, T_world_left, float(threshold), _HYPOTHESES, seed)
-    enough = found.inliers.sum() >= max(CONFIRMED, (len(z) + 1) // 2)
-    return found.T_world_left if enough and np.isfinite(found.T_world_left).all() else None
+    share = share_by_chance(rejected, chi_square_limits(np.array([3]), problem.probability)[0])
+    others, many = int(used.sum()) - MINIMAL_POINTS, len(used) - MINIMAL_POINTS
+    return bool(
+        others < 1 or comb(len(used), MINIMAL_POINTS) * bdtrc(others - 1, many, share) > 1 - problem.probability
+    )
 
 
 def world_covariance(P: Array) -> Array:

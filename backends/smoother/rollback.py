@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from backends.smoother.measurement_log import MeasurementLog, Track
+from backends.smoother.landmarks import Track
+from backends.smoother.measurement_log import MeasurementLog
 
 
-def snapshot(measurement_log: MeasurementLog) -> Callable[[], None]:
-    """What puts the measurement_log back to how they are now."""
-    parts = (measurement_log.path, measurement_log.measurements, measurement_log.landmarks, measurement_log.history)
+def snapshot(log: MeasurementLog) -> Callable[[], None]:
+    """A function that puts the log back to how it is now."""
+    parts = (log.path, log.measurements, log.landmarks, log.history)
     states = [_state(part) for part in parts]
-    tracks = {slot: (track, *_of_track(track)) for slot, track in measurement_log.landmarks.tracks.items()}
+    tracks = {slot: (track, *_of_track(track)) for slot, track in log.landmarks.tracks.items()}
 
     def restore() -> None:
         for part, state in zip(parts, states):
@@ -27,7 +28,7 @@ def snapshot(measurement_log: MeasurementLog) -> Callable[[], None]:
         for track, count, rows, points, keys, stereo, factor in tracks.values():
             track.rows, track.points, track.keys = rows[:count], points[:count], keys[:count]
             track.stereo, track.factor = stereo, factor
-        measurement_log.landmarks.tracks = {slot: entry[0] for slot, entry in tracks.items()}
+        log.landmarks.tracks = {slot: entry[0] for slot, entry in tracks.items()}
 
     return restore
 

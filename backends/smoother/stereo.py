@@ -11,11 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
+from backends.smoother.pose_kernels import NEAREST
 from slam.data import Observations
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
-
-_NEAREST = 1e-6  # no depth below this [m] is projected
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class RectifiedStereo:
         """
         R = self.rectified_rig.R_left
         p = local @ R.T
-        behind = p[:, 2] < _NEAREST
+        behind = p[:, 2] < NEAREST
         w = 1 / np.where(behind, np.nan, p[:, 2])
         f_w = self.f * w
         z = np.empty((len(p), 3))

@@ -1,4 +1,4 @@
-"""How landmarks hang on the poses that saw them: refinement, covariances, and what is predicted of them.
+"""How landmarks depend on the poses that measured them: refinement, covariances, and their Jacobians by these poses.
 
 A landmark's position, given all poses, follows from its measurements alone: ``l = l(x_1, x_2, …) + e`` with
 ``cov(e) = σ² (ΣEᵀE)⁻¹`` and ``∂l/∂x_j = −(ΣEᵀE)⁻¹ E_jᵀF_j``, where E and F are the measurements' Jacobians by the
@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backends.smoother.measurement_log import IndexArray, Landmarks, Measurements
+from backends.smoother.landmarks import Landmarks
+from backends.smoother.measurement_log import Measurements
 from backends.smoother.stereo import RectifiedStereo
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
 #: Landmarks are refined until another step would lessen their sum of squares by less than this, in at most so many.
@@ -132,7 +134,7 @@ def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, s
 
     A measurement from another pose counts for the pose of the set that comes next, as if the two were fixed to each
     other; what is no longer among the recent measurements counts for the pose next to the oldest one that is. What was
-    known beforehand hangs on no pose.
+    known beforehand depends on no pose.
     """
     rows, count, width = landmarks.recent[slots], len(slots), len(known)
     if not width:

@@ -25,13 +25,12 @@ import numpy as np
 from slam.calibration.model import RigModel
 from slam.data import Estimate
 from slam.geometry.arrays import Array, IdArray
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 
 #: Standard deviation of the baseline's length, as a share of it. It scales the whole world, so images never show it:
 #: the squares of a calibration board are known to some tenths of a percent.
 BASELINE = 0.002
-
-_MINIMAL = 3  # landmarks that fix a pose
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class RigUncertainty:
         old = known.ids[rows] == ids if len(known.ids) else np.zeros(len(ids), bool)
         local = transform(inverse(T), positions[old])
         good = local[:, 2] > 0
-        if good.sum() >= _MINIMAL:
+        if good.sum() >= MINIMAL_POINTS:
             self._solve(T[:3, :3], local[good], known.select(rows[old][good]))
         seen = known.seen.copy()
         seen[rows[old]] += 1

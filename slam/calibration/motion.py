@@ -12,12 +12,11 @@ import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
+from slam.calibration.robust import student_weights
 from slam.geometry.se3 import Array, hat, so3_exp
 
 _ITERATIONS = 20  # of Gauss-Newton at most
 _CONVERGED = 0.02  # largest last change of a predicted point [px]
-_DEGREES = 4.0  # of Student's t, the weight of a point's residual
-_MEDIAN = 2.366  # of χ² with three degrees of freedom
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
 
@@ -126,7 +125,6 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
 
 
 def _weights(residual: Array, W: Array) -> Array:
-    """Weights (N,) of Student's t over the noise's scale, which the median of the squared distances gives."""
+    """Weights (N,) of residuals (N, 3) with information W (N, 3, 3) for a noise whose scale is estimated."""
     distance = np.einsum("ni,nij,nj->n", residual, W, residual)
-    scale = max(float(np.median(distance)) / _MEDIAN, _LEAST_NOISE**2)
-    return np.asarray((_DEGREES + 3) / (_DEGREES + distance / scale) / scale)
+    return student_weights(distance, 3, _LEAST_NOISE)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
+from slam.calibration.robust import student_weights
 from slam.geometry.se3 import Array
 
-_DEGREES = 4.0  # of Student's t, the weight of a match
-_MEDIAN = 0.455  # of χ² with one degree of freedom
 _LEAST_NOISE = 0.03  # of a row [px], the least that is believed
 
 
@@ -24,7 +21,5 @@ def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Ar
     """
     A = model.vertical(points)
     residual = vertical + A @ parameters
-    noise = max(float(np.median(residual**2)) / _MEDIAN, _LEAST_NOISE**2) if len(residual) else 1.0
-    weights = (_DEGREES + 1) / (_DEGREES + residual**2 / noise) / noise
-    weighted = A * weights[:, None]
+    weighted = A * student_weights(residual**2, 1, _LEAST_NOISE)[:, None]
     return Evidence(weighted.T @ A, -(weighted.T @ vertical), weighted.T @ model.residual_vertical(points))

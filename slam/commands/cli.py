@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,11 +30,11 @@ from slam.commands.options import (
     SequenceArgument,
     SetOption,
 )
+from slam.commands.signals import Stopped, catch_signals, whole_frames
 from slam.errors import SlamError, one_line
 from slam.files import reason
 
 if TYPE_CHECKING:
-    from slam.data import FrameResult
     from slam.run.replay import Recording
     from slam.sequences import Sequence
 
@@ -49,26 +47,11 @@ app = typer.Typer(
 )
 
 
-#: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
-
-
-class _Stopped(BaseException):
-    """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(signal.Signals(number).name)
-        self.number = number
-
-
 def main() -> None:
     """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
-    for name in _SIGNALS:
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
-            signal.signal(number, _stop)
+    catch_signals()
     try:
         app(prog_name="slam")
     except SlamError as error:
@@ -80,7 +63,7 @@ def main() -> None:
         _end(f"slam: {one_line(f'{place}{reason(error)}')}", 2)
     except MemoryError:
         _end("slam: there is not enough memory for this", 2)
-    except _Stopped as stopped:
+    except Stopped as stopped:
         _end(f"slam: stopped by {stopped}; frames done so far are kept", 128 + stopped.number)
 
 
@@ -101,51 +84,6 @@ def _print_version(wanted: bool) -> None:
 
         print(f"surf-stereo-slam {versions()['surf-stereo-slam']}")
         raise typer.Exit
-
-
-_pending: list[int] = []  # a signal that waits for the end of a frame
-_in_frames = False
-_until: threading.Event | None = None  # ends the frames of a live run
-
-
-def _stop(number: int, frame: object) -> None:
-    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once.
-
-    Frames of a live run are not waited for any more; that is how one from a camera ends.
-    """
-    if not _in_frames or _pending or (_until is not None and _until.is_set()):
-        raise _Stopped(number)
-    if _until is not None:
-        _until.set()
-        if number == signal.SIGINT:
-            return
-    _pending.append(number)
-
-
-@contextmanager
-def _whole_frames(
-    after_frame: Callable[[FrameResult], None], until: threading.Event | None = None
-) -> Iterator[Callable[[FrameResult], None]]:
-    """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
-
-    Args:
-        after_frame: is called, too.
-        until: set by a signal; its run then has no more frames, and Ctrl-C has no further effect.
-    """
-    global _in_frames, _until
-
-    def end_of_frame(result: FrameResult) -> None:
-        after_frame(result)
-        if _pending:
-            raise _Stopped(_pending.pop())
-
-    _in_frames, _until = True, until
-    try:
-        yield end_of_frame
-        if _pending:  # no frame came after it
-            raise _Stopped(_pending.pop())
-    finally:
-        _in_frames, _until = False, None
 
 
 @app.callback()
@@ -216,7 +154,7 @@ def run_command(
 
             watches.append(stack.enter_context(FramePictures(draw)).show)
         until = threading.Event() if live or is_live(opened) else None
-        end_of_frame = stack.enter_context(_whole_frames(stack.enter_context(progress).frame, until))
+        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until)
     _leave_picture(folder, picture)
     if not quiet:
@@ -247,7 +185,7 @@ def replay_command(
     progress = Progress(len(loaded), _title(loaded, name), quiet)
     with run_folder(out, loaded.name, name, overwrite) as folder:
         options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
-        with progress, _whole_frames(progress.frame) as end_of_frame:
+        with progress, whole_frames(progress.frame) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
     _leave_picture(folder, picture)
     if not quiet:

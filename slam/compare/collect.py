@@ -27,10 +27,7 @@ _RIGHT = 3.0  # a feature so near to its landmark's true place is rightly associ
 _SECONDS = 1.0  # of RPE by time
 _SAME = 1e-6  # stamps of one frame, one of them from a file, differ by less [s]
 
-#: Frames whose pose was measured, as in `slam.run.runner`; accuracy is that of these alone.
-_MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
-
-#: The others, by key of `slam.compare.measure.UNTRACKED`.
+#: Frames without a measured pose, by key of `slam.compare.measure.UNTRACKED`.
 _STATUSES = {
     "frames_lost": FrameStatus.LOST,
     "frames_predicted": FrameStatus.PREDICTED,
@@ -115,7 +112,7 @@ class Collector:
         """All figures.
 
         Args:
-            final: the last word on the path.
+            final: the path as estimated at the end.
             ids: landmarks in the map at the end (N,).
             positions: where they are (N, 3) [m].
             summary: of the run, for what it says of objects; may be empty.
@@ -209,7 +206,7 @@ class _Frame:
     @property
     def tracked(self) -> bool:
         """Whether the pose was measured."""
-        return self.located and self.status in _MEASURED
+        return self.located and self.status.measured
 
 
 def _common(path: Trajectory, sequence: Sequence) -> tuple[Trajectory, Trajectory] | None:

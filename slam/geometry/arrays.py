@@ -11,3 +11,5 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 IdArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+#: Places in arrays: row or slot numbers.
+IndexArray = NDArray[np.intp]

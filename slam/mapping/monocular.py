@@ -24,7 +24,7 @@ from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
 from slam.landmarks import LandmarkRows
-from slam.tracking.association import match_everywhere, pairs_in_boxes
+from slam.tracking.association import match_everywhere, match_in_boxes, pairs_in_boxes
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.visibility import MapView
 
@@ -142,7 +142,7 @@ def _adjoints(T: Array) -> Array:
 def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma: float) -> Array:
     """How well a frame's measurements of landmarks at `local` (M, 3) fix the camera before them: covariance (6, 6).
 
-    Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinitely vague where they do not fix it.
+    Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinite where they do not fix it.
     """
     _, J = rig.project_stereo(local)
     by_pose = J @ points_by_pose(local)
@@ -278,23 +278,12 @@ class MonocularDepth:
         self, views: _Views, features: StereoFeatures, rows: NDArray[np.intp], T: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Features that are views seen again: rows of features and rows of views, each at most once."""
-        none = np.zeros(0, np.intp)
-        if not len(views) or not len(rows):
-            return none, none
         turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T[:3, :3]
         expected = self._rig.left.project((_rays(self._rig, views.uv_last)[:, None, :] @ turn)[:, 0])
-        distance = np.linalg.norm(views.descriptors[:, None] - features.descriptors[rows][None], axis=2)
-        near = (np.abs(expected[:, None] - features.uv_left[rows][None]) < _RADIUS).all(axis=2)
-        near &= views.laplacian[:, None] == features.laplacian[rows][None]
-        distance = np.where(near, distance, np.inf)
-        view = np.arange(len(views))
-        best = distance.argmin(axis=1)
-        nearest = distance[view, best]
-        distance_else = distance.copy()
-        distance_else[view, best] = np.inf
-        clear = (nearest < _D_MATCH) & (nearest <= _RATIO * distance_else.min(axis=1))
-        clear &= distance.argmin(axis=0)[best] == view
-        return rows[best[clear]], view[clear]
+        found = match_in_boxes(
+            expected, _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
+        )  # fmt: skip
+        return found.features, found.landmarks
 
 
 def find_pose(

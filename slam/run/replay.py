@@ -388,7 +388,7 @@ def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
         return FrameStatus.TRACKED, ""
     if first:
         return FrameStatus.STARTED, ""
-    return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks recognised"
+    return FrameStatus.PREDICTED, report.reason or f"only {len(report.used)} landmarks matched"
 
 
 def _features(frame: RecordedFrame) -> StereoFeatures:

@@ -9,18 +9,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from slam import registry
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, FrameStatus, StereoFrame
+from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line
-from slam.evaluation.summary import consistency, evaluate, true_path
+from slam.evaluation.summary import true_path
 from slam.files import require_target
-from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, Frontend
-from slam.landmarks import LandmarkRows
+from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.last_files import LastFiles
@@ -28,15 +24,12 @@ from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
 from slam.run.replay import RecordedFrame, Recording, replay
-from slam.run.schema import STAGES, schema
+from slam.run.schema import schema
 from slam.run.settings_reference import in_force
-from slam.runtime.compile_clock import compile_clock, working_time
+from slam.run.summary import Replayed, RunRecord, live_frames, results_of
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
-
-#: Frames whose pose was measured; accuracy is that of these alone.
-_MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
 
@@ -75,52 +68,6 @@ class RunOptions:
     overlap: bool = True
     live: bool = False
     origin: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass
-class RunRecord:
-    """What a run has gathered so far: the online path, frame by frame, but for frames that have no pose at all."""
-
-    numbers: list[int] = field(default_factory=list)
-    stamps: list[float] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    statuses: list[str] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    measured: list[bool] = field(default_factory=list)
-    milliseconds: list[dict[str, float]] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
-    compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
-    ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
-    rejected: int = 0
-    used: int = 0
-    returned: int | None = None  # the first frame in which landmarks of an old place came back
-    nis: float = 0.0
-    nis_dof: int = 0
-
-    def add(self, number: int, result: FrameResult) -> None:
-        """Take in one frame, `number` in its sequence."""
-        self.numbers.append(number)
-        if len(result.returned) and self.returned is None:
-            self.returned = number
-        self.statuses.append(result.status.value)
-        self.milliseconds.append(dict(result.milliseconds))
-        self.times.append(working_time())
-        if not result.located:
-            return
-        self.stamps.append(result.estimate.stamp)
-        self.poses.append(result.estimate.T_world_left)
-        self.covariances.append(result.estimate.covariance)
-        self.measured.append(result.status in _MEASURED)
-        self.rejected += len(result.report.rejected)
-        self.used += len(result.report.used)
-        if result.report.dof:
-            self.nis += result.report.nis
-            self.nis_dof += result.report.dof
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The online path."""
-        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
 
 
 def run(
@@ -190,13 +137,13 @@ def run_recording(
     backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
     results = zip(recording.numbers.tolist(), replay(recording, backend, association=config.association))
     record = RunRecord()
-    return _drive(recording, options, _Replayed(recording, backend, record), results, record, on_frame)
+    return _drive(recording, options, Replayed(recording, backend, record), results, record, on_frame)
 
 
 def _drive(
     sequence: Sequence | Recording,
     options: RunOptions,
-    system: StereoSlam | _Replayed,
+    system: StereoSlam | Replayed,
     results: Iterable[tuple[int, FrameResult]],
     record: RunRecord,
     on_frame: Callable[[FrameResult], None] | None,
@@ -251,7 +198,7 @@ def _loop(result: FrameResult, record: RunRecord) -> int | str:
 def _write_copies(
     sequence: Sequence | Recording,
     options: RunOptions,
-    system: StereoSlam | _Replayed,
+    system: StereoSlam | Replayed,
     record: RunRecord,
     tape: list[RecordedFrame],
     last: LastFiles,
@@ -268,7 +215,7 @@ def _write_copies(
 def _recording(
     sequence: Sequence | Recording,
     options: RunOptions,
-    system: StereoSlam | _Replayed,
+    system: StereoSlam | Replayed,
     record: RunRecord,
     tape: list[RecordedFrame],
 ) -> Recording:
@@ -304,28 +251,6 @@ def _processed(
             watch(frame, result, system)
 
 
-@dataclass(frozen=True)
-class _Replayed:
-    """A back end that is given a recording, as the summary sees a system."""
-
-    recording: Recording
-    backend: Backend
-    record: RunRecord
-
-    def trajectory(self) -> Trajectory:
-        """The back end's last word on every frame."""
-        return self.backend.trajectory()
-
-    def estimate(self) -> Estimate:
-        """Pose and map with covariances."""
-        return self.backend.estimate()
-
-    @property
-    def landmarks(self) -> LandmarkRows:
-        """How often, and when last, each landmark was given so far."""
-        return self.recording.landmarks(len(self.record.stamps))
-
-
 class _Reading:
     """Frames, and the wall time that reading each took [ms] by its index; nothing in a live run, which waits for them.
 
@@ -352,7 +277,7 @@ class _Reading:
 def _finish(
     sequence: Sequence | Recording,
     options: RunOptions,
-    system: StereoSlam | _Replayed,
+    system: StereoSlam | Replayed,
     record: RunRecord,
     files: RunFiles,
     ended: str,
@@ -372,7 +297,7 @@ def _finish(
         "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
     }
     if live is not None:
-        summary["live"] = _live(live, record)
+        summary["live"] = live_frames(live, record)
     if record.stamps:
         final = Trajectory.empty()
         with last.each():
@@ -385,7 +310,7 @@ def _finish(
         with last.each():
             files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
         with last.each():
-            summary.update(_results(sequence, system, record, final, score))
+            summary.update(results_of(sequence, system, record, final, score))
     summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
     summary["configuration"] = options.config.to_json()
     summary["versions"] = versions()
@@ -394,65 +319,7 @@ def _finish(
     return summary
 
 
-def _results(
-    sequence: Sequence | Recording,
-    system: StereoSlam | _Replayed,
-    record: RunRecord,
-    final: Trajectory,
-    score: ObjectScore | None,
-) -> dict[str, Any]:
-    """The part of a summary that says how good the run was."""
-    measured = np.array(record.measured)
-    found: dict[str, Any] = {
-        "path_length_m": record.trajectory.length,
-        "landmarks": 0 if system.landmarks is None else len(system.landmarks),
-        "observations": {"used": record.used, "rejected": record.rejected},
-        "accuracy": {
-            "online": evaluate(record.trajectory.select(measured), sequence),
-            "final": evaluate(final.select(np.isin(final.stamps, record.trajectory.stamps[measured])), sequence),
-            "poses left out": int((~measured).sum()),
-        },
-        "consistency": {
-            "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
-        },
-    }
-    if isinstance(system, StereoSlam):
-        found["self_calibration"] = system.calibration.summary()
-        found["loops"] = system.atlas.summary()
-    if score is not None:
-        found["objects"] = score.summary()
-    compiled = compile_clock.seconds() - record.compiled_before
-    return {
-        **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
-    }  # fmt: skip
-
-
-def _live(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
-    """Frames that came too late, and how old frames were when they were done."""
-    later = 1e3 * np.array(record.ages[1:] or record.ages or [np.nan])  # the first may wait for compilers
-    return {
-        "frames dropped": live.dropped,
-        "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
-        "clock waited [s]": live.clock_waited,
-    }
-
-
-def _rate(record: RunRecord) -> float | None:
-    """Frames per second over all frames but the first, compiling left out; None for a single frame."""
-    seconds = record.times[-1] - record.times[0]
-    return (len(record.times) - 1) / seconds if seconds > 0 else None
-
-
-def _timings(record: RunRecord) -> dict[str, Any]:
-    """Median per stage over all frames but the first, and the first frame's total [ms]."""
-    totals = [sum(m.values()) for m in record.milliseconds]
-    later = record.milliseconds[1:] or record.milliseconds
-    median = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in STAGES}
-    return {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}
-
-
-def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | _Replayed) -> dict[str, Any]:
+def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | Replayed) -> dict[str, Any]:
     """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
     parts = {"frontend": in_force(getattr(system, "frontend", None)), "backend": in_force(system.backend)}
     return {

@@ -187,6 +187,35 @@ def match_everywhere(
     return Matches(pairs.rows[best], pairs.columns[best])
 
 
+def match_in_boxes(
+    centres: Array, reach: float, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
+    rows: NDArray[np.intp], d_match: float, ratio: float,
+) -> Matches:  # fmt: skip
+    """Match what is expected at pixels (M, 2), with descriptors (M, D), to features `rows` (K,) of a frame.
+
+    Args:
+        centres: the pixels; without a match where they are not finite.
+        reach: half size of the square boxes around them [px].
+        descriptors: what is expected to be seen (M, D).
+        laplacian: its signs of the Laplacian (M,).
+        features: of the frame.
+        rows: the features that may be matched.
+        d_match: largest descriptor distance.
+        ratio: largest ratio of the best to the second best distance in a box.
+    """
+    known = np.flatnonzero(np.isfinite(centres).all(axis=1))
+    if not len(known) or not len(rows):
+        return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
+    boxes = np.full((len(known), 2), reach)
+    which, member = pairs_in_boxes(centres[known], boxes, features.uv_left[rows])
+    which, member = known[which], rows[member]
+    same = laplacian[which] == features.laplacian[member]
+    which, member = which[same], member[same]
+    pairs = _Pairs(which, member, _distances(descriptors, features.descriptors, which, member))
+    best = pairs.mutual_best(d_match, ratio, len(features))
+    return Matches(pairs.rows[best], pairs.columns[best])
+
+
 @dataclass(frozen=True)
 class SearchWindows:
     """Where landmarks (M) are looked for: nested windows around their predicted pixels.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Stereo features with which a known place would be recognised.
+#: Stereo features with which the camera would be localised in a known place.
 ENOUGH_FEATURES = 20
 
 
@@ -14,9 +14,9 @@ class TrackingState:
 
     Attributes:
         unmatched: frames since the pose was last measured.
-        unknown: how many of these showed enough features to recognise a known place.
+        unknown: how many of these showed enough features to be localised in a known place.
         lost: for so long, and the prediction is so uncertain, that the camera's pose is not known.
-        showed_enough: the last frame showed enough features to recognise a known place.
+        showed_enough: the last frame showed enough features to be localised in a known place.
     """
 
     unmatched: int = 0

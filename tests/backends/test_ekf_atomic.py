@@ -89,5 +89,5 @@ def test_an_interrupted_call_did_not_happen(seed):
     assert interrupted.count > 100
     np.testing.assert_array_equal(found.trajectory().poses, expected.trajectory().poses)
     np.testing.assert_array_equal(found.trajectory().stamps, expected.trajectory().stamps)
-    np.testing.assert_array_equal(found._covariance.full(), expected._covariance.full())
+    np.testing.assert_array_equal(found._state.covariance.full(), expected._state.covariance.full())
     np.testing.assert_array_equal(found.estimate().positions, expected.estimate().positions)

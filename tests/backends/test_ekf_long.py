@@ -51,6 +51,6 @@ def test_the_filters_memory_follows_the_map():
         backend.remove(backend.estimate().ids)
         seen = measured(corridor.pose(0.0), points, ids, rng)
         backend.add(Observations(seen.ids + 1000 * k, seen.uv_left, seen.uv_right))
-        capacities.append(backend._covariance.capacity)
+        capacities.append(backend._state.covariance.capacity)
     assert len(seen) > 50
     assert max(capacities) < 1.3 * (12 + 3 * len(seen))

@@ -145,7 +145,7 @@ def test_after_the_first_frame_serves_as_well():
 def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
     scene = Scene()
     plain = tracked("smoother", scene).estimate()
-    rebuilt = tracked("smoother", scene, disturb=lambda k, b: b._graph._recover() if k in (0, 5) else None).estimate()
+    rebuilt = tracked("smoother", scene, disturb=lambda k, b: b._graph.recover() if k in (0, 5) else None).estimate()
     np.testing.assert_allclose(rebuilt.T_world_left, plain.T_world_left, atol=1e-3)  # of 15 mm
     np.testing.assert_allclose(rebuilt.positions, plain.positions, atol=1e-3)
 

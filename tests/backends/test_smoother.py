@@ -180,9 +180,9 @@ def test_a_fixed_lag_keeps_the_path_and_bounds_the_problem():
     sizes = []
     for stamp, _, seen in data:
         assert step(lagged, stamp, seen, known).status in (UpdateStatus.OK, UpdateStatus.EMPTY)
-        sizes.append(lagged._graph._solver.values().size())
+        sizes.append(lagged._graph.solver.values().size())
     assert max(sizes[40:]) <= max(sizes[20:40]) + 10, "the number of variables does not grow"
-    assert full._graph._solver.values().size() > sizes[-1] + 60, "poses and landmarks have left"
+    assert full._graph.solver.values().size() > sizes[-1] + 60, "poses and landmarks have left"
     ours, theirs = (errors(b.trajectory().poses, data.poses)[0] for b in (lagged, full))
     assert len(ours) == 80
     rms = [float(np.sqrt(np.mean(e**2))) for e in (ours, theirs)]
@@ -210,7 +210,7 @@ def test_landmarks_in_the_map_outlast_the_lag():
     known.difference_update(first)
     for k in range(10):
         step(backend, DT * (len(poses) + k), observe(poses[-1], points, 1.0, rng, limit=12), known)
-    keys = set(backend._graph._solver.values().keys())
+    keys = set(backend._graph.solver.values().keys())
     assert all(key in keys for key in backend.measurement_log.landmarks.variable.tolist() if key >= 0)
 
 
@@ -288,7 +288,7 @@ def test_no_two_landmarks_share_a_variable(monkeypatch):
                 rows = np.array(backend.measurement_log.history.explicit[key])
                 for row in rows[::-1]:
                     backend.measurement_log.take_back(np.array([slot]), np.array([row]))
-            backend._graph._recover()
+            backend._graph.recover()
     numbers = [gtsam.symbolIndex(key) for key in given]
     assert len(numbers) > 20 and len(set(numbers)) == len(numbers)
 

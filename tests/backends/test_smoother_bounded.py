@@ -10,7 +10,7 @@ import pytest
 
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
-from backends.smoother.graph import FactorMaker
+from backends.smoother.factors import FactorMaker
 from backends.smoother.marginal import MarginalPrior
 from backends.smoother.prediction import PredictedPoints, residual_noise
 from backends.smoother.stereo import RectifiedStereo

@@ -196,7 +196,7 @@ def test_a_covariance_that_is_none_is_not_handed_on(monkeypatch):
 def test_the_whole_problem_cannot_be_solved_for_a_while(break_isam, monkeypatch):
     data = drive()
     fails = Fails(monkeypatch, rebuild, "optimise", range(3), solver.SolverError("no solution"))
-    monkeypatch.setattr(smoother.pose_graph, "optimise", rebuild.optimise)
+    monkeypatch.setattr(smoother.factor_graph, "optimise", rebuild.optimise)
     break_isam("update", [8, 14, 19], ERRORS["indeterminate"])
     backend = SmootherBackend(RIG, MODELS)
     reports = run(backend, data)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slam.tracking.gating import chi_square_gate, chi_square_limits, squared_distances
+from slam.tracking.gating import chi_square_gate, chi_square_limits, squared_distances, whiteners
 
 
 def covariances(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -62,3 +62,12 @@ def test_what_cannot_be_judged_does_not_pass(residual, covariance):
 
 def test_no_rows_are_no_error():
     assert chi_square_gate(np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.9).shape == (0,)
+
+
+def test_whitened_residuals_have_unit_covariance():
+    S = covariances(50, np.random.default_rng(2))
+    W = whiteners(S)
+    np.testing.assert_allclose(W @ S @ np.swapaxes(W, 1, 2), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
+    S[7] *= -1
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        whiteners(S)

@@ -10,7 +10,7 @@ import gtsam_unstable
 import numpy as np
 
 from backends.smoother import motion
-from backends.smoother.measurement_log import Known
+from backends.smoother.landmarks import Known
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import pose_key
 from slam.geometry.se3 import Array, hat, nearest_rotation

@@ -1,0 +1,427 @@
+"""The smoother's factor graph: solved incrementally, and set up again from the measurement log where that fails."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+
+from backends.smoother.config import SmootherConfig
+from backends.smoother.factor_builder import FactorBuilder
+from backends.smoother.factors import FactorMaker, to_pose3
+from backends.smoother.lag import held_pose, overdue, without_old
+from backends.smoother.landmarks import Known
+from backends.smoother.marginal import Held, reference_prior
+from backends.smoother.measurement_log import MeasurementLog
+from backends.smoother.positions import linearise, place
+from backends.smoother.rebuild import optimise, pose_factor, whole_problem
+from backends.smoother.solver import Change, Solver, SolverError
+from backends.smoother.variables import pose_key, thresholds
+from slam.data import IdArray, IndexArray
+from slam.geometry.se3 import Array, transform
+from slam.tracking.gating import chi_square_gate
+
+#: Poses before the window and all landmarks are read from the solver again once the window's oldest pose has been
+#: revised by so much [m, or sine of an angle].
+_STALE = 0.005
+
+#: That takes time in proportion to the run, so it is not done again before the run is longer by this share, unless the
+#: revision is so many times as large.
+_SELDOM, _AT_ONCE = 0.01, 20
+
+#: Linearising a variable anew eliminates all that was measured since it was first seen, so it is done for many
+#: variables together every so many frames. A variable that is off by so many times the threshold does not wait.
+_EVERY, _OFF = 10, 10.0
+
+#: Gauss-Newton steps that move landmarks to where their changed measurements put them.
+_REFINED = 3
+
+#: When all is solved to convergence, variables are linearised anew until they are within so much [px].
+_LAST = 1e-4
+_ROUNDS = 6  # of linearising everything anew, at most
+
+
+class FactorGraph:
+    """Poses, landmarks and their factors in ISAM2. Which factors: see `backends.smoother.factor_builder`.
+
+    Everything that is put in is in the measurement log as well, and what the solver finds is written back to it. A
+    solver that fails is replaced by a new one that is given the whole log.
+
+    Args:
+        make: makes the factors.
+        config: limits and thresholds.
+
+    Attributes:
+        config: limits and thresholds.
+        log: poses, measurements and landmarks, with the latest values of poses and positions.
+        solver: holds the factors.
+        solutions: how often the poses have been solved for: what depends on them is out of date once this has changed.
+        placements: the same for the landmarks.
+        rebuilds: how often all was put into a new solver.
+    """
+
+    def __init__(self, make: FactorMaker, config: SmootherConfig) -> None:
+        self.log = MeasurementLog()
+        self.config = config
+        self._make = make
+        self._factor_builder = FactorBuilder(make, config, self.log)
+        self._often, self._seldom, self._last = (
+            thresholds(make.stereo, config.relinearise, share) for share in (_OFF, 1.0, _LAST / config.relinearise)
+        )
+        self.solver = self._new_solver()
+        self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
+        self.rebuilds = 0
+        self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
+        self._broken = False  # whether a call was interrupted since
+        self._solved = True  # whether all is solved to the last
+        self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
+        self._converged = 0  # number of frames then
+        self.solutions = 0
+        self.placements = 0
+
+    @property
+    def solver_seconds(self) -> float:
+        """CPU time spent in gtsam's solvers [s]."""
+        return self._seconds + self.solver.seconds
+
+    def interrupted(self) -> None:
+        """Note that the solver may hold what is not on record: it is made anew before anything else is done."""
+        self._broken = True
+        self._out_of_date()
+
+    def _out_of_date(self) -> None:
+        """Note that poses and landmarks have changed."""
+        self.solutions += 1
+        self.placements += 1
+
+    def mend(self) -> None:
+        """Make the solver anew after an interruption."""
+        if self._broken:
+            self.recover()
+            self._broken = False
+
+    def append_pose(self, stamp: float, T_world_left: Array) -> None:
+        """Add a frame without measurements."""
+        self.log.path.append(stamp, T_world_left)
+        try:
+            self._enter_pose(Change())
+        except SolverError:
+            self.recover()
+        self._advance()
+
+    def append_measured_pose(self, stamp: float, T_world_left: Array, slots: IndexArray, z: Array) -> str:
+        """Add a frame with measurements (M, 3) of landmarks.
+
+        Args:
+            stamp: time [s].
+            T_world_left: first value of the pose (4, 4), near the solution.
+            slots: landmarks (M,).
+            z: their measurements (M, 3).
+
+        Returns:
+            what failed, in one line; empty if nothing did. After a failure the frame stands without measurements.
+        """
+        marks, frame = self.log.landmarks, self.log.path.count
+        self.log.path.append(stamp, T_world_left)
+        rows = self.log.measurements.append(z, frame, marks.serial[slots])
+        change = Change()
+        grown = self._factor_builder.grow(change, slots, rows, z)
+        try:
+            try:
+                new = self._enter_pose(change)
+                for track, number in grown:
+                    track.factor = new[number]
+            except SolverError:
+                self._rebuild()
+        except SolverError as error:
+            self.log.take_back(slots, rows)
+            self.recover()
+            self._advance()
+            return str(error)
+        marks.measured(slots, rows, frame)
+        self.log.path.note_measured()
+        try:
+            self._read_back(slots)
+            if self._diverged(slots, z):
+                self._rebuild()
+        except SolverError:
+            self.recover()
+        self._factor_builder.finish_tracks(slots)
+        self._advance()
+        return ""
+
+    def start_anew(
+        self, stamp: float, T_world_left: Array, covariance: Array, covariances: Array, slots: IndexArray, z: Array
+    ) -> str:
+        """Add a frame whose pose follows from the landmarks and not from the poses before it.
+
+        Earlier poses stay as they are. Landmarks keep their position relative to the new pose.
+
+        Args:
+            stamp: time [s].
+            T_world_left: the pose (4, 4).
+            covariance: its covariance in the world (6, 6).
+            covariances: of all landmarks (N, 3, 3), by slot, relative to the newest pose that measured any.
+            slots: landmarks (M,) measured.
+            z: their measurements (M, 3).
+
+        Returns:
+            what failed, as in `append_measured_pose`.
+        """
+        log, frame = self.log, self.log.path.count
+        log.path.append(stamp, T_world_left)
+        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
+        self._out_of_date()
+        self._solved, self._broken = False, True
+        rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
+        self._factor_builder.grow(Change(), slots, rows, z)
+        try:
+            self._rebuild()
+        except SolverError as error:
+            log.take_back(slots, rows)
+            self.recover()
+            return str(error)
+        log.landmarks.measured(slots, rows, frame)
+        log.path.note_measured()
+        self._place(slots)
+        return ""
+
+    def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
+        """Take in landmarks at their first sight, at `local` (M, 3) in the newest camera's coordinates."""
+        path, marks, frame = self.log.path, self.log.landmarks, self.log.path.count - 1
+        limits = [self.config.track + i % self.config.track for i in ids.tolist()]
+        slots = marks.add(ids, transform(path.poses[-1], local), frame, limits)
+        rows = self.log.measurements.append(z, frame, marks.serial[slots])
+        marks.measured(slots, rows, frame)
+        path.note_measured()
+        key = pose_key(frame)
+        for slot, row, zi in zip(slots.tolist(), rows.tolist(), z.tolist()):
+            marks.tracks[slot].append(row, self._make.point(zi), key, stereo=True)
+        linearise(self._make, self.log, slots)
+        self.placements += 1
+
+    def add_known(self, ids: IdArray, positions: Array, covariances: Array, frame: int | None = None) -> None:
+        """Take in landmarks of which much is known, at `positions` (M, 3) with covariances (M, 3, 3).
+
+        In world coordinates, or in the camera's of a frame. They become variables when they are first measured.
+        """
+        path, marks, newest = self.log.path, self.log.landmarks, self.log.path.count - 1
+        T = np.eye(4) if frame is None else path.poses[frame]
+        slots = marks.add(ids, transform(T, positions), newest, [self.config.track] * len(ids))
+        marks.covariance[slots] = T[:3, :3] @ covariances @ T[:3, :3].T
+        information = np.linalg.inv(marks.covariance[slots])
+        if frame is None:
+            marks.mean[slots], marks.prior[slots] = positions, information
+        else:
+            marks.older[slots] = information
+            path.note_measured()
+        for serial, position, covariance in zip(marks.serial[slots].tolist(), positions, covariances):
+            self.log.history.known[serial] = Known(position.copy(), covariance.copy(), frame)
+        self.placements += 1
+
+    def remove_landmarks(self, slots: IndexArray) -> None:
+        """Take landmarks out of the map; what they have told about the poses stays known."""
+        marks = self.log.landmarks
+        for slot in slots.tolist():
+            self.log.finish(marks.tracks[slot])
+        marks.remove(slots)
+
+    def revise(self, mend: Callable[[Array], Array]) -> None:
+        """Correct all measurements by `mend` and solve anew."""
+        marks = self.log.landmarks
+        self.log.revise(mend, self._make.point)
+        self.recover()
+        with suppress(SolverError):  # of a problem that could not be solved: the landmarks stay where they were
+            for _ in range(_REFINED):
+                self._place(marks.used())
+
+    def joint_covariance(self, keys: list[int]) -> Array:
+        """Joint covariance of pose variables, as if none was held (see `backends.smoother.marginal.Held`).
+
+        Raises:
+            SolverError: the solver cannot give it.
+        """
+        held = self.log.history.held
+        if held is None:
+            return self.solver.joint_covariance(keys)
+        others = [key for key in keys if key != held.key]
+        P = self.solver.joint_covariance([held.key, *others])
+        P = held.let_go(P, P[:, :6], P[:6, :6])
+        return P if len(others) < len(keys) else P[6:, 6:]
+
+    def converge(self) -> None:
+        """Solve to convergence: every variable is linearised anew until none moves any more."""
+        if self._solved:
+            return
+        try:
+            change = Change()
+            self._factor_builder.eliminate_late(change)
+            self.solver.converge(change, self._last, _ROUNDS)
+            self._read_all()
+        except SolverError:
+            self.recover()
+        self._solved = True
+        self.solutions += 1
+
+    def _read_all(self, before: Array | None = None) -> None:
+        """Bring all poses and landmarks on record up to what the solver has; `before` are the poses as they were."""
+        path = self.log.path
+        if path.count:
+            before = path.poses.copy() if before is None else before
+            path.poses[:] = self._solved_poses()
+            if self.log.measurements.count:
+                self._place(self.log.landmarks.used(), before)
+            self._moved, self._converged = 0.0, path.count
+
+    def _solved_poses(self) -> Array:
+        """All poses, those that are variables as the solver has them."""
+        poses = self.log.path.poses.copy()
+        first = self.log.history.first
+        if len(poses):
+            values = self.solver.values()
+            poses[first:] = [values.atPose3(pose_key(i)).matrix() for i in range(first, len(poses))]
+        return poses
+
+    def _new_solver(self) -> Solver:
+        """An empty solver for as many variables as there will be."""
+        c = self.config
+        return Solver(self._seldom, None if c.lag is None else 2 * (c.lag + c.explicit))
+
+    # --- factors ---
+
+    def _enter_pose(self, change: Change) -> list[int]:
+        """Add the newest pose with its prior or motion to the change, and solve; returns the new factors' slots."""
+        path = self.log.path
+        i = path.count - 1
+        if i >= 3:
+            self._factor_builder.eliminate_late(change)
+        change.values.insert(pose_key(i), to_pose3(path.poses[i]))
+        change.factors.add(pose_factor(self._make, path, i))
+        self._solved = False
+        self.solutions += 1
+        thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver linearises all anew
+        return self.solver.update(change, self._seldom if thorough else self._often)
+
+    # --- the lag ---
+
+    def _overdue(self) -> int | None:
+        """Frame of the oldest pose that shall stay, where others leave in this frame."""
+        return None if self.config.lag is None else overdue(self.log, self.config.lag)
+
+    def _advance(self) -> None:
+        """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
+        first = self._overdue()
+        if first is None:
+            return
+        try:
+            rest = without_old(self.log, self.solver, first, self.config.explicit)
+            self._factor_builder.eliminate_late(rest.change, first, rest.gone)
+            solver = self._new_solver()
+            new = solver.update(rest.change)
+            held = _informed(rest.held, solver)
+            left = self.solver.poses(pose_key(i) for i in range(self.log.history.first, first))
+        except SolverError:
+            return
+        marks = self.log.landmarks
+        self.log.path.poses[first - len(left) : first] = left
+        marks.variable[np.isin(marks.variable, rest.gone)] = -1
+        for track in rest.finished:
+            track.restart()
+        for track in marks.tracks.values():
+            track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
+        self.log.advance(first, rest.gone, rest.prior, held)
+        self._seconds += self.solver.seconds
+        self.solver = solver
+        self._out_of_date()
+
+    # --- the way back from the solver ---
+
+    def _read_back(self, slots: IndexArray) -> None:
+        """Poses of the window and the landmarks just measured, as the solver has them now.
+
+        What lies further back changes seldom: it follows once the window's oldest pose has been revised by as much as
+        makes the solver linearise anew.
+        """
+        path = self.log.path
+        first = max(self.log.history.first, path.count - self.config.window)
+        before = path.poses.copy()
+        path.poses[first:] = self.solver.poses(pose_key(i) for i in range(first, path.count))
+        self._moved += float(np.abs(path.poses[first] - before[first]).max())
+        waited = path.count - self._converged >= _SELDOM * path.count
+        if self._moved > (_STALE if waited else _AT_ONCE * _STALE):
+            self._read_all(before)
+        else:
+            self._place(slots, before)
+
+    def _place(self, slots: IndexArray, before: Array | None = None) -> None:
+        """Positions of landmarks that fit the poses on record; see `backends.smoother.positions.place`."""
+        self.placements += 1
+        place(self._make, self.log, self.solver, slots, before)
+
+    # --- failures ---
+
+    def _diverged(self, slots: IndexArray, z: Array) -> bool:
+        """Whether most of the newest measurements would not pass the gate any more: ISAM2 steps without looking.
+
+        Solving all anew takes long, so it is not said twice in a few frames.
+        """
+        T, marks = self.log.path.poses[-1], self.log.landmarks
+        if self.log.path.count < self._rebuilt + _EVERY:
+            return False
+        h, _ = self._make.stereo.project((marks.position[slots] - T[:3, 3]) @ T[:3, :3])
+        noise = np.broadcast_to(self._make.sigma**2 * np.eye(3), (len(z), 3, 3))
+        passed = chi_square_gate(z - h, noise, self._make.models.gate_probability)
+        return 2 * int(passed.sum()) < len(z)
+
+    def recover(self) -> None:
+        """Rebuild; where the problem has no solution, as it stands; where not even that, without what was measured.
+
+        Where the solver takes nothing at all, it stays broken, and the next step tries again.
+        """
+        for solved, forget in ((True, False), (False, False), (False, True)):
+            if forget:
+                self.log.forget_measurements()
+            with suppress(SolverError):
+                self._rebuild(solved)
+                return
+
+    def _rebuild(self, solved: bool = True) -> None:
+        """A new solver for all that is on record, solved as a whole first.
+
+        Raises:
+            SolverError: that cannot be solved either.
+        """
+        self.rebuilds += 1
+        change, places = whole_problem(self._make, self.log)
+        start = time.process_time()
+        try:
+            if solved:
+                change.values = optimise(change)
+            prior = self.log.history.prior
+            held = None if prior is None else held_pose(self.log, prior, change.values)
+        finally:
+            self._seconds += time.process_time() - start
+        if held is not None:
+            change.factors.add(held.factor())
+        solver = self._new_solver()
+        new = solver.update(change)
+        with suppress(SolverError):
+            held = _informed(held, solver)
+        self._broken = True  # until all of the following has been done
+        self.log.history.held = held
+        for track in self.log.landmarks.tracks.values():
+            track.factor = -1
+        for track, number in places:
+            track.factor = new[number]
+        self._seconds += self.solver.seconds
+        self.solver, self._rebuilt = solver, self.log.path.count
+        self.solutions += 1
+        self._read_all()
+        self._broken = False
+
+
+def _informed(held: Held | None, solver: Solver) -> Held | None:
+    """What is known of the pose that is held, by a solver that is new."""
+    return None if held is None else held.informed(solver.joint_covariance([held.key]))

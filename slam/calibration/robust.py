@@ -1,0 +1,25 @@
+"""Weights of residuals that may be outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from slam.geometry.se3 import Array
+
+_DEGREES = 4.0  # of freedom of Student's t: its tails are those of matches, a few of which are wrong
+
+
+def student_weights(squared: Array, dof: int, least: float) -> Array:
+    """Weights (N,) of residuals by Student's t distribution, as the information that each is worth.
+
+    Args:
+        squared: squared residuals (N,), in units of a covariance of which the scale is not known.
+        dof: numbers in a residual.
+        least: least scale, as a standard deviation. The scale is the median of `squared` over that of χ².
+    """
+    if not len(squared):
+        return squared
+    median = 2 * float(gammaincinv(dof / 2, 0.5))
+    scale = max(float(np.median(squared)) / median, least**2)
+    return np.asarray((_DEGREES + dof) / (_DEGREES + squared / scale) / scale)

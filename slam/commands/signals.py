@@ -1,0 +1,76 @@
+"""Signals that end a run: frames that are being worked on are completed first, and files with them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from slam.data import FrameResult
+
+#: Signals that end a run with all its files: Ctrl-C, a request to end, a closed terminal.
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+class Stopped(BaseException):
+    """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def catch_signals() -> None:
+    """Have the signals raise `Stopped`, but for those that this process is told to ignore."""
+    for name in _SIGNALS:
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
+            signal.signal(number, _stop)
+
+
+_pending: list[int] = []  # a signal that waits for the end of a frame
+_in_frames = False
+_until: threading.Event | None = None  # ends the frames of a live run
+
+
+def _stop(number: int, frame: object) -> None:
+    """Stop at once; while frames are worked on, after the present one, so that all files agree. Twice: at once.
+
+    Frames of a live run are not waited for any more; that is how one from a camera ends.
+    """
+    if not _in_frames or _pending or (_until is not None and _until.is_set()):
+        raise Stopped(number)
+    if _until is not None:
+        _until.set()
+        if number == signal.SIGINT:
+            return
+    _pending.append(number)
+
+
+@contextmanager
+def whole_frames(
+    after_frame: Callable[[FrameResult], None], until: threading.Event | None = None
+) -> Iterator[Callable[[FrameResult], None]]:
+    """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
+
+    Args:
+        after_frame: is called, too.
+        until: set by a signal; its run then has no more frames, and Ctrl-C has no further effect.
+    """
+    global _in_frames, _until
+
+    def end_of_frame(result: FrameResult) -> None:
+        after_frame(result)
+        if _pending:
+            raise Stopped(_pending.pop())
+
+    _in_frames, _until = True, until
+    try:
+        yield end_of_frame
+        if _pending:  # no frame came after it
+            raise Stopped(_pending.pop())
+    finally:
+        _in_frames, _until = False, None

@@ -1,0 +1,148 @@
+"""What a run gathers frame by frame, and what its ``summary.json`` says of it: accuracy, consistency and times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from slam.data import Estimate, FrameResult
+from slam.evaluation.summary import consistency, evaluate
+from slam.geometry.se3 import Array
+from slam.geometry.trajectory import Trajectory
+from slam.interfaces import Backend
+from slam.landmarks import LandmarkRows
+from slam.objects.metrics import ObjectScore
+from slam.run.replay import Recording
+from slam.run.schema import STAGES
+from slam.runtime.compile_clock import compile_clock, working_time
+from slam.sequences import Sequence
+from slam.sequences.live import LiveFrames
+from slam.system import StereoSlam
+
+
+@dataclass
+class RunRecord:
+    """What a run has gathered so far: the online path, frame by frame, but for frames that have no pose at all."""
+
+    numbers: list[int] = field(default_factory=list)
+    stamps: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    statuses: list[str] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    measured: list[bool] = field(default_factory=list)
+    milliseconds: list[dict[str, float]] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
+    compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
+    ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
+    rejected: int = 0
+    used: int = 0
+    returned: int | None = None  # the first frame in which landmarks of an old place came back
+    nis: float = 0.0
+    nis_dof: int = 0
+
+    def add(self, number: int, result: FrameResult) -> None:
+        """Take in one frame, `number` in its sequence."""
+        self.numbers.append(number)
+        if len(result.returned) and self.returned is None:
+            self.returned = number
+        self.statuses.append(result.status.value)
+        self.milliseconds.append(dict(result.milliseconds))
+        self.times.append(working_time())
+        if not result.located:
+            return
+        self.stamps.append(result.estimate.stamp)
+        self.poses.append(result.estimate.T_world_left)
+        self.covariances.append(result.estimate.covariance)
+        self.measured.append(result.status.measured)
+        self.rejected += len(result.report.rejected)
+        self.used += len(result.report.used)
+        if result.report.dof:
+            self.nis += result.report.nis
+            self.nis_dof += result.report.dof
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The online path."""
+        return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A back end that is given a recording, as the summary sees a system."""
+
+    recording: Recording
+    backend: Backend
+    record: RunRecord
+
+    def trajectory(self) -> Trajectory:
+        """The back end's final estimate of every frame's pose."""
+        return self.backend.trajectory()
+
+    def estimate(self) -> Estimate:
+        """Pose and map with covariances."""
+        return self.backend.estimate()
+
+    @property
+    def landmarks(self) -> LandmarkRows:
+        """How often, and when last, each landmark was given so far."""
+        return self.recording.landmarks(len(self.record.stamps))
+
+
+def results_of(
+    sequence: Sequence | Recording,
+    system: StereoSlam | Replayed,
+    record: RunRecord,
+    final: Trajectory,
+    score: ObjectScore | None,
+) -> dict[str, Any]:
+    """The part of a summary that says how good the run was."""
+    measured = np.array(record.measured)
+    found: dict[str, Any] = {
+        "path_length_m": record.trajectory.length,
+        "landmarks": 0 if system.landmarks is None else len(system.landmarks),
+        "observations": {"used": record.used, "rejected": record.rejected},
+        "accuracy": {
+            "online": evaluate(record.trajectory.select(measured), sequence),
+            "final": evaluate(final.select(np.isin(final.stamps, record.trajectory.stamps[measured])), sequence),
+            "poses left out": int((~measured).sum()),
+        },
+        "consistency": {
+            "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
+            **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
+        },
+    }
+    if isinstance(system, StereoSlam):
+        found["self_calibration"] = system.calibration.summary()
+        found["loops"] = system.atlas.summary()
+    if score is not None:
+        found["objects"] = score.summary()
+    compiled = compile_clock.seconds() - record.compiled_before
+    return {
+        **found, "milliseconds": _timings(record), "frames_per_second": _rate(record), "compile_seconds": compiled,
+    }  # fmt: skip
+
+
+def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
+    """Frames that came too late, and how old frames were when they were done."""
+    later = 1e3 * np.array(record.ages[1:] or record.ages or [np.nan])  # the first may wait for compilers
+    return {
+        "frames dropped": live.dropped,
+        "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
+        "clock waited [s]": live.clock_waited,
+    }
+
+
+def _rate(record: RunRecord) -> float | None:
+    """Frames per second over all frames but the first, compiling left out; None for a single frame."""
+    seconds = record.times[-1] - record.times[0]
+    return (len(record.times) - 1) / seconds if seconds > 0 else None
+
+
+def _timings(record: RunRecord) -> dict[str, Any]:
+    """Median per stage over all frames but the first, and the first frame's total [ms]."""
+    totals = [sum(m.values()) for m in record.milliseconds]
+    later = record.milliseconds[1:] or record.milliseconds
+    median = {stage: float(np.median([m.get(stage, 0.0) for m in later])) for stage in STAGES}
+    return {"median": median, "median_total": float(np.median(totals[1:] or totals)), "first_frame": totals[0]}

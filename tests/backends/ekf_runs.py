@@ -1,0 +1,54 @@
+"""Runs of the EKF on simulated scenes, for its tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from backends.ekf import EkfBackend
+from slam.data import Observations
+from slam.geometry import se3
+from slam.models import EstimatorModels, MotionModel
+from tests.backends.scenes import Scene, path, scene, step
+
+FORWARD, STILL = np.array([0, 0, 1.5]), np.zeros(3)
+YAW, ROLL = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
+MODELS = EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5)
+
+
+def errors(backend: EkfBackend, truth: np.ndarray) -> np.ndarray:
+    """Largest rotation [rad] and translation error [m] over the trajectory."""
+    xi = se3.log(se3.inverse(truth) @ backend.trajectory().poses)
+    return np.array([np.linalg.norm(xi[:, :3], axis=1).max(), np.linalg.norm(xi[:, 3:], axis=1).max()])
+
+
+def nees(backend: EkfBackend, truth: np.ndarray) -> float:
+    found = backend.estimate(landmarks=False)
+    xi = se3.log(se3.inverse(found.T_world_left) @ truth)
+    return float(xi @ np.linalg.solve(found.covariance, xi))
+
+
+def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """A covariance in units of another's standard deviations: entries of m², m rad/s and 1/m² become comparable."""
+    deviation = np.sqrt(np.diag(of))
+    return P / np.outer(deviation, deviation)
+
+
+def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:
+    """A filter after some frames of a scene, and the landmarks it knows."""
+    backend, known = EkfBackend(data.rig, models, **options), set()
+    for stamp, _, seen in list(data)[:frames]:
+        step(backend, stamp, seen, known)
+    return backend, known
+
+
+def predicted(data: Scene, frames: int, **options) -> tuple[EkfBackend, Observations]:
+    """A filter with frame number `frames` predicted, and what it will see there of its map."""
+    backend, known = halfway(data, frames, **options)
+    backend.predict(float(data.stamps[frames]))
+    seen = data.observations[frames]
+    return backend, seen.select(np.array([i in known for i in seen.ids.tolist()]))
+
+
+def turning_drive() -> Scene:
+    """A drive of 30 frames that turns."""
+    return scene(path(30, 0.1, FORWARD, 0.3 * YAW), points=300)

@@ -1,0 +1,298 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from backends.ekf import EkfBackend
+from slam.data import Observations, UpdateStatus
+from slam.errors import MeasurementError
+from slam.geometry import se3
+from slam.models import EstimatorModels, MotionModel, models_for
+from tests.backends.ekf_runs import (
+    FORWARD,
+    MODELS,
+    ROLL,
+    STILL,
+    YAW,
+    errors,
+    halfway,
+    nees,
+    predicted,
+    turning_drive,
+)
+from tests.backends.scenes import RIG, Scene, cloud, observe, path, run, scene, step
+
+# --- gaps and turns ---
+
+
+@pytest.fixture(scope="module")
+def drive() -> Scene:
+    return turning_drive()
+
+
+@pytest.mark.parametrize("rate", [YAW, ROLL, np.array([0.6, 0.6, 0.6])], ids=["heading", "roll", "all"])
+def test_the_angles_singularity_is_harmless(rate):
+    data = scene(path(70, 0.1, 0.2 * FORWARD, rate), points=1000)  # turns by 400 degrees
+    backend = EkfBackend(RIG, MODELS)
+    reports = run(backend, data)
+    assert errors(backend, data.poses).max() < 0.03
+    assert nees(backend, data.poses[-1]) < chi2.ppf(0.9999, 6)
+    assert sum(len(r.rejected) for r in reports) < 10
+
+
+def test_a_turn_through_the_singularity_in_one_step():
+    data = scene(path(30, 0.5, STILL, 4 * ROLL), points=300)  # 115 degrees a frame
+    backend = EkfBackend(RIG, replace(MODELS, initial_angular_velocity_sigma=3.0))
+    known: set[int] = set()
+    for stamp, guess, seen in data:
+        backend.predict(stamp)
+        old = np.array([i in known for i in seen.ids.tolist()], bool)
+        backend.update(seen.select(old), guess)
+        backend.add(seen.select(~old))
+        known.update(seen.ids.tolist())
+        assert np.linalg.eigvalsh(backend.estimate(False).covariance).min() > 0
+    assert errors(backend, data.poses)[0] < 0.02
+
+
+def test_the_first_step_may_be_long():
+    """A car at 15 m/s with points at 10 m, when nothing is known of its speed."""
+    for seed in range(5):
+        poses, rng = path(3, 0.1, 10 * FORWARD, 0.1 * YAW), np.random.default_rng(seed)
+        points = cloud(poses, 60, rng, 6.0, 14.0)
+        backend, known = EkfBackend(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
+        for k, T in enumerate(poses):
+            report = step(backend, 0.1 * k, observe(T, points, 0.5, rng, 60), known)
+        assert len(report.used) > 15 and len(report.rejected) <= 1
+        assert errors(backend, poses).max() < 0.12
+        assert nees(backend, poses[-1]) < chi2.ppf(0.9999, 6)
+
+
+@pytest.mark.parametrize("gap", [1.0, 3.0])
+def test_gaps_of_seconds(gap):
+    poses, rng = path(6, gap, 3 * FORWARD, 0.05 * YAW), np.random.default_rng(0)
+    points = cloud(poses, 300, rng, 5.0, 40.0)
+    backend, known = EkfBackend(RIG, replace(models_for("driving"), pixel_sigma=0.5)), set()
+    for k, T in enumerate(poses):
+        report = step(backend, gap * k, observe(T, points, 0.5, rng, 40), known)
+        assert k == 0 or len(report.used) > 5 * len(report.rejected)
+    assert np.linalg.norm(backend.trajectory().poses[-1][:3, 3] - poses[-1][:3, 3]) < 0.05 * 5 * gap * 4.5
+
+
+def test_a_shock_beyond_the_motion_model_is_followed():
+    before = path(15, 0.1, 0.3 * FORWARD, STILL)
+    after = before[-1] @ path(15, 0.1, np.array([1.2, 0, 0]), 0.8 * YAW)[1:]
+    data = scene(np.concatenate([before, after]), points=300)
+    backend = EkfBackend(RIG, EstimatorModels(MotionModel(0.1, 0.1), pixel_sigma=0.5))
+    reports = run(backend, data)
+    assert all(len(r.used) > len(r.rejected) for r in reports[1:])
+    assert errors(backend, data.poses).max() < 0.05
+
+
+@pytest.mark.parametrize("gap", [1e3, 1e5, 1e9])
+def test_a_gap_of_any_length(gap):
+    """A paused recording, while the camera was moved a little: tracked again from the first frame on."""
+    for moved in (np.zeros(6), np.array([0.1, -0.3, 0.05, 0.4, -0.2, 0.3])):
+        before = path(15, 0.1, 0.5 * FORWARD, 0.1 * YAW)
+        poses = np.concatenate([before, before[-1] @ se3.exp(moved) @ path(15, 0.1, 0.5 * FORWARD, 0.1 * YAW)])
+        data = scene(poses, points=200)
+        backend, known = EkfBackend(RIG, MODELS), set()
+        for k, (stamp, _, seen) in enumerate(data):
+            report = step(backend, stamp + (gap if k >= 15 else 0), seen, known)
+            assert k == 0 or len(report.used) > 5 * len(report.rejected)
+        assert errors(backend, poses)[1] < 0.05
+        P = backend._state.covariance.full()
+        assert np.linalg.eigvalsh(P / np.sqrt(np.outer(P.diagonal(), P.diagonal()))).min() > 0
+
+
+@pytest.mark.parametrize("count", [5, 7, 20])
+def test_known_landmarks_are_found_again_after_a_blind_stretch(count):
+    """The camera went where the motion model does not expect it, and sees but landmarks it knows: it starts there."""
+    before, after = path(15, 0.1, 0.3 * FORWARD, STILL), path(20, 0.1, 0.3 * FORWARD, 0.1 * YAW)
+    hidden = se3.exp(np.array([0.05, 0.3, -0.1, 1.5, -0.5, 1.0]))
+    poses = np.concatenate([before, before[-1] @ hidden @ after])
+    rng = np.random.default_rng(2)
+    points = cloud(poses[:1], 60, rng, 6.0, 12.0)
+    backend, known = EkfBackend(RIG, EstimatorModels(MotionModel(0.02, 0.02), pixel_sigma=0.5)), set()
+    for k, T in enumerate(before):
+        step(backend, 0.1 * k, observe(T, points, 0.5, rng, 60), known)
+    backend.predict(1.6)
+    for k, T in enumerate(poses[15:]):
+        backend.predict(1.7 + 0.1 * k)
+        seen = observe(T, points, 0.5, rng, 60)
+        report = backend.update(seen.select(np.array([i in known for i in seen.ids.tolist()])).select(np.arange(count)))
+        assert k == 0 or len(report.used) > len(report.rejected)
+    assert np.linalg.norm(backend.trajectory().poses[-1][:3, 3] - poses[-1][:3, 3]) < 0.05
+    assert nees(backend, poses[-1]) < chi2.ppf(0.9999, 6)
+
+
+@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
+def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks):
+    """Two maps, each seen after a gap of years, joined by one look: half of the landmarks are not in it."""
+    backend, rng = EkfBackend(RIG, EstimatorModels(pixel_sigma=0.5), landmarks=landmarks), np.random.default_rng(0)
+    points = cloud(np.eye(4)[None], 80, rng)
+    ids = np.arange(len(points))
+
+    def seen(which: np.ndarray) -> Observations:
+        all_ = observe(np.eye(4), points, 0.5, rng, limit=80)
+        return all_.select(np.isin(all_.ids, which))
+
+    backend.predict(0.0)
+    backend.add(seen(ids[:30]))
+    backend.predict(1e9)
+    backend.add(seen(ids[30:]))
+    backend.predict(1e9 + 1e5)
+    report = backend.update(seen(ids[::2]))
+    assert report.status is UpdateStatus.OK and len(report.used) > 15
+    P = backend._state.covariance.full()
+    deviation = np.sqrt(P.diagonal())
+    assert np.linalg.eigvalsh(P / np.outer(deviation, deviation))[0] > 0
+    assert (np.linalg.eigvalsh(backend.estimate().covariances)[:, 0] > 0).all()
+
+
+def test_a_pair_that_is_not_in_step_moves_nothing():
+    """The first right images were taken at other times, at 10 m/s: their landmarks contradict all that follows."""
+    poses, rng = path(10, 0.1, 6.7 * FORWARD, STILL), np.random.default_rng(1)
+    models = replace(models_for("driving"), pixel_sigma=0.5)
+    points = cloud(poses, 150, rng, 10.0, 50.0)
+    backend, known = EkfBackend(RIG, models), set()
+    late = se3.pose(np.eye(3), [0, 0, 0.5])
+    for k, T in enumerate(poses):
+        seen = observe(T, points, 0.5, rng, 150)
+        if k < 2:
+            local = se3.transform(se3.inverse(T @ late if k else T @ se3.inverse(late)), points[seen.ids])
+            seen = Observations(seen.ids, seen.uv_left, RIG.project(local)[1])
+        if k in (1, 2):  # as long as there is nothing else to see
+            seen = seen.select(np.array([i in known for i in seen.ids.tolist()], bool))
+        step(backend, 0.1 * k, seen, known)
+        off = se3.log(se3.inverse(T) @ backend.trajectory().poses[-1])
+        assert np.linalg.norm(off[:5]) < 0.3 and abs(off[5]) < 0.7 * T[2, 3] + 0.1
+
+
+# --- robustness ---
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_wrong_matches_are_found(drive, share):
+    rng = np.random.default_rng(3)
+    backend, known, missed, false, wrong = EkfBackend(RIG, MODELS), set(), 0, 0, 0
+    for stamp, _, seen in drive:
+        old = np.array([i in known for i in seen.ids.tolist()], bool)
+        backend.predict(stamp)
+        bad = old & (rng.random(len(seen)) < share)
+        shift = np.where(bad[:, None], rng.normal(0, 30, (len(seen), 2)), 0.0)
+        spoilt = Observations(seen.ids, seen.uv_left + shift, seen.uv_right + shift)
+        report = backend.update(spoilt.select(old))
+        backend.add(seen.select(~old))
+        known.update(seen.ids.tolist())
+        wrong += bad.sum()
+        missed += np.isin(seen.ids[bad], report.used).sum()
+        false += np.isin(seen.ids[old & ~bad], report.rejected).sum()
+    assert wrong > 50 and missed < 0.03 * wrong  # some shifts are small
+    assert false < 10
+    assert errors(backend, drive.poses).max() < 0.04
+
+
+def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
+    """An innovation within its own wide gate, but not where the others say: the velocity is unknown at first."""
+    models = replace(models_for("driving"), pixel_sigma=0.5)
+    backend, seen = predicted(drive, 1, models=models)
+    uv_left, uv_right = seen.uv_left.copy(), seen.uv_right.copy()
+    uv_left[5] += [8.0, -6.0]
+    uv_right[5] += [8.0, -6.0]
+    report = backend.update(Observations(seen.ids, uv_left, uv_right))
+    np.testing.assert_array_equal(report.rejected, seen.ids[[5]])
+
+
+def test_a_point_predicted_behind_the_camera_does_no_harm(drive):
+    backend, seen = predicted(drive, 5)
+    behind = backend._state.landmarks.slots(seen.ids[:1])
+    backend._state.landmarks.state[behind] *= [1, 1, -1]
+    report = backend.update(seen)
+    assert report.status is UpdateStatus.OK and report.rejected.tolist() == seen.ids[:1].tolist()
+
+
+def test_nothing_that_agrees_leaves_the_prediction(drive):
+    backend, seen = predicted(drive, 5)
+    before = backend.estimate()
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(100, 200, (len(seen), 2)) * rng.choice([-1, 1], (len(seen), 2))
+    report = backend.update(Observations(seen.ids, seen.uv_left + noise, seen.uv_right + noise[::-1]))
+    assert report.status is UpdateStatus.EMPTY and report.reason
+    np.testing.assert_array_equal(report.rejected, seen.ids)
+    np.testing.assert_array_equal(backend.estimate().T_world_left, before.T_world_left)
+    np.testing.assert_array_equal(backend.estimate().covariance, before.covariance)
+
+
+@pytest.mark.parametrize("entry", [-1.0, np.nan, np.inf])
+@pytest.mark.parametrize("where", ["pose", "landmark"])
+def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
+    backend, seen = predicted(drive, 5)
+    backend._state.covariance.make_local(backend._state.landmarks.slots(seen.ids))  # these are local now
+    row = (
+        1
+        if where == "pose"
+        else 12 + 3 * int(backend._state.covariance._place[backend._state.landmarks.slots(seen.ids[3:4])[0]])
+    )
+    backend._state.covariance._local[row, row] = entry
+    before, camera, points = (
+        backend._state.covariance.full(),
+        backend._state.camera.copy(),
+        backend._state.landmarks.points.copy(),
+    )
+    report = backend.update(seen)
+    assert report.status is UpdateStatus.FAILED and "ekf" in report.reason
+    assert len(report.used) == 0
+    np.testing.assert_array_equal(backend._state.covariance.full(), before)
+    np.testing.assert_array_equal(backend._state.camera, camera)
+    np.testing.assert_array_equal(backend._state.landmarks.points, points)
+
+
+@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
+def test_far_points_stay_before_the_camera(landmarks):
+    """Points at 60 to 400 m, whose disparity is all noise: no position and no covariance loses its meaning.
+
+    Nor do they hold up the first steps: the inverse depth of some wants to be negative.
+    """
+    rng = np.random.default_rng(5)
+    poses = path(40, 0.1, np.array([0, 0, 2.0]), 0.02 * YAW)
+    points = np.concatenate([cloud(poses, 60, rng, 4.0, 15.0), cloud(poses, 120, rng, 60.0, 400.0)])
+    backend, known = EkfBackend(RIG, replace(MODELS, pixel_sigma=0.7), landmarks=landmarks), set()
+    for k, T in enumerate(poses):
+        step(backend, 0.1 * k, observe(T, points, 0.7, rng, 180), known)
+        found = backend.estimate()
+        depth = ((found.positions - T[:3, 3]) @ T[:3, :3])[found.ids >= 60, 2]
+        assert landmarks == "euclidean" or (depth > 0).all()
+        assert np.linalg.eigvalsh(found.covariances).min() > 0
+        np.testing.assert_array_equal(found.covariances, np.swapaxes(found.covariances, 1, 2))
+    assert landmarks == "euclidean" or errors(backend, poses)[1] < 0.05
+
+
+@pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
+@pytest.mark.parametrize("disparity", [1e-6, 1e-12])
+def test_hardly_any_disparity(drive, disparity, landmarks):
+    backend, known = halfway(drive, 6, landmarks=landmarks)
+    new, seen = max(known) + 1, drive.observations[6]
+    left = np.array([[300.0, 200.0]])
+    backend.add(Observations(np.array([new]), left, left - [disparity, 0]))
+    backend.predict(0.6)
+    report = backend.update(seen.select(np.array([i in known for i in seen.ids.tolist()])))
+    assert report.status is UpdateStatus.OK and len(report.rejected) < 3
+    P = backend._state.covariance.full()
+    d = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(d, d)).min() > 0
+    assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0
+
+
+@pytest.mark.parametrize("pixel", [1e7, 1e300])
+def test_no_pixel_of_a_camera(drive, pixel):
+    backend, seen = predicted(drive, 5)
+    uv = seen.uv_left.copy()
+    uv[3, 0] = pixel
+    with pytest.raises(MeasurementError, match="pixel"):
+        backend.update(Observations(seen.ids, uv, seen.uv_right))
+    uv[3, 0] = 0.9e6  # no camera has it, but a number that can be worked with
+    report = backend.update(Observations(seen.ids, uv, seen.uv_right))
+    np.testing.assert_array_equal(report.rejected, seen.ids[[3]])
