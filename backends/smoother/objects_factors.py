@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.stereo import RectifiedStereo
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.object_models import ObjectModels
 
