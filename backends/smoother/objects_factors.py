@@ -1,4 +1,4 @@
-"""What ties a body's recent poses, the camera's, and the body's points together, linearised.
+"""Linearised factors between a body's recent poses, the camera's, and the body's points.
 
 Unknown are, for each of the n frames of the window, the right perturbation of the body's pose and that of the camera's
 (6 + 6), then the positions of the p points in body coordinates (3 each).

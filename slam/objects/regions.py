@@ -1,4 +1,4 @@
-"""Which tracks moved together, against the rest of the scene: the test that a wrong camera pose cannot fool.
+"""Which tracks moved together, relative to the rest of the scene: a test that a wrong camera pose does not affect.
 
 Each track brings a displacement ``d_i`` (3,): where its last few frames see it, less where the frames before did. A
 camera pose that is off moves all still points by one small rigid motion ``d_i = ρ + θ × (p_i − c)``; so does a body's

@@ -1,4 +1,4 @@
-"""What back ends share where most observations contradict a prediction: the prediction is at fault then, not they."""
+"""What both back ends do where most observations contradict the prediction: then the prediction itself is wrong."""
 
 from __future__ import annotations
 
