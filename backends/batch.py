@@ -1,4 +1,4 @@
-"""The maximum-likelihood answer over all measurements, by Levenberg-Marquardt: the yardstick for the other back ends.
+"""The maximum-likelihood estimate from all measurements, by Levenberg-Marquardt: the reference for back ends.
 
 Every landmark is a variable and every accepted measurement a factor of its own; nothing is approximated.
 """

@@ -32,14 +32,15 @@ Every number in the algorithms that is not a setting, with what it is and where 
 SENSITIVITY = """\
 The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position,
 and that of the bodies' motion, each as a ratio to the error with the default. It is the worse of both back ends, and
-the geometric mean over short runs of {cases} (`python experiments/sensitivity.py`). Under small perturbations of the
-pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose ratios lie within does not matter
-there.
+the geometric mean over short runs of {cases} (`python experiments/sensitivity.py`).
+Under small perturbations of the pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose
+ratios lie within does not matter there.
 
 - "same": the same bytes.
 - "fails": a run did not end, or lost the camera or the bodies.
 - "not read": none of these runs comes to the code that reads the number, as that for faults and long runs.
-- Empty: not measured. Such numbers are compiled into kernels, read on import, or belong to the front end{rest}.
+- Empty: not measured. Such numbers are compiled into kernels, are read on import, or belong to the front
+  end{rest}.
 """
 
 
@@ -151,9 +152,9 @@ def _row(cells: list[str]) -> str:
 
 
 def _ratio(measured: dict[str, float | str]) -> str:
-    """The ratios of the camera's and the bodies' errors, or what happened instead."""
-    values = [f"{v:.2f}" if isinstance(v, float) else v for v in measured.values()]
-    return " / ".join(values[:1] if len(set(values)) == 1 and isinstance(measured["camera"], str) else values)
+    """The ratios of the camera's and the bodies' errors, or one word where that says it all."""
+    values = [f"{v:.2f}" if isinstance(v, float) else str(v) for v in map(measured.get, ("camera", "bodies")) if v]
+    return values[0] if values and values[0] in ("same", "fails", "not read") else " / ".join(values)
 
 
 def main() -> int:

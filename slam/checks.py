@@ -10,6 +10,12 @@ from slam.geometry.arrays import Array
 #: Farthest pixel from the origin [px] and latest stamp from zero [s] that are taken for a measurement.
 FARTHEST_PIXEL, LATEST_STAMP = 1e6, 1e12
 
+#: Largest coordinate of a position [m]: beyond, a double has too few digits for what a camera sees.
+FARTHEST_POSITION = 1e8
+
+#: Largest id of a landmark, and largest count, in files: doubles hold them exactly, and there is room for later ones.
+MOST_ID = 2**53
+
 
 def require_stamp(owner: str, stamp: float, last: float | None) -> None:
     """Check the time to which a back end is to be advanced.

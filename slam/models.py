@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.bounds import require_not_negative as require_not_negative
 from slam.bounds import require_positive
+from slam.checks import FARTHEST_POSITION
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import Array
 from slam.naming import unknown
@@ -16,7 +17,6 @@ from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
 _DENSITIES = (1e-6, 1e6)  # of velocity noise
-_FARTHEST = 1e8  # coordinate of the first position [m]: beyond it, the rounding of a position is no longer small
 _SIGMAS = (1e-7, 1e6)  # of the initial state
 _RANGES = {
     "pixel_sigma": (1e-3, 1e3),
@@ -98,7 +98,7 @@ class EstimatorModels:
         require_positive(self, _RANGES)
         if self.T_world_left is not None:
             T = _numbers(self.T_world_left)
-            if T.shape != (4, 4) or not (np.abs(T) <= _FARTHEST).all() or not _is_rotation(T[:3, :3]):
+            if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_POSITION).all() or not _is_rotation(T[:3, :3]):
                 raise ConfigurationError("T_world_left must be a (4, 4) pose: a rotation and a translation")
             object.__setattr__(self, "T_world_left", tuple(map(tuple, T.tolist())))
         if self.gate_probability >= 1:

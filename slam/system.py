@@ -1,4 +1,4 @@
-"""The system: one step of stereo SLAM, whatever detects and whatever estimates."""
+"""The system: one step of stereo SLAM, with any front end and any back end."""
 
 from __future__ import annotations
 

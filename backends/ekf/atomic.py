@@ -1,4 +1,4 @@
-"""Calls that happen or do not: where one is broken off, for whatever reason, the filter is as it was before."""
+"""A call that is interrupted, or raises an exception, leaves the filter as it was before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter's covariance matrix: exact, but the part far from the camera is brought up to date only when needed.
+"""The filter's covariance matrix: exact, but the part far from the camera is updated only when needed.
 
 An update of a few landmarks changes every entry of the matrix, but until one of the others is measured nobody looks at
 most of these. So the camera and the landmarks measured of late, the local part L, are kept as a small dense matrix;

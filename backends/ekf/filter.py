@@ -28,10 +28,8 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.tracking.agreement import landmarks_pose
+from slam.tracking.agreement import INFLATION, landmarks_pose
 
-#: Process-noise inflation: factors of the impulses' standard deviation, tried where most observations disagree.
-_INFLATION = (3.0, 10.0)
 _PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
 _VAGUE = 1e3  # deviation of an innovation, in those of a pixel, above which all of P is brought up to date
@@ -266,7 +264,7 @@ class EkfBackend:
         if len(self._stamps) < 2:
             return []
         noise = motion_noise(self.models, self._stamps[-1] - self._stamps[-2])
-        return [factor**2 * noise for factor in _INFLATION]
+        return [factor**2 * noise for factor in INFLATION]
 
     def _landmarks_pose(self, problem: Problem, slots: IndexArray) -> Array | None:
         """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""

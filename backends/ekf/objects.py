@@ -31,12 +31,8 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
-from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
-
-#: By how much an impulse may exceed its standard deviation where most observations say so.
-_SURPRISES = (0.0, 3.0, 10.0)
-_ENOUGH = 4  # observations that can be judged to agree with each other
-_FAILURES = 3  # so many rejections running, and a point starts anew
+from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
+from slam.tracking.agreement import INFLATION
 
 
 class ObjectFilter:
@@ -183,8 +179,8 @@ class ObjectFilter:
         seen[rows] = self._now
         sights[rows] += used
         wanted = ~known
-        wanted[known] = failures[rows] >= _FAILURES
-        body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= _FAILURES)
+        wanted[known] = failures[rows] >= REJECTIONS
+        body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= REJECTIONS)
         body, new = self._join(body, o, wanted, camera)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([o.points[known][used], o.points[new]])
@@ -224,9 +220,9 @@ class ObjectFilter:
         As for the camera: the guess and wider motion noise are tried until most pass; if nothing helps, the gate at
         the prediction stands.
         """
-        most = max(_ENOUGH, (len(z) + 1) // 2)
+        most = max(ENOUGH, (len(z) + 1) // 2)
         first: tuple[Body, Gathered, Problem, Gated] | None = None
-        for factor in _SURPRISES:
+        for factor in (0.0, *INFLATION):
             wider = widened(body, factor)
             covariances, problem = self._problem(wider, rows, z, guess, camera)
             for at_guess in (False,) if guess is None else (False, True):
@@ -272,7 +268,7 @@ class ObjectFilter:
 
     def _shape(self, body: Body, h: Array, T_left_body: Array) -> Shape:
         """The body's shape in camera coordinates, by the points it has, or else by the new ones at h (M, 3)."""
-        if len(body.ids) < _ENOUGH:
+        if len(body.ids) < ENOUGH:
             return shape_of(h, self._rig.triangulation_covariance(h, self._models.pixel_sigma))
         D, rows = body.points.derivatives(), RIGID + np.arange(3 * len(body.ids)).reshape(-1, 3)
         own = body.covariance[rows[:, :, None], rows[:, None, :]]

@@ -1,10 +1,12 @@
 """What the filter tries where most observations contradict its prediction.
 
-The prediction is then at fault, and not they. It may be so far off that its linearisation does not hold: then the pose
-on which the matches agree, where the caller knows it, is a better place for that. Or an impulse (or a turn that the
-Euler model does not follow) was larger than the motion model expects: a wider motion noise lets the observations pass.
-Or the filter has lost its way (a stretch with next to nothing to see, a long gap): the landmarks agree on a pose that
-no impulse explains. Then the camera starts anew there, in the same map.
+Then the prediction is wrong, not the observations. There are three cases, tried in turn:
+
+- It is so far off that its linearisation does not hold: the update is linearised where the matches agree on a pose.
+- An impulse was larger than the motion model expects, or the camera turned as the Euler model cannot follow: the
+  process noise is inflated.
+- The filter is lost, after a long gap or a stretch with hardly anything to see: the landmarks agree on a pose that no
+  impulse explains. The camera starts anew there, in the same map.
 """
 
 from __future__ import annotations

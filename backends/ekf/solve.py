@@ -1,4 +1,4 @@
-"""The measurement update on the gathered part of the state: iterated, gated, without touching the filter.
+"""The measurement update of the camera and the measured landmarks: gated and iterated; the filter is not changed.
 
 Every quantity of an update follows from the camera's [r, φ] and the measured landmarks. Their part of the covariance,
 ``P_gg``, is small (6 + 3M), so that iterating and gating cost little; the whole state changes once, at the end, by

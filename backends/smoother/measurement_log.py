@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from backends.smoother.landmarks import Known, Landmarks, Track
 from backends.smoother.path import Path, grown
-from slam.data import IndexArray as IndexArray
+from slam.data import IndexArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 

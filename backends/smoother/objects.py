@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, velocities
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
@@ -23,18 +22,16 @@ from backends.smoother.objects_window import (
 from backends.smoother.path import Path
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.uncertainty import PoseSet
-from slam.data import BoolArray, IdArray, Observations
+from slam.data import BoolArray, IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
-from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
+from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
 
 _LAG = 4  # frames of a window at least
 _BATCH = 2  # so many frames leave it together: that costs hardly more than for one
 _ITERATIONS = 2  # linearisations of a body's window in a frame
-_ENOUGH = 4  # points that show a shape
-_FAILURES = 3  # so many rejections running, and a point starts anew
 # Keeps poses of the camera apart that are taken to move together: of each variance, and at least [rad², m²].
 _JITTER, _LEAST = 1e-8, 1e-14
 
@@ -181,9 +178,9 @@ class ObjectSmoother:
         unseen[rows] = 0
         sights[rows] += used
         wanted = ~known
-        wanted[known] = failures[rows] >= _FAILURES
+        wanted[known] = failures[rows] >= REJECTIONS
         window = replace(window, failures=failures, unseen=unseen, sights=sights)
-        window = without_points(window, failures >= _FAILURES)
+        window = without_points(window, failures >= REJECTIONS)
         window, new = self._join(window, camera, seen, wanted)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([seen.ids[known][used], seen.ids[new]])
@@ -212,7 +209,7 @@ class ObjectSmoother:
     def _shape(self, window: Window, h: Array, T_body_left: Array) -> Shape:
         """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
         own = window.point_covariances()
-        if len(own) < _ENOUGH:
+        if len(own) < ENOUGH:
             _, J = self._stereo.project(h)
             inverse_J = np.linalg.inv(J) * self._sigma
             return shape_of(h, inverse_J @ np.swapaxes(inverse_J, 1, 2)).seen_from(T_body_left)

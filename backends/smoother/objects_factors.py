@@ -1,4 +1,4 @@
-"""What ties a body's recent poses, the camera's, and the body's points together, linearised.
+"""Linearised factors between a body's recent poses, the camera's, and the body's points.
 
 Unknown are, for each of the n frames of the window, the right perturbation of the body's pose and that of the camera's
 (6 + 6), then the positions of the p points in body coordinates (3 each).
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.stereo import RectifiedStereo
+from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.object_models import ObjectModels
 

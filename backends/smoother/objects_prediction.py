@@ -7,18 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import pose_only
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, first_sigmas, impulse_sigmas, velocities
 from backends.smoother.objects_window import CameraWindow, Window
 from backends.smoother.stereo import RectifiedStereo
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
 from slam.object_models import ObjectModels
+from slam.objects.points import ENOUGH
+from slam.tracking.agreement import INFLATION
 from slam.tracking.gating import chi_square_limits
-
-#: By how much an impulse may exceed its standard deviation where most observations say so.
-_SURPRISES = (0.0, 3.0, 10.0)
-_ENOUGH = 4  # observations that can be judged to agree with each other
 
 
 @dataclass(frozen=True)
@@ -113,11 +110,11 @@ def agreement(
         z: the observations (M, 3).
         guess: T_world_object (4, 4) to start from, or None.
     """
-    most = max(_ENOUGH, (len(rows) + 1) // 2)
+    most = max(ENOUGH, (len(rows) + 1) // 2)
     limit = float(chi_square_limits(np.array([6]), probability)[0])
     starts = [expected.T_body_left] + ([] if guess is None else [inverse(guess) @ expected.X])
     first = None
-    for factor in _SURPRISES:
+    for factor in (0.0, *INFLATION):
         belief = _belief(expected, rows, factor)
         problem = _problem(expected, stereo, sigma, probability, points, rows, z, belief)
         for start in starts:

@@ -16,11 +16,10 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.measurement_log import IndexArray
 from backends.smoother.objects_factors import FRAME, System, add_measurements, add_motion
 from backends.smoother.pose_kernels import moved
 from backends.smoother.stereo import RectifiedStereo
-from slam.data import BoolArray, IdArray
+from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.object_models import ObjectModels
 from slam.objects.points import Shape

@@ -1,4 +1,4 @@
-"""The whole problem once more from the records, solved by Levenberg-Marquardt; the way out when ISAM2 has failed."""
+"""The whole problem set up again from the measurement log and solved by Levenberg-Marquardt, where ISAM2 has failed."""
 
 from __future__ import annotations
 

@@ -1,9 +1,11 @@
 """What the smoother tries where most observations contradict its prediction.
 
-The prediction is then at fault, and not they. It may be so far off that the solution is not found from there: then the
-pose on which the landmarks agree, wherever they stand, is a better place to start from. Or the camera is where its own
-past says it cannot be: the poses were wrong for a while, in a stretch with next to nothing to see. Then the problem
-starts anew with that pose among the landmarks (`FactorGraph.start_anew`), and the poses before it stay as they are.
+Then the prediction is wrong, not the observations. There are two cases, tried in turn:
+
+- It is so far off that the solution is not found from there: the pose on which the landmarks agree is the start.
+- The camera is where its earlier poses say that it cannot be: these were wrong for a while, in a stretch with hardly
+  anything to see. The problem starts anew with that pose among the landmarks (`FactorGraph.start_anew`), and the poses
+  before it stay as they are.
 """
 
 from __future__ import annotations

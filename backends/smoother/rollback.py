@@ -1,4 +1,4 @@
-"""Restores the measurement log as it was before a call that was interrupted: a step either happened or it did not.
+"""Restores the measurement log after a call that was interrupted.
 
 Lists of rows only grow at their end or are replaced by new ones, so that their lengths are enough; arrays are copied.
 Values of poses and measurements that were there before may have been revised since: the solver's are as good as those.

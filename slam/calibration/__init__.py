@@ -1,4 +1,4 @@
-"""The rig as something estimated: what its calibration is off by, from the images alone, with a posterior.
+"""Self-calibration: errors of the rig's calibration, estimated from the images alone, with their uncertainty.
 
 docs/selfcalibration.md derives the estimator. May import `slam.geometry` and the data.
 """

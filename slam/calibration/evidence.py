@@ -1,4 +1,4 @@
-"""What data say about the parameters, added up so that errors that last over many frames are counted as such."""
+"""The likelihood of the parameters, gathered in blocks, so that errors common to neighbouring frames count once."""
 
 from __future__ import annotations
 

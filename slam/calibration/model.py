@@ -1,4 +1,4 @@
-"""What a stereo calibration can be off by, and where that moves pixels: all linear, about the calibration as delivered.
+"""The possible errors of a stereo calibration, and how each moves pixels: linear about the calibration as delivered.
 
 Coordinates are those of the rectified rig: x, y from the principal point in focal lengths, d the disparity in focal
 lengths (inverse depth times the baseline). A parameter is the *correction* that takes what was measured to what an

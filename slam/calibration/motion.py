@@ -1,4 +1,4 @@
-"""What two views of the same still points say: flow and disparity of an ideal rig fit one rigid motion.
+"""The likelihood from two views of the same still points: flow and disparity of an ideal rig fit one rigid motion.
 
 In coordinates (x, y, D), D the true disparity, a rigid motion is a homography. What the rig is off by spoils that in a
 way of its own for each parameter, whatever the motion was.

@@ -1,4 +1,4 @@
-"""How far off a stereo calibration may be before anything is seen: standard deviations, and why."""
+"""The prior of a calibration's errors: standard deviations, with reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the rows of one frame say: matched pixels of an ideal rectified pair lie in one row."""
+"""The likelihood from the rows of one frame: matched pixels of an ideal rectified pair lie in one row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run is worth in numbers: gathered frame by frame, summed up at its end."""
+"""The figures of one run: gathered frame by frame, summed up at its end."""
 
 from __future__ import annotations
 

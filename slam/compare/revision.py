@@ -1,4 +1,4 @@
-"""Which code made a result: what is gone on with later must come from the same."""
+"""Which code made a result: a comparison can be continued with the same code alone."""
 
 from __future__ import annotations
 

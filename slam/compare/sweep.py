@@ -1,4 +1,4 @@
-"""All trials of a comparison, each once: what is done stays done, and a sweep that was killed goes on where it was.
+"""All trials of a comparison, each once: a sweep that was stopped continues where it was.
 
 A trial's folder appears at once with all its files, ``result.json`` among them, and is its own checkpoint.
 """

@@ -17,6 +17,9 @@ import numpy as np
 
 from slam.geometry.arrays import Array as Array
 
+#: Variance [rad², m²] that is added to a pose's covariance to keep it invertible.
+LEAST_VARIANCE = 1e-12
+
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision
 _SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.archives import array, json_text, unpack
+from slam.checks import FARTHEST_POSITION, MOST_ID
 from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
@@ -45,9 +46,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
-_MOST_ID = 2**53  # of landmarks and of counts: there is room for those that follow
 _MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # of descriptors
-_FARTHEST = 1e8  # coordinate of a landmark [m]
 
 _TYPES = {
     "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,
@@ -108,13 +107,16 @@ class SavedMap:
             raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
         if self.seen_from.shape != (n, 3):
             raise SlamError(f"{self.source}: seen_from must be {n} rows of 3 numbers")
-        if n and (self.ids[0] < 0 or self.ids[-1] > _MOST_ID or (np.diff(self.ids) <= 0).any()):
-            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on, up to {_MOST_ID}")
+        if n and (self.ids[0] < 0 or self.ids[-1] > MOST_ID or (np.diff(self.ids) <= 0).any()):
+            raise SlamError(f"{self.source}: landmark ids must ascend from 0 on, up to {MOST_ID}")
         if not (np.abs(self.descriptors) <= _LONGEST).all() or self.dimensions > _MOST_DIMENSIONS:
             raise SlamError(f"{self.source}: a descriptor is not finite, or far too long")
-        if not (np.abs(self.positions) <= _FARTHEST).all() or (np.abs(self.seen_from) > _FARTHEST).any():
+        if (
+            not (np.abs(self.positions) <= FARTHEST_POSITION).all()
+            or (np.abs(self.seen_from) > FARTHEST_POSITION).any()
+        ):
             raise SlamError(f"{self.source}: the position of a landmark is not finite, or too far away")
-        if any(((c := getattr(self, name)) < 0).any() or (c > _MOST_ID).any() for name in ("seen", "in_view")):
+        if any(((c := getattr(self, name)) < 0).any() or (c > MOST_ID).any() for name in ("seen", "in_view")):
             raise SlamError(f"{self.source}: a number of frames is impossible")
         try:
             require_known(self.source, self.ids, self.positions, self.covariances)

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array
-from slam.objects.tracks import ConstantVelocity
+from slam.objects.tracks import MOVES, ConstantVelocity
 
 _NEAR = 7.8  # χ²(3) at 95 %: tracks inside the region
 _AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
-_MOVES = 12.0  # χ²(3) of a velocity from which it counts: 1 % of still points
 _SUPPORT = 3  # tracks of a frame that are a region's support
 _FRAMES = 4  # with support
 _TRACKS = 4  # different ones that have supported it
@@ -77,7 +76,7 @@ class MovingTracks:
         some = ConstantVelocity(
             m.position[kept], m.covariance[kept], m.velocity[kept], m.velocity_covariance[kept], m.test[kept]
         )
-        moves = (some.test > _MOVES) & (np.linalg.norm(some.velocity, axis=1) > min_speed)
+        moves = (some.test > MOVES) & (np.linalg.norm(some.velocity, axis=1) > min_speed)
         return cls(rows[kept], ids[kept], some, radius[kept], moves)
 
     @property

@@ -14,7 +14,8 @@ from slam.geometry.se3 import Array, transform
 Projection = Callable[[Array], tuple[Array, Array]]
 
 _FAR = 4.0  # so many times the median distance from the median point is no part of the body
-_SHAPELY = 4  # points that show a shape
+ENOUGH = 4  #: points that show a shape, and that can be judged to agree with each other
+REJECTIONS = 3  #: so many running, and a point starts anew
 _STEPS = 3  # of Gauss-Newton; the prior is weak where depth is known well
 
 
@@ -60,7 +61,7 @@ def shape_of(points: Array, covariances: Array) -> Shape:
     No extent is taken to be less than half the middle one: a body is seldom flatter than that, and would be taken for
     flat wrongly where depth is all noise. Fewer than four points show no shape: then next to nothing is said.
     """
-    if len(points) < _SHAPELY:
+    if len(points) < ENOUGH:
         return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
     offset = points - points.mean(axis=0)
     total = offset.T @ offset / max(1, len(points) - 1)

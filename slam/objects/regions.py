@@ -1,4 +1,4 @@
-"""Which tracks moved together, against the rest of the scene: the test that a wrong camera pose cannot fool.
+"""Which tracks moved together, relative to the rest of the scene: a test that a wrong camera pose does not affect.
 
 Each track brings a displacement ``d_i`` (3,): where its last few frames see it, less where the frames before did. A
 camera pose that is off moves all still points by one small rigid motion ``d_i = ρ + θ × (p_i − c)``; so does a body's
@@ -24,6 +24,7 @@ from slam.geometry.se3 import Array
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
 from slam.objects.tracks import median, times_vectors
+from slam.tracking.gating import chi_square_limits
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
 _ROUNDS = (3, 2)  # of reweighting: Huber's first, which has one minimum, then a sharper one
@@ -34,7 +35,7 @@ _BETTER = 4.0  # by how much χ² a member must fit its group's motion better th
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _TAIL = 3.0  # tracks; see `limit`
-_MEDIAN = 2.37  # of χ²(3)
+_MEDIAN = float(chi_square_limits(np.array([3]), 0.5)[0])  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _MOST = 20  # windows looked into for the next group

@@ -17,7 +17,7 @@ from slam.geometry.se3 import Array
 from slam.objects.track_kernels import even_motions, fit_fixed_points, leave_window, measurements
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-_MOVES = 12.0  # χ²(3) of the velocity from which it counts: 1 % of still points
+MOVES = 12.0  #: χ²(3) of the velocity from which it counts: 1 % of still points
 _ROOM = 1000  # rows that a table begins with
 
 
@@ -199,7 +199,7 @@ def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed:
 def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> None:
     """Give tracks their even motion, in place, where a fixed point does not explain them; see `even_motion`."""
     m = even_motion(tracks, rows, times, max_speed)
-    moves = m.test > _MOVES
+    moves = m.test > MOVES
     moving = rows[moves]
     tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]
     tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]

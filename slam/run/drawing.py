@@ -1,4 +1,4 @@
-"""Frames with what is seen drawn in: beacons yellow, new ones green, object features black, boxes and axes.
+"""Frames with landmarks and objects drawn in: landmarks yellow, new ones green, object features black, boxes and axes.
 
 The colours are those of paper B, Fig. 10.
 """

@@ -1,4 +1,4 @@
-"""The last things of a run, each done although another one fails."""
+"""The files at the end of a run: each is written even if another one fails."""
 
 from __future__ import annotations
 

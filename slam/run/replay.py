@@ -15,7 +15,7 @@ import numpy as np
 
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.model import RigModel
-from slam.checks import LATEST_STAMP
+from slam.checks import FARTHEST_PIXEL, LATEST_STAMP, MOST_ID
 from slam.data import (
     FrameResult,
     FrameStatus,
@@ -27,7 +27,7 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import MeasurementError
-from slam.geometry.pnp import find_consensus, measurement_rows
+from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -36,9 +36,6 @@ from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
 
-_FARTHEST = 1e7  # pixel
-_MOST_ID = 2**53
-_TRACKED = 3  # stereo points that fix a pose
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
 
@@ -260,10 +257,10 @@ def _check_rows(what: str, rows: RecordedRows) -> None:
         raise MeasurementError(f"recording: arrays of {what} differ in length")
     if not np.isfinite(rows.uv_left).all():
         raise MeasurementError(f"recording: a left pixel of {what} is not finite")
-    if (np.abs(rows.uv_left) > _FARTHEST).any() or (np.abs(rows.uv_right) > _FARTHEST).any():
+    if (np.abs(rows.uv_left) > FARTHEST_PIXEL).any() or (np.abs(rows.uv_right) > FARTHEST_PIXEL).any():
         raise MeasurementError(f"recording: a pixel of {what} is far outside of any image")
-    if count and (rows.ids.min() < 0 or rows.ids.max() > _MOST_ID):
-        raise MeasurementError(f"recording: ids of landmarks must go from 0 to {_MOST_ID}")
+    if count and (rows.ids.min() < 0 or rows.ids.max() > MOST_ID):
+        raise MeasurementError(f"recording: ids of landmarks must go from 0 to {MOST_ID}")
     order = np.lexsort((rows.ids, rows.frame))
     frame, ids = rows.frame[order], rows.ids[order]
     twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(ids) == 0))
@@ -384,7 +381,7 @@ def _keep_map(backend: Backend, frame: RecordedFrame) -> None:
 def _status(report: UpdateReport, first: bool) -> tuple[FrameStatus, str]:
     if report.status is UpdateStatus.FAILED:
         return FrameStatus.FAILED, report.reason
-    if len(report.used) >= _TRACKED:
+    if len(report.used) >= MINIMAL_POINTS:
         return FrameStatus.TRACKED, ""
     if first:
         return FrameStatus.STARTED, ""

@@ -1,4 +1,4 @@
-"""Compiled kernels (Numba) and the thread count of BLAS: what the machine is asked to do, and how.
+"""Compiled kernels (Numba), the thread count of BLAS, and timing.
 
 Nothing of SLAM is known here; the kernels stand beside what they serve. May import nothing of `slam`.
 """

@@ -1,4 +1,4 @@
-"""Whether a path can be a true one: errors against one that cannot would mean nothing."""
+"""Checks that a ground-truth path is possible: errors against one that is not would mean nothing."""
 
 from __future__ import annotations
 

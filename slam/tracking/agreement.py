@@ -1,9 +1,9 @@
-"""What back ends share where most observations contradict a prediction: the prediction is at fault then, not they."""
+"""What both back ends do where most observations contradict the prediction: then the prediction itself is wrong."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammainc, gammaincinv
+from scipy.special import gammainc
 
 from slam.geometry.pnp import find_consensus
 from slam.geometry.rig import StereoRig
@@ -14,6 +14,7 @@ from slam.tracking.gating import chi_square_limits
 ENOUGH = 6  #: observations that can be judged to agree with each other
 HEEDED = 3  #: one in so many observations is enough to agree with a prediction
 CONFIRMED = 5  #: observations that agree on a pose by more than chance: three fix it
+INFLATION = (3.0, 10.0)  #: process noise that is tried where they disagree, in standard deviations of the usual one
 _HYPOTHESES = 200  # poses that are tried in the search for that on which the observations agree
 _AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
 
@@ -46,5 +47,6 @@ def share_by_chance(rejected: Array, limit: float) -> float:
         rejected: squared Mahalanobis distances (R,) of the rejected observations, χ² with three degrees of freedom.
         limit: the gate.
     """
-    spread = float(np.median(rejected)) / (2 * gammaincinv(1.5, 0.5))  # in units of the innovation covariances
+    median = chi_square_limits(np.array([3]), 0.5)[0]
+    spread = float(np.median(rejected)) / median  # in units of the innovation covariances
     return float(gammainc(1.5, limit / spread / 2))

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, log, transform
+from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
 from slam.tracking.hypotheses import PoseHypotheses
 from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
-
-_TINY = 1e-12  # variance [rad², m²] that keeps a covariance invertible
 
 
 @dataclass(frozen=True)
@@ -249,7 +247,7 @@ def _select(prediction: Prediction, keep: BoolArray) -> Prediction:
 def jump(prediction: Prediction, T_world_left: Array) -> float:
     """How far a pose (4, 4) lies from the predicted one, in standard deviations of the prediction."""
     step = log(inverse(prediction.T_world_left) @ T_world_left)
-    squared = step @ np.linalg.solve(prediction.covariance + _TINY * np.eye(6), step)
+    squared = step @ np.linalg.solve(prediction.covariance + LEAST_VARIANCE * np.eye(6), step)
     return float(np.sqrt(max(float(squared), 0.0)))
 
 

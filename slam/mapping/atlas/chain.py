@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import Array, adjoint, exp, hat, inverse, log
-
-_LEAST = 1e-12  # variance [rad², m²] that keeps a stretch's covariance invertible
+from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def spread(chain: Chain, ends: NDArray[np.intp], moved: Array) -> Array:
     a = inverse(chain.poses[begin])
     step = a @ chain.poses[end]
     change = log(inverse(step) @ inverse(moved[at - 1]) @ moved[at])
-    whole = carried[end] + _LEAST * np.eye(6)
+    whole = carried[end] + LEAST_VARIANCE * np.eye(6)
     part = (carried @ np.linalg.solve(whole, change[:, :, None]))[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change[ends[1:]]

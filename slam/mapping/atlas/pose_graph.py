@@ -16,12 +16,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import Array, adjoint, inverse
+from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, inverse
 from slam.mapping.atlas.chain import Chain, spread
 from slam.mapping.atlas.loops import Loop
 
 _FIXED = 1e-6  # standard deviation of the first keyframe's pose [rad], [m], which defines the map
-_LEAST = 1e-12  # variance [rad², m²] that keeps a factor's covariance invertible
 
 
 @dataclass(frozen=True)
@@ -105,5 +104,5 @@ def _pose3(T: Array) -> gtsam.Pose3:
 
 
 def _between(a: int, b: int, T: Array, covariance: Array) -> gtsam.BetweenFactorPose3:
-    noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T) + _LEAST * np.eye(6))
+    noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T) + LEAST_VARIANCE * np.eye(6))
     return gtsam.BetweenFactorPose3(a, b, _pose3(T), noise)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from slam.checks import FARTHEST_POSITION, MOST_ID
 from slam.errors import SlamError
 from slam.geometry.se3 import nearest_rotation
 from slam.mapping.atlas.keyframes import Keyframe
@@ -19,9 +20,7 @@ KEYFRAME_TYPES = {
     "place_laplacian": np.int8, "place_landmarks": np.int64,
 }  # fmt: skip
 
-_FARTHEST = 1e8  # coordinate [m]
 _LARGEST = 1e12  # entry of a covariance [rad², m²]
-_MOST_ID = 2**53  # of a landmark
 _TURNED = 1e-6  # by which a rotation matrix may be none
 
 
@@ -59,13 +58,13 @@ def from_arrays(arrays: Mapping[str, np.ndarray], width: tuple[int, ...], source
     shapes = [(n,), (n, 4, 4), (n, 6, 6), (n, 6, 6), (n,), (n,), (n,), (total, 3), (total, *width), (total,), (total,)]
     if [a.shape for a in arrays.values()] != shapes and not (n == total == 0):
         raise SlamError(f"{source}: the arrays of the keyframes do not fit together")
-    if (count < 0).any() or (landmarks < -1).any() or (landmarks > _MOST_ID).any():
+    if (count < 0).any() or (landmarks < -1).any() or (landmarks > MOST_ID).any():
         raise SlamError(f"{source}: a keyframe has an impossible number")
-    limits = [_LARGEST, _FARTHEST, _LARGEST, _LARGEST, _FARTHEST, _FARTHEST]
+    limits = [_LARGEST, FARTHEST_POSITION, _LARGEST, _LARGEST, FARTHEST_POSITION, FARTHEST_POSITION]
     for name, limit in zip(KEYFRAME_TYPES, limits):
         if not (np.abs(arrays[name]) <= limit).all():
             raise SlamError(f"{source}: {name} is not finite, or far too large")
-    if not (np.abs(points) <= _FARTHEST).all() or not np.isfinite(descriptors).all() or (depths <= 0).any():
+    if not (np.abs(points) <= FARTHEST_POSITION).all() or not np.isfinite(descriptors).all() or (depths <= 0).any():
         raise SlamError(f"{source}: a feature of a keyframe is not finite, or far too large")
     if any(_no_covariance(P) for P in (*covariances, *steps)):
         raise SlamError(f"{source}: the covariance of a keyframe is none")
