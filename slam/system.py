@@ -9,7 +9,7 @@ from typing import overload
 import numpy as np
 
 from slam import registry
-from slam.calibration import Revision, RigUncertainty, SelfCalibration
+from slam.calibration import KeptCalibration, Revision, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
@@ -77,8 +77,11 @@ class StereoSlam:
         config: all settings; overrides `kind`.
         known_map: a map to start in (see `slam.load_map`). The world is then the map's; frames are lost until the
             camera is found in it. The back end must be given by its name.
+        rig_prior: what earlier recordings have shown of the rig's error (see `slam.load_calibration`). It is corrected
+            from the first frame on, and goes on being learnt.
 
     Raises:
+        CalibrationError: `rig_prior` is of another rig.
         UnknownNameError: no front end or back end of this name.
         ConfigurationError: a setting is unknown or out of range.
         SlamError: the map is of another front end.
@@ -99,6 +102,7 @@ class StereoSlam:
         kind: str = "handheld",
         config: SystemConfig | None = None,
         known_map: SavedMap | None = None,
+        rig_prior: KeptCalibration | None = None,
     ) -> None:
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
@@ -115,7 +119,7 @@ class StereoSlam:
             else backend
         )
         self.landmarks: LandmarkRows | None = None  # of the last step that was completed
-        self.calibration = SelfCalibration(rig, c.self_calibration)
+        self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if known_map is None else known_map.world_frame

@@ -355,6 +355,10 @@ def reader_has(name):
         for frame in sequence:
             system.process(frame)
         return {"system": system, "rig": sequence.rig}
+    if name == "docs/selfcalibration.md":
+        rig = slam.open_sequence("synthetic:desk?frames=2").rig
+        slam.save_calibration("rig.json", slam.StereoSlam(rig).calibration.kept())
+        return {"rig": rig}
     return {}
 
 

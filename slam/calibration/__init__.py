@@ -7,10 +7,12 @@ from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.consider import RigUncertainty
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.estimator import SelfCalibration
+from slam.calibration.kept import KeptCalibration, load_calibration, save_calibration
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior
 
 __all__ = [
+    "KeptCalibration",
     "Revision",
     "RigCorrection",
     "RigModel",
@@ -18,4 +20,6 @@ __all__ = [
     "RigUncertainty",
     "SelfCalibration",
     "SelfCalibrationConfig",
+    "load_calibration",
+    "save_calibration",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,15 @@ import numpy as np
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.evidence import Accumulator, Evidence
+from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
-from slam.calibration.motion import pair_evidence, parallax
+from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, solve
-from slam.calibration.prior import offset_sigma, prior_information, residual_variance, systematic_variance
+from slam.calibration.prior import as_delivered, as_found, prior_information, residual_variance, systematic_variance
 from slam.calibration.rows import row_evidence
 from slam.calibration.views import View, match, pair_of
 from slam.data import StereoFeatures
+from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
@@ -25,7 +28,9 @@ _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
 _MOST_ROWS = 250  # of a frame: more say little more
 _MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
+_CONFIGURED = 4  # pairs that the configured noise counts for
 _RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
+_TURN = 0.05  # but never rarer than once in this turn [rad]: turns are rare, and they alone show the focal length
 
 
 class SelfCalibration:
@@ -34,30 +39,44 @@ class SelfCalibration:
     Args:
         rig: the cameras.
         config: settings.
+        kept: what earlier recordings of this rig have shown; None for nothing.
+
+    Raises:
+        CalibrationError: `kept` is of another rig.
+        ConfigurationError: there is one, but self-calibration is switched off.
 
     Attributes:
         pairs: number of pairs of views that the posterior rests on.
         unsolved: number of pairs for which no motion was found.
     """
 
-    def __init__(self, rig: StereoRig, config: SelfCalibrationConfig) -> None:
+    def __init__(self, rig: StereoRig, config: SelfCalibrationConfig, kept: KeptCalibration | None = None) -> None:
         self.rig = rig
         self.config = config
         self.model = RigModel(rig)
-        n = len(self.model.names)
-        self._prior = prior_information(self.model)
+        self._kept = kept is not None
+        if kept is None:
+            self._prior = as_delivered(self.model)
+        else:
+            kept.require_fits(rig)
+            if not config.enabled:
+                raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
+            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance, kept.residual)
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
-        start = np.linalg.inv(self._prior)
+        start = self._prior.covariances[-1] if kept is None else self._prior.covariances.mean(axis=0)
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
-        self._unknown = _mean_variance(self._far, start)
-        self._solution = Solution(np.zeros(n), start, start)
+        self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
+        self._solution = Solution(self._prior.mean, start, start, float(self._prior.residual[-1]))
+        self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
+        self._scattered = _CONFIGURED
         self._waiting: list[View] = []
         self._open: Evidence | None = None  # of a pair that is not complete
         self._seen = 0
+        self._looked: Array | None = None  # pose of the last frame that was looked at
         self.unsolved = 0
-        self.applied = RigCorrection(self.model, np.zeros(n))
+        self.applied = RigCorrection(self.model, self._prior.mean.copy())
 
     @property
     def pairs(self) -> int:
@@ -67,20 +86,23 @@ class SelfCalibration:
     @property
     def posterior(self) -> RigPosterior:
         """What is believed of the rig's error now."""
-        covariance = self._solution.covariance + np.diag(self._systematic)
+        covariance = self._solution.covariance
+        if not self._kept:  # else it is in the evidence
+            covariance = covariance + np.diag(self._systematic)
         return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
 
-        Nothing is corrected before motion has taken half of the prior's variance from the disparities: rows alone say
-        too little of them, and what they seem to say is then mostly the prior. Where disparities would change by less
-        than `least` standard deviations (root mean square over the image), features are corrected as before.
+        Nothing is corrected before motion has taken half of the prior's variance from the disparities, unless there is
+        a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Where
+        disparities would change by less than `least` standard deviations (root mean square over the image), features
+        are corrected as before.
         """
         if not self.config.enabled:
             return None
         variance = _mean_variance(self._far, self._solution.inner)
-        known = variance <= _KNOWN * self._unknown
+        known = self._kept or variance <= _KNOWN * self._unknown
         mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
         step = mean - self.applied.parameters
         if not step.any() or np.square(self._far @ step).mean() <= least**2 * variance:
@@ -104,8 +126,9 @@ class SelfCalibration:
         if not self.config.enabled:
             return
         self._seen += 1
-        if self._seen % (1 + self.pairs // _RARER):
+        if self._seen % (1 + self.pairs // _RARER) and not self._has_turned(T_world_left):
             return
+        self._looked = T_world_left
         view = View.of(self.model, features, T_world_left, _MOST_FEATURES)
         if len(view) < self.config.minimum_common:
             return
@@ -114,6 +137,13 @@ class SelfCalibration:
         self._compare(view)
         if self.pairs or self._open is not None:
             self._update()
+
+    def _has_turned(self, T_world_left: Array) -> bool:
+        """Whether the camera looks elsewhere than in the last frame that was looked at."""
+        if self._looked is None:
+            return True
+        cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
+        return bool(cosine < np.cos(_TURN))
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones that wait for a partner, the oldest first, until one goes on waiting."""
@@ -134,20 +164,50 @@ class SelfCalibration:
             self._open = self._evidence(waiting[0], view)
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
+    def evidence(self) -> Evidence | None:
+        """What this recording alone says, without any prior; None where no motion was seen."""
+        parts = self._parts()
+        return sum(parts[1:], parts[0]) if self.pairs or self._open is not None else None
+
+    def _parts(self) -> list[Evidence]:
+        """What rows and motion say, and the pair that is not complete."""
+        parts = [*self._rows.total(), *self._motion.total()]
+        if self._open is not None:
+            parts.append(self._open.scaled(1 / self._motion.inflation))
+        return parts
+
+    def kept(self) -> KeptCalibration:
+        """What is known now, to be kept for further recordings of the rig."""
+        return KeptCalibration(self.posterior, RigNumbers.of(self.rig), self._solution.residual)
+
     def summary(self) -> dict[str, Any]:
         """What has been found, as plain types."""
-        return {"pairs": self.pairs, "unsolved_pairs": self.unsolved, **self.posterior.to_json()}
+        return {"pairs": self.pairs, "unsolved_pairs": self.unsolved, **self.kept().to_json()}
+
+    @property
+    def _noise(self) -> Array:
+        """Covariance (3, 3) of a point ``(x, y, d)`` [px²]."""
+        pixel, disparity = np.exp(self._variances)
+        return np.diag([pixel, pixel, disparity])
+
+    def _ideal(self, pair: Pair) -> Pair:
+        """A pair of views with its points corrected by what is known now."""
+        first, second = (p + self.model.field(p) @ self._solution.mean for p in (pair.first, pair.second))
+        return replace(pair, first=first, second=second)
 
     def _evidence(self, first: View, second: View) -> Evidence | None:
         """What a pair of views says; None where it is nothing."""
         c = self.config
-        pair = pair_of(self.model, first, second, self._solution.mean, self._seen)
+        pair = pair_of(self.model, first, second, self._solution.mean, self._noise, self._seen)
         if len(pair.first) < c.minimum_common:
             self.unsolved += 1
             return None
         if parallax(self.model, pair) < c.minimum_parallax:
             return None
-        evidence = pair_evidence(self.model, pair, self._solution.mean, c.pixel_sigma, c.disparity_sigma)
+        self._scattered += 1
+        scatter = np.log(noise_variances(self._ideal(pair), self.model.focal, self._noise))
+        self._variances = self._variances + (scatter - self._variances) / self._scattered
+        evidence = pair_evidence(self.model, pair, self._solution.mean, self._noise)
         self.unsolved += evidence is None
         return evidence
 
@@ -155,10 +215,10 @@ class SelfCalibration:
         """Bayes' rule with what all pairs of views and all rows so far say."""
         for part in (self._rows, self._motion):
             part.judge(self._solution.mean, self._solution.inner)
-        evidence = self._rows.total() + self._motion.total()
-        if self._open is not None:
-            evidence.append(self._open.scaled(1 / self._motion.inflation))
-        self._solution = solve(self._prior, offset_sigma(self.model), residual_variance(), evidence)
+        evidence = self._parts()
+        if self._kept:
+            evidence = [sum(evidence[1:], evidence[0]).with_error(self._systematic)]
+        self._solution = solve(self._prior, residual_variance(), evidence)
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

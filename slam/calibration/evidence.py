@@ -29,6 +29,14 @@ class Evidence(NamedTuple):
         """The same with `factor` times the information."""
         return Evidence(*(factor * x for x in self))
 
+    def with_error(self, variance: Array) -> Evidence:
+        """The same, where the parameters that a recording shows are off by an error of this variance (n,) in each.
+
+        ``(S⁻¹ + V)⁻¹ = (1 + S V)⁻¹ S``, which needs no inverse of S.
+        """
+        reduced = np.linalg.inv(np.eye(len(self.e)) + self.S * variance)
+        return Evidence(*(reduced @ x for x in self))
+
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
         """What both say together."""
         return Evidence(*(a + b for a, b in zip(self, other)))

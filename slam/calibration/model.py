@@ -94,7 +94,7 @@ class RigModel:
     def _unturned(self, points: Array) -> Array:
         """`field` without the rotation."""
         x, y, d = points.T / self.focal
-        left, right = _lens(x, y), _lens(x - d, y)
+        left, right = lens_change(x, y), lens_change(x - d, y)
         turn = np.stack([-(x - d) * y, 1 + (x - d) ** 2, -y], axis=1)
         none = np.zeros((len(points), len(LENS) + len(POSE)))
         along_d = [left[0], -right[0], -turn, 0 * x[:, None], (d * (x - d))[:, None]]
@@ -108,7 +108,7 @@ class RigModel:
         ``d · (forward · y - down)``, which the correction takes away.
         """
         x, y, d = points.T / self.focal
-        left, right = _lens(x, y)[1], _lens(x - d, y)[1]
+        left, right = lens_change(x, y)[1], lens_change(x - d, y)[1]
         turn = np.stack([-1 - y**2, (x - d) * y, x - d], axis=1)
         return np.asarray(self.focal * np.concatenate([-left, right, turn, d[:, None], (-d * y)[:, None]], axis=1))
 
@@ -133,7 +133,7 @@ class RigModel:
         return np.stack([a[:, i] * b[:, j] for i, j in RESIDUAL], axis=1)
 
 
-def _lens(x: Array, y: Array) -> tuple[Array, Array]:
+def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
     """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera."""
     none, r2 = 0 * x, x * x + y * y
     along_x = [none + 1, none, x, none, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x]

@@ -12,11 +12,13 @@ import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
-from slam.calibration.robust import student_weights
+from slam.calibration.robust import chi_square_median, student_weights
 from slam.geometry.se3 import Array, hat, so3_exp
 
 _ITERATIONS = 20  # of Gauss-Newton at most
-_CONVERGED = 0.02  # largest last change of a predicted point [px]
+_CONVERGED = 1e-3  # largest last change of a predicted point [px]; 0.02 let focal lengths be wrong by percents
+_NEARLY = 3e-3  # the same after all iterations: single points that jump to and fro keep some pairs from coming to rest
+_EXACT = 1e-3  # least noise of pixels and disparities [px]
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
 
@@ -35,29 +37,45 @@ class Pair:
     t: Array
 
 
-def pair_evidence(
-    model: RigModel, pair: Pair, parameters: Array, pixel_sigma: float, disparity_sigma: float
-) -> Evidence | None:
-    """The likelihood of the parameters from two views, with motion and points eliminated; None without a solution.
+@dataclass(frozen=True)
+class Fit:
+    """The motion that takes one view's points to the other's, and the linear problem about it.
 
-    Motion and the first view's true points are found by Gauss-Newton at the given parameters; there the problem is
-    linearised in all of them. Fields are taken at the estimated points, not at the measured ones: else the noise would
-    be correlated with the Jacobian, and the result biased. Points are weighted by Student's t distribution, whose
-    scale is estimated.
+    Attributes:
+        R, t: the motion.
+        points: the first view's, estimated from both views (N, 3) [px].
+        moved: where they are in the second view (N, 3) [px].
+        J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6).
+        residual: second view less its prediction from the first (N, 3) [px].
+        weights: information of the residuals (N, 3, 3).
+    """
+
+    R: Array
+    t: Array
+    points: Array
+    moved: Array
+    J_point: Array
+    J_motion: Array
+    residual: Array
+    weights: Array
+
+
+def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:
+    """Motion and the first view's true points by Gauss-Newton; None where it does not converge.
+
+    Points are weighted by Student's t distribution, whose scale is estimated.
 
     Args:
-        model: the parameters' meaning.
-        pair: the views.
-        parameters: where to linearise (n,).
-        pixel_sigma: noise of x and y [px]; only its ratio to the next matters.
-        disparity_sigma: noise of d [px].
+        first: points ``(x, y, d)`` (N, 3) [px] of an ideal rig.
+        second: the same points in the second view.
+        R: first guess of the rotation (3, 3).
+        t: of the translation (3,) [baselines].
+        focal: focal length [px].
+        noise: covariance of a point (3, 3) [px²]; only its form matters.
     """
-    noise = np.diag(np.square([pixel_sigma, pixel_sigma, disparity_sigma]))
-    first = pair.first + model.field(pair.first) @ parameters
-    second = pair.second + model.field(pair.second) @ parameters
-    points, R, t = first, pair.R, pair.t
+    points = first
     for _ in range(_ITERATIONS):
-        moved, J_point, J_motion = move(points, R, t, model.focal)
+        moved, J_point, J_motion = move(points, R, t, focal)
         # The second view less its prediction from the first, the points' own corrections carried to first order.
         residual = second - moved - (J_point @ (first - points)[..., None])[..., 0]
         back = noise @ np.swapaxes(J_point, 1, 2)
@@ -75,10 +93,64 @@ def pair_evidence(
         change = J_motion @ step
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
         points = first + (back @ W @ (residual - change)[..., None])[..., 0]
-        if np.abs(change).max() < _CONVERGED:
-            J_rig, J_residual = (f(moved) - J_point @ f(points) for f in (model.field, model.residual_field))
-            return _eliminated(J_motion, -J_rig, -J_residual, weighted, residual, parameters)
-    return None
+        fit, last = Fit(R, t, points, moved, J_point, J_motion, residual, weighted), float(np.abs(change).max())
+        if last < _CONVERGED:
+            break
+    return fit if last < _NEARLY else None
+
+
+def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
+    """The likelihood of the parameters from two views, with motion and points eliminated; None without a solution.
+
+    The problem is linearised in all of them at the motion and the points of `fit_motion`. Fields are taken at the
+    estimated points, not at the measured ones: else the noise would be correlated with the Jacobian, and the result
+    biased.
+
+    Args:
+        model: the parameters' meaning.
+        pair: the views.
+        parameters: where to linearise (n,).
+        noise: covariance of a point (3, 3) [px²]; only its form matters, the scale is estimated.
+    """
+    first = pair.first + model.field(pair.first) @ parameters
+    second = pair.second + model.field(pair.second) @ parameters
+    fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
+    if fit is None:
+        return None
+    fields = (model.field, model.residual_field)
+    J_rig, J_residual = (field(fit.moved) - fit.J_point @ field(fit.points) for field in fields)
+    return _eliminated(fit.J_motion, -J_rig, -J_residual, fit.weights, fit.residual, parameters)
+
+
+def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
+    """How far points (N, 3) of two views are from the motion, over the noise of both, squared (N,); NaN for never.
+
+    The error of a near point's disparity grows with the motion. A limit of so many pixels would keep those points alone
+    whose errors happen to be small, and favour what was believed of the motion before.
+    """
+    with np.errstate(all="ignore"):
+        moved, J, _ = move(first, R, t, focal)
+        covariance = noise + J @ noise @ np.swapaxes(J, 1, 2)
+        off = second - moved
+        good = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+        out = np.full(len(first), np.nan)
+        out[good] = np.einsum("ni,ni->n", off[good], np.linalg.solve(covariance[good], off[good][..., None])[..., 0])
+        return out
+
+
+def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
+    """Variances (2,) [px²] of a pixel and of a disparity, as two views scatter about their motion.
+
+    A feature's place slides over the surface from view to view, in both images alike: pixels are often less exact than
+    disparities. Which is which has to be known, else the motion and with it the rig's parameters are biased. `noise`
+    (3, 3) [px²] shares the scatter out where it comes from both.
+    """
+    moved, J, _ = move(pair.first, pair.R, pair.t, focal)
+    growth = 1 + np.square(J) @ np.diag(noise) / np.diag(noise)
+    squares = np.square(pair.second - moved) / growth
+    squares = squares[np.isfinite(squares).all(axis=1)]
+    found = np.array([np.median(squares[:, :2]), np.median(squares[:, 2])]) / chi_square_median(1)
+    return np.maximum(found, _EXACT**2)
 
 
 def parallax(model: RigModel, pair: Pair) -> float:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from slam.calibration.evidence import Evidence
+from slam.calibration.prior import Prior
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
-
-#: Scales of the prior that are weighed against each other, from a calibration without errors to one as bad as the
-#: prior allows, and the same for an offset of the disparity alone; all equally probable beforehand.
-_SCALES = (0.02, 0.1, 0.3, 1.0)
-_OFFSETS = (0.03, 0.3, 1.0)  # scales of the prior of a disparity offset that are weighed against each other [px]
 
 
 @dataclass(frozen=True)
@@ -87,40 +82,39 @@ class Solution:
         mean: (n,).
         inner: covariance (n, n), were there no residual fields.
         covariance: with what the residual fields may have moved the mean by (n, n).
+        residual: scale of the residual fields, from 0 to 1.
     """
 
     mean: Array
     inner: Array
     covariance: Array
+    residual: float
 
 
-def solve(prior: Array, offset: Array, residual: float, evidence: Sequence[Evidence]) -> Solution:
+def solve(prior: Prior, residual: float, evidence: Sequence[Evidence]) -> Solution:
     """Posterior, averaged over how large a calibration's errors are.
 
-    The prior `N(0, s² prior⁻¹ + t² offset offsetᵀ)` has scales s and t that are not known: how good the calibration
-    was, and by how much the cameras have turned since. The scales' probabilities follow from the evidence (the
-    marginal likelihood), so a calibration that nothing speaks against is left as it is, instead of following the noise.
+    The scales of the prior's errors are not known. Their probabilities follow from the evidence (the marginal
+    likelihood), so a calibration that nothing speaks against is left as it is, instead of following the noise.
 
     Args:
-        prior: its information (n, n) at the scale 1.
-        offset: standard deviation of the parameters by an offset of the disparity (n,).
+        prior: of the parameters.
         residual: variance of the residual fields' coefficients.
         evidence: of the data.
     """
     whole = evidence[0]
     for more in evidence[1:]:
         whole += more
-    spread, drift = np.linalg.inv(prior), np.outer(offset, offset)
-    scales, turned = np.array(list(product(_SCALES, _OFFSETS))).T[:, :, None, None]
-    information = np.linalg.inv(scales**2 * spread + turned**2 * drift)  # of each pair of scales (K, n, n)
+    information = np.linalg.inv(prior.covariances)  # (K, n, n)
     total = information + whole.S
     covariances = np.linalg.inv(total)
-    means = covariances @ whole.e
-    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + means @ whole.e)
+    e = whole.e - whole.S @ prior.mean
+    steps = covariances @ e
+    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + steps @ e)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    mean = weights @ means
-    off = means - mean
+    step = weights @ steps
+    off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
-    moved = np.tensordot(weights * scales[:, 0, 0], covariances, axes=1) @ whole.cross
-    return Solution(mean, inner, inner + residual * moved @ moved.T)
+    moved = np.tensordot(weights * prior.residual, covariances, axes=1) @ whole.cross
+    return Solution(prior.mean + step, inner, inner + residual * moved @ moved.T, float(weights @ prior.residual))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import product
+
 import numpy as np
 
 from slam.calibration.model import RESIDUAL, RigModel
@@ -36,7 +39,55 @@ OFFSET = 7e-4
 FIELD = 1.4e-3
 _FREEDOM = 10  # independent values of such a field
 
+#: A focal length that is wrong in both cameras alike, where the board's distance or curvature made up for it [share].
+FOCAL = 0.005
+
+#: Scales that are weighed against each other, all equally probable beforehand: of all errors of a calibration, from
+#: none to as large as allowed.
+_SCALES = (0.02, 0.1, 0.3, 1.0)
+_OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
+_FOCALS = (0.1, 1.0)  # the same of a common error of the focal lengths
+
 _NEAR = 0.05  # disparity [focal lengths] of points that are near
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed of the parameters before anything is seen: a mean, and several covariances that may be.
+
+    Attributes:
+        mean: (n,).
+        covariances: equally probable ones (K, n, n).
+        residual: scale of the residual fields with each of them (K,).
+    """
+
+    mean: Array
+    covariances: Array
+    residual: Array
+
+
+def as_delivered(model: RigModel) -> Prior:
+    """Of a calibration of which nothing is known but how calibrations are made."""
+    spread = np.linalg.inv(prior_information(model))
+    drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
+    scales, turned, zoomed = np.array(list(product(_SCALES, _OFFSETS, _FOCALS))).T
+    wide = [s[:, None, None] ** 2 * covariance for s, covariance in ((scales, spread), (turned, drift), (zoomed, zoom))]
+    return Prior(np.zeros(len(model.names)), sum(wide), scales)
+
+
+def as_found(model: RigModel, mean: Array, covariance: Array, residual: float) -> Prior:
+    """Of a rig whose earlier recordings are known; its cameras may have turned since.
+
+    Args:
+        model: the parameters' meaning.
+        mean: what the recordings say (n,).
+        covariance: how well (n, n).
+        residual: scale of the residual fields.
+    """
+    sigma = offset_sigma(model)
+    turned = np.array(_OFFSETS)
+    covariances = covariance + turned[:, None, None] ** 2 * np.outer(sigma, sigma)
+    return Prior(mean, covariances, np.full(len(turned), residual))
 
 
 def prior_information(model: RigModel) -> Array:
@@ -55,6 +106,11 @@ def prior_information(model: RigModel) -> Array:
 def offset_sigma(model: RigModel) -> Array:
     """Standard deviation of the parameters (n,) by an offset of all disparities."""
     return np.array([OFFSET if name == "right_cx" else 0.0 for name in model.names])
+
+
+def focal_sigma(model: RigModel) -> Array:
+    """Standard deviation of the parameters (n,) by an error of the focal length that both cameras share."""
+    return np.array([FOCAL if name in ("left_f", "right_f") else 0.0 for name in model.names])
 
 
 def residual_variance() -> float:

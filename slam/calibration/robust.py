@@ -10,6 +10,11 @@ from slam.geometry.se3 import Array
 _DEGREES = 4.0  # of freedom of Student's t: its tails are those of matches, a few of which are wrong
 
 
+def chi_square_median(dof: int) -> float:
+    """The median of χ² with so many degrees of freedom."""
+    return 2 * float(gammaincinv(dof / 2, 0.5))
+
+
 def student_weights(squared: Array, dof: int, least: float) -> Array:
     """Weights (N,) of residuals by Student's t distribution, as the information that each is worth.
 
@@ -20,6 +25,5 @@ def student_weights(squared: Array, dof: int, least: float) -> Array:
     """
     if not len(squared):
         return squared
-    median = 2 * float(gammaincinv(dof / 2, 0.5))
-    scale = max(float(np.median(squared)) / median, least**2)
+    scale = max(float(np.median(squared)) / chi_square_median(dof), least**2)
     return np.asarray((_DEGREES + dof) / (_DEGREES + squared / scale) / scale)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
-from slam.calibration.motion import Pair, move
+from slam.calibration.motion import Pair, fit_motion, move, squared_distance
+from slam.calibration.robust import chi_square_median
 from slam.data import StereoFeatures
 from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
@@ -17,7 +18,9 @@ from slam.geometry.se3 import Array, inverse
 _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
-_LOOSE = np.array([1.0, 1.0, 2.0])  # of uR, predicted from the first view's disparity, more is allowed
+_EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
+_FARTHEST = 16.3  # largest squared distance of a match that agrees: 99.9 % of χ² with three degrees of freedom
+_REFITS = 2  # times that motion and matches that agree with it are found anew
 _HYPOTHESES = 100  # poses tried in the geometric check of a pair of views
 
 
@@ -101,7 +104,7 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
     return rows, best[rows]
 
 
-def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed: int) -> Pair:
+def pair_of(model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int) -> Pair:
     """What two views have in common: matches that agree with one motion, and that motion.
 
     The motion of the system's poses is the first guess; it is the only one where most matches agree with it.
@@ -111,6 +114,7 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed:
         first: the earlier view.
         second: the later view.
         parameters: of the rig (n,), as known so far.
+        noise: covariance (3, 3) of a point [px²]; only its form matters.
         seed: of the random choice in the geometric check.
     """
     a, b = match(first, second)
@@ -125,8 +129,14 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed:
         found = find_consensus(rig, local, after, inverse(T), _AGREES, _HYPOTHESES, seed)
         T = np.asarray(inverse(found.T_world_left))
     R, t = T[:3, :3], T[:3, 3] / rig.baseline
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = move(ideal[0], R, t, model.focal)[0] - ideal[1]
-    every = np.column_stack([error[:, :2], error[:, 0] - error[:, 2]])  # of uL, vL and uR
-    agree = (np.abs(every) <= _AGREES * _LOOSE).all(axis=1)
+    with np.errstate(all="ignore"):
+        moved, J, _ = move(ideal[0], R, t, model.focal)
+        agree = (np.abs(moved - ideal[1]) <= _EACH * np.sqrt(1 + np.square(J).sum(axis=2))).all(axis=1)
+    for _ in range(_REFITS):
+        fitted = fit_motion(ideal[0][agree], ideal[1][agree], R, t, model.focal, noise) if agree.sum() >= 3 else None
+        if fitted is None:
+            break
+        R, t = fitted.R, fitted.t
+        distance = squared_distance(ideal[0], ideal[1], R, t, model.focal, noise)
+        agree = distance <= _FARTHEST * np.median(distance[agree]) / chi_square_median(3)
     return Pair(one[agree], two[agree], R, t)

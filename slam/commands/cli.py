@@ -114,6 +114,10 @@ def run_command(
     ] = None,
     save_map: Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")] = None,
     mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a known map.")] = False,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),
+    ] = None,
     viewer: Annotated[
         str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
     ] = None,
@@ -137,7 +141,9 @@ def run_command(
     from slam.run.runner import run
     from slam.sequences import is_live
 
-    wanted = Wanted(sequence, config, backend, frontend, settings or (), frames, kind, format, known_map, mono)
+    wanted = Wanted(
+        sequence, config, backend, frontend, settings or (), frames, kind, format, known_map, mono, calibration
+    )
     opened, options, origin = prepare(wanted)
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
@@ -273,6 +279,36 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
+
+
+@app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
+def calibrate_command(
+    sequences: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SEQUENCE", help="Recordings of one rig.", show_default=False, autocompletion=completion.sequences
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
+        "calibration.json"
+    ),
+    opencv: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="The corrected calibration in OpenCV's form.")
+    ] = None,
+    kalibr: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="The same in the form of Kalibr's camchain.")
+    ] = None,
+    settings: SetOption = None,
+    frames: FramesOption = None,
+    format: FormatOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
+    from slam.commands.calibrate import calibrate
+    from slam.run.calibrating import Targets
+    from slam.run.runner import parse_frames
+
+    calibrate(sequences, Targets(out, opencv, kalibr), settings or [], parse_frames(frames), format, quiet)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -33,6 +33,7 @@ class Wanted:
         format: of the sequence.
         known_map: file of a map to start in.
         mono: whether to use the left images alone.
+        calibration: file with what is known of the rig's error.
     """
 
     sequence: str | None
@@ -45,6 +46,7 @@ class Wanted:
     format: str | None = None
     known_map: Path | None = None
     mono: bool = False
+    calibration: Path | None = None
 
 
 def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
@@ -53,7 +55,9 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     Raises:
         SlamError: bad input; one line says what and where.
     """
-    before = None if wanted.config is None else load(wanted.config, wanted.sequence, wanted.known_map)
+    before = (
+        None if wanted.config is None else load(wanted.config, wanted.sequence, wanted.known_map, wanted.calibration)
+    )
     if before is not None and wanted.kind is not None:
         raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
     text = wanted.sequence if before is None else before.origin.sequence
@@ -66,6 +70,7 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     backend = wanted.backend or (before.backend if before is not None else _BACKEND)
     mono = wanted.mono or (before is not None and before.origin.mono)
     known_map = wanted.known_map or (before.origin.known_map if before is not None else None)
+    calibration = wanted.calibration or (before.origin.calibration if before is not None else None)
     if mono and known_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     kind = wanted.kind or (opened.kind if before is None else before.origin.kind)
@@ -77,7 +82,8 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     if wanted.frames is not None:
         start, stop = parse_frames(wanted.frames)
     options = RunOptions(backend, frontend, config, Path(), start, stop, known_map=known_map, mono=mono)
-    return opened, options, Origin(command_line(), text or "", format, kind, known_map, mono)
+    options = replace(options, calibration=calibration)
+    return opened, options, Origin(command_line(), text or "", format, kind, known_map, mono, calibration)
 
 
 def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:

@@ -31,6 +31,7 @@ class Origin:
         kind: kind of motion that the defaults are for.
         known_map: file of the map that it starts in; None for none.
         mono: whether the left images are used alone.
+        calibration: file with what is known of the rig's error; None for none.
     """
 
     command: str
@@ -39,6 +40,7 @@ class Origin:
     kind: str
     known_map: Path | None = None
     mono: bool = False
+    calibration: Path | None = None
 
     def to_json(self, folder: Path) -> dict[str, Any]:
         """The tree for the ``config.json`` of a run in `folder`: files by absolute and by relative path."""
@@ -48,6 +50,7 @@ class Origin:
             "kind": self.kind,
             "mono": self.mono,
             "known_map": None if self.known_map is None else _places(str(self.known_map), folder),
+            "calibration": None if self.calibration is None else _places(str(self.calibration), folder),
         }
 
 
@@ -72,16 +75,19 @@ class Repeat:
     versions: Mapping[str, str]
 
 
-def load(path: Path, sequence: str | None = None, known_map: Path | None = None) -> Repeat:
+def load(
+    path: Path, sequence: str | None = None, known_map: Path | None = None, calibration: Path | None = None
+) -> Repeat:
     """Read the ``config.json`` of a run.
 
     Args:
         path: the file, or the run's folder.
         sequence: taken in place of the run's own.
         known_map: taken in place of the run's own.
+        calibration: likewise.
 
     Raises:
-        SlamError: it cannot be read, is none of a run of a sequence, or its sequence or map is not found any more.
+        SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
         ConfigurationError: its settings are not those of this version.
     """
     file = path / CONFIG if path.is_dir() else path
@@ -89,7 +95,7 @@ def load(path: Path, sequence: str | None = None, known_map: Path | None = None)
         tree = _restored(json.loads(file.read_text(encoding="utf-8")))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        source, known = tree.get("source") or {}, tree.get("known_map")
+        source, known, kept = tree.get("source") or {}, tree.get("known_map"), tree.get("calibration")
         start, stop = tree["frames"]
         origin = Origin(
             str(tree.get("command", "")),
@@ -98,6 +104,7 @@ def load(path: Path, sequence: str | None = None, known_map: Path | None = None)
             str(tree.get("kind", "handheld")),
             known_map or (Path(_found(known, file)) if known else None),
             bool(tree.get("mono", False)),
+            calibration or (Path(_found(kept, file)) if kept else None),
         )
         config = SystemConfig.from_json(tree["settings"])
         names = str(tree["frontend"]), str(tree["backend"])

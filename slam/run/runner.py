@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slam import registry
+from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line
@@ -49,6 +50,7 @@ class RunOptions:
         record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
         known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
+        calibration: file with what is known of the rig's error, see `slam.calibration.kept`; None for nothing.
         mono: use the left images alone.
         overlap: read and extract the next frame while the present one is estimated; the results are the same.
         live: take frames at their own rate, and leave out those that come too late; of a camera always.
@@ -64,6 +66,7 @@ class RunOptions:
     record: Path | None = None
     known_map: Path | None = None
     save_map: Path | None = None
+    calibration: Path | None = None
     mono: bool = False
     overlap: bool = True
     live: bool = False
@@ -112,8 +115,14 @@ def run(
     if options.mono:
         frames = (replace(frame, right=None) for frame in frames)
     known = None if options.known_map is None else load_map(options.known_map)
+    rig_prior = None if options.calibration is None else load_calibration(options.calibration)
     system = StereoSlam(
-        sequence.rig, frontend or options.frontend, options.backend, config=options.config, known_map=known
+        sequence.rig,
+        frontend or options.frontend,
+        options.backend,
+        config=options.config,
+        known_map=known,
+        rig_prior=rig_prior,
     )
     record = RunRecord()
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)

@@ -60,6 +60,41 @@ def test_an_offset_of_the_disparity_is_found():
     assert abs(np.median(disparity[0] - disparity[1])) < 0.05
 
 
+FOCAL = parameters(left_f=0.005, right_f=0.005)
+
+
+def common_focal(calibration):
+    """Mean and standard deviation of the focal length's error that both cameras share."""
+    posterior = calibration.posterior
+    w = 0.5 * (FOCAL > 0)
+    return w @ posterior.mean, np.sqrt(w @ posterior.covariance @ w)
+
+
+@pytest.mark.parametrize("theta", [FOCAL, FOCAL + TURNED])
+def test_a_common_error_of_the_focal_lengths_is_found_in_a_turn(theta):
+    """A quarter turn among points all around."""
+    street = Street(4, count=4000)
+    rng, count = np.random.default_rng(0), len(street.points)
+    angle, radius = rng.uniform(-np.pi, np.pi, count), rng.uniform(15, 45, count)
+    street.points[:, ::2] = radius[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
+    calibration = SelfCalibration(CAR, SelfCalibrationConfig())
+    for k in range(40):
+        yaw = np.deg2rad(90) * k / 39
+        T = se3.exp(np.array([0, yaw, 0, 0, 0, 0]))
+        T[:3, 3] = [8 - 8 * np.cos(yaw), 0, 8 * np.sin(yaw)]
+        calibration.observe(street.features(0.1 * k, T, theta, noise=0.3), T)
+    assert np.abs(z_scores(calibration, theta)).max() < 3
+    mean, sigma = common_focal(calibration)
+    assert abs(mean - 0.005) < 3 * sigma < 0.0075
+    assert mean > (0.001 if theta[-4] else 0.0025)
+
+
+def test_on_a_straight_road_a_common_error_of_the_focal_lengths_stays_unknown():
+    for theta in (FOCAL, parameters()):
+        mean, sigma = common_focal(drive(theta, seed=6, frames=20))
+        assert abs(mean - theta.max()) < 3 * sigma and 0.0025 < sigma < 0.006
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_good_calibration_is_left_as_it_is(seed):
     calibration = drive(seed=seed)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam.calibration import RigModel
-from slam.calibration.motion import Pair, move, pair_evidence
+from slam.calibration.motion import Pair, fit_motion, move, noise_variances, pair_evidence, squared_distance
 from slam.calibration.prior import prior_information
 from slam.calibration.views import View, pair_of
 from slam.geometry import se3
@@ -12,6 +12,7 @@ from tests.slam.numeric import jacobian
 
 MODEL = RigModel(CAR)
 NONE = parameters()
+NOISE = np.diag([0.4, 0.4, 0.2]) ** 2
 F = MODEL.focal
 
 
@@ -37,7 +38,7 @@ def test_a_pair_without_noise_gives_the_truth():
     ideal = np.column_stack([rng.uniform(-500, 500, 300), rng.uniform(-150, 150, 300), rng.uniform(0, 40, 300)])
     pair = [ideal, move(ideal, R, t, F)[0]]
     measured = [x - MODEL.field(x) @ theta for x in pair]
-    evidence = pair_evidence(MODEL, Pair(*measured, R, t), theta, 0.4, 0.2)
+    evidence = pair_evidence(MODEL, Pair(*measured, R, t), theta, NOISE)
     strong = 1e8
     mean = np.linalg.solve(prior_information(MODEL) + strong * evidence.S, strong * evidence.e)
     far = MODEL.field(MODEL.far())[:, 2]
@@ -57,15 +58,50 @@ def test_views_forty_metres_apart_are_solved_from_the_poses_of_the_system():
     poses, every = distant_views()
     off = se3.exp(np.array([0.01, 0.01, 0.0, 0.5, 0.0, 1.0]))  # as poses of a run that has drifted
     first = View.of(MODEL, every[0], poses[0], 10**6)
-    pair = pair_of(MODEL, first, View.of(MODEL, every[1], poses[1] @ off, 10**6), NONE, seed=0)
+    pair = pair_of(MODEL, first, View.of(MODEL, every[1], poses[1] @ off, 10**6), NONE, NOISE, seed=0)
     assert len(pair.first) >= 30
-    evidence = pair_evidence(MODEL, pair, NONE, 0.4, 0.2)
+    evidence = pair_evidence(MODEL, pair, NONE, NOISE)
     assert evidence is not None and evidence.S[MODEL.names.index("yaw")].any()
     # From no motion the same pair has no solution: that is why the poses are asked for, and such pairs are counted.
     still = Pair(pair.first, pair.second, np.eye(3), np.zeros(3))
-    assert pair_evidence(MODEL, still, NONE, 0.4, 0.2) is None
+    assert pair_evidence(MODEL, still, NONE, NOISE) is None
 
 
 def test_points_that_cannot_be_solved_are_no_evidence():
     points = np.full((40, 3), np.nan)
-    assert pair_evidence(MODEL, Pair(points, points, np.eye(3), np.ones(3)), NONE, 0.4, 0.2) is None
+    assert pair_evidence(MODEL, Pair(points, points, np.eye(3), np.ones(3)), NONE, NOISE) is None
+
+
+def noisy_views(pixel, disparity, outliers=0):
+    """Points and their noisy measurements in two views, and the motion."""
+    rng = np.random.default_rng(2)
+    R, t = se3.so3_exp(np.array([0.0, 0.1, 0.0])), np.array([0.3, 0.0, -4.0])
+    ideal = np.column_stack([rng.uniform(-500, 500, 800), rng.uniform(-150, 150, 800), rng.uniform(3, 40, 800)])
+    views = [x + rng.standard_normal(x.shape) * [pixel, pixel, disparity] for x in (ideal, move(ideal, R, t, F)[0])]
+    views[1][:outliers] += rng.normal(0, 30, (outliers, 3))
+    return views, R, t
+
+
+def test_the_noise_of_pixels_and_of_disparities_is_told_apart():
+    for pixel, disparity in ((0.7, 1.0), (0.3, 0.1)):
+        views, R, t = noisy_views(pixel, disparity, outliers=80)
+        noise = np.diag([pixel, pixel, disparity]) ** 2
+        found = np.sqrt(noise_variances(Pair(*views, R, t), F, noise))
+        np.testing.assert_allclose(found, [pixel, disparity], rtol=0.2)
+
+
+def test_matches_agree_as_exactly_as_they_are_measured():
+    """Near points move far: what their disparity's noise makes of that is no reason to leave them out."""
+    views, R, t = noisy_views(0.7, 1.0, outliers=80)
+    noise = np.diag([0.7, 0.7, 1.0]) ** 2
+    agree = squared_distance(*views, R, t, F, noise) < 16.3
+    assert agree[:80].mean() < 0.1 < 0.99 < agree[80:].mean()
+
+
+def test_a_motion_is_found_to_the_end():
+    """Steps shrink slowly: the first small one is not near the solution."""
+    views, R, t = noisy_views(0.2, 0.2)
+    noise = np.diag([0.2, 0.2, 0.2]) ** 2
+    near, far = (fit_motion(*views, R, t + off, F, noise) for off in (np.zeros(3), np.array([0.5, 0.3, 1.0])))
+    np.testing.assert_allclose(near.moved, far.moved, atol=0.02)
+    assert np.abs(near.t - t).max() < 0.1

@@ -8,6 +8,7 @@ import pytest
 from slam.calibration import RigPosterior
 from slam.calibration.evidence import Accumulator, Evidence
 from slam.calibration.posterior import solve
+from slam.calibration.prior import Prior
 from slam.errors import CalibrationError
 
 NONE = np.zeros(1)
@@ -42,15 +43,17 @@ def test_shapes_and_values_are_checked():
 
 
 def test_a_calibration_that_nothing_speaks_against_is_left_alone():
-    prior = np.eye(1)
-    near = solve(prior, NONE, 0.0, [evidence(0.1, 0.1)])
+    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2, np.ones(4))
+    near = solve(prior, 0.0, [evidence(0.1, 0.1)])
     assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
-    clear = solve(prior, NONE, 0.0, [evidence(0.1, 0.01)])
+    clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
     assert clear.mean[0] == pytest.approx(0.1, abs=0.01)
 
 
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
-    plain, wide = (solve(np.eye(1), NONE, 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0))
+    plain, wide = (
+        solve(Prior(NONE, np.ones((1, 1, 1)), np.ones(1)), 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0)
+    )
     assert plain.mean == wide.mean and plain.inner == wide.inner
     assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + 0.25**2, rel=0.1)  # 0.5 · 50 / 100
 
@@ -66,8 +69,25 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(np.array([[1e-6]]), NONE, 0.0, sums.total())
+            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6), np.ones(1)), 0.0, sums.total())
             sums.judge(solution.mean, solution.inner)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9
+
+
+def test_what_an_error_of_the_whole_recording_leaves():
+    """Information (S⁻¹ + V)⁻¹, and the same mean."""
+    S = np.array([[4.0, 1.0], [1.0, 2.0]])
+    mean = np.array([0.3, -0.2])
+    left = Evidence(S, S @ mean, np.zeros((2, 1))).with_error(np.array([0.5, 2.0]))
+    np.testing.assert_allclose(np.linalg.inv(left.S), np.linalg.inv(S) + np.diag([0.5, 2.0]))
+    np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
+    nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2))
+    assert not nothing.S.any()
+
+
+def test_an_earlier_posterior_is_the_start():
+    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)), np.ones(1))
+    found = solve(prior, 0.0, [evidence(4.0, 1.0)])
+    assert found.mean[0] == pytest.approx(3.0) and found.inner[0, 0] == pytest.approx(0.5)

@@ -1,0 +1,87 @@
+"""A rig with its error taken out: cameras and extrinsics of the usual form that measure as the corrected pixels do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from slam.calibration.model import LENS, RigModel, lens_change
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, so3_exp
+
+_GRID = 25, 15  # pixels at which the cameras are to agree, columns and rows
+
+
+class CorrectedRig(NamedTuple):
+    """A rig with its error taken out.
+
+    Attributes:
+        rig: in the form of a calibration file.
+        left_off, right_off: how far its pixels are from the corrected ones, root mean square over the image [px].
+    """
+
+    rig: StereoRig
+    left_off: float
+    right_off: float
+
+
+def corrected_rig(model: RigModel, parameters: Array) -> CorrectedRig:
+    """The rig as calibrated, corrected by parameters (n,).
+
+    Focal lengths, principal points and distortion of each camera are fitted to where the corrected rays are in its
+    image. A camera without distortion gets k1, k2, p1 and p2. A fisheye's form has no tangential distortion. The left
+    camera's axes stay: the turn of the ideal rig that `RigModel.field` has is left out.
+
+    Args:
+        model: the parameters' meaning, and the rig as calibrated.
+        parameters: the corrections (n,).
+    """
+    rig, rectified = model.rig, model.rig.rectified
+    side = len(LENS)
+    left_theta, right_theta, (pitch, yaw, roll, down, forward) = np.split(parameters, [side, 2 * side])
+    left, left_off = _camera(rig.left, rectified.rig.left, rectified.rectify_left, rectified.R_left, left_theta)
+    right, right_off = _camera(rig.right, rectified.rig.right, rectified.rectify_right, rectified.R_right, right_theta)
+    R = rectified.R_right.T @ so3_exp(-np.array([pitch, yaw, roll])) @ rectified.R_left
+    centre = np.array([1.0, down, forward])
+    b = -rig.baseline * (rectified.R_left.T @ centre) / np.linalg.norm(centre)
+    return CorrectedRig(StereoRig(left, right, R, b), left_off, right_off)
+
+
+def _camera(
+    camera: PinholeCamera, ideal: PinholeCamera, rectify: Callable[[Array], Array], R: Array, theta: Array
+) -> tuple[PinholeCamera, float]:
+    """A camera that sees the corrected rays at its pixels, and how well [px].
+
+    Args:
+        camera: as calibrated.
+        ideal: its rectified twin.
+        rectify: takes its pixels (N, 2) to those of the twin.
+        R: takes its axes to those of the twin (3, 3).
+        theta: the corrections (8,) of `LENS`.
+    """
+    u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), _GRID)))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    seen = ideal.normalise(rectify(pixels))
+    good = np.isfinite(seen).all(axis=1)
+    pixels, seen = pixels[good], seen[good]
+    true = seen + np.stack(lens_change(*seen.T), axis=1) @ theta
+    rays = np.column_stack([true, np.ones(len(true))]) @ R
+    distortion = camera.distortion or (0.0,) * 4
+    start = np.array([camera.fu, camera.fv, camera.u0, camera.v0, *distortion])
+    scale = np.array([camera.fu, camera.fu, camera.fu, camera.fu, *np.ones(len(distortion))])
+
+    def of(values: Array) -> PinholeCamera:
+        fu, fv, u0, v0, *rest = (float(x) for x in values)
+        model = "radtan" if camera.model == "none" else camera.model
+        return replace(camera, fu=fu, fv=fv, u0=u0, v0=v0, model=model, distortion=tuple(rest))
+
+    def off(values: Array) -> Array:
+        return np.nan_to_num((of(values).project(rays) - pixels).ravel(), nan=1e3)
+
+    found = least_squares(off, start, x_scale=scale, method="lm")
+    return of(found.x), float(np.sqrt(2 * np.mean(found.fun**2)))

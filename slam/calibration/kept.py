@@ -1,0 +1,153 @@
+"""A calibration that is kept: what recordings have shown of a rig, in a file, as the prior of further recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.calibration.model import RigModel
+from slam.calibration.posterior import RigPosterior
+from slam.errors import CalibrationError
+from slam.files import expanded, read_text, write_text
+from slam.geometry.rig import StereoRig
+
+_LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
+_SAME = 1e-5  # relative difference of numbers of the same calibration, written and read
+_SUMMARY, _KEY = "summary.json", "self_calibration"
+
+
+@dataclass(frozen=True)
+class RigNumbers:
+    """By what a calibration file knows its rig: the rectified cameras as delivered, which all corrections refer to.
+
+    Attributes:
+        width, height: size of the images [px].
+        focal: focal length [px].
+        u0, v0: principal point of the left camera [px].
+        right_u0: of the right camera [px].
+        baseline: distance of the cameras [m].
+    """
+
+    width: float
+    height: float
+    focal: float
+    u0: float
+    v0: float
+    right_u0: float
+    baseline: float
+
+    @classmethod
+    def of(cls, rig: StereoRig) -> RigNumbers:
+        """Those of a rig."""
+        r = rig.rectified.rig
+        numbers = r.width, r.height, r.left.fu, r.left.u0, r.left.v0, r.right.u0, r.baseline
+        return cls(*(float(number) for number in numbers))
+
+    @classmethod
+    def from_json(cls, tree: Any) -> RigNumbers:
+        """The inverse of `dataclasses.asdict`.
+
+        Raises:
+            CalibrationError: a number is missing or none.
+        """
+        try:
+            numbers = cls(**{field.name: float(tree[field.name]) for field in fields(cls)})
+        except (KeyError, TypeError, ValueError) as error:
+            raise CalibrationError("calibration: it does not say of which rig it is") from error
+        if not np.isfinite(list(asdict(numbers).values())).all():
+            raise CalibrationError("calibration: the numbers of its rig must be finite")
+        return numbers
+
+    def difference(self, other: RigNumbers) -> str:
+        """The first number that differs, in words; empty where none does."""
+        for name, mine, theirs in zip(asdict(self), asdict(self).values(), asdict(other).values()):
+            if abs(mine - theirs) > _SAME * max(abs(mine), abs(theirs)):
+                return f"{name} {mine:g} there, {theirs:g} here"
+        return ""
+
+
+@dataclass(frozen=True)
+class KeptCalibration:
+    """What recordings have shown of a rig.
+
+    Attributes:
+        posterior: corrections of the calibration as delivered.
+        rig: the rig as delivered.
+        residual: scale of what no parameter holds, from 0 to 1 (see `slam.calibration.prior`).
+    """
+
+    posterior: RigPosterior
+    rig: RigNumbers
+    residual: float = 1.0
+
+    def require_fits(self, rig: StereoRig) -> None:
+        """Raise where it is not of this rig.
+
+        Raises:
+            CalibrationError: a number of the calibration as delivered is another one.
+        """
+        difference = self.rig.difference(RigNumbers.of(rig))
+        if difference:
+            raise CalibrationError(f"the kept calibration is of another rig: {difference}")
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain types."""
+        return {"rig": asdict(self.rig), "residual_scale": self.residual, **self.posterior.to_json()}
+
+    @classmethod
+    def from_json(cls, tree: Mapping[str, Any]) -> KeptCalibration:
+        """The inverse of `to_json`.
+
+        Raises:
+            CalibrationError: a key is missing, a value is of the wrong kind, or the parameters are others than ours.
+        """
+        posterior = RigPosterior.from_json(tree)
+        if posterior.names != RigModel.names:
+            raise CalibrationError("calibration: its parameters are not those of this version")
+        symmetric = np.allclose(posterior.covariance, posterior.covariance.T, rtol=1e-6, atol=0)
+        if not symmetric or np.linalg.eigvalsh(posterior.covariance).min() <= 0:
+            raise CalibrationError("calibration: its covariance is none")
+        residual = tree.get("residual_scale")
+        if not isinstance(residual, (int, float)) or not 0 <= residual <= 1:
+            raise CalibrationError("calibration: residual_scale must lie in 0..1")
+        return cls(posterior, RigNumbers.from_json(tree.get("rig")), float(residual))
+
+
+def load_calibration(path: str | Path) -> KeptCalibration:
+    """Read what recordings have shown of a rig.
+
+    Args:
+        path: file of `slam calibrate`, ``summary.json`` of a run, or the folder of a run.
+
+    Raises:
+        CalibrationError: it cannot be read, or is none.
+    """
+    file = expanded(path, CalibrationError)
+    file = file / _SUMMARY if file.is_dir() else file
+    text = read_text(file, _LIMIT, CalibrationError)
+    try:
+        tree = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CalibrationError(f"{file}: not the summary of a run, and no file of `slam calibrate`") from error
+    if isinstance(tree, Mapping):
+        tree = tree.get(_KEY, tree)
+    if not isinstance(tree, Mapping) or "parameters" not in tree:
+        raise CalibrationError(f"{file}: no calibration in this file")
+    try:
+        return KeptCalibration.from_json(tree)
+    except CalibrationError as error:
+        raise CalibrationError(f"{file}: {error}") from error
+
+
+def save_calibration(path: str | Path, kept: KeptCalibration) -> None:
+    """Write a file that `load_calibration` reads.
+
+    Raises:
+        SlamError: it cannot be written; an old one is kept.
+    """
+    write_text(path, json.dumps(kept.to_json(), indent=1) + "\n")

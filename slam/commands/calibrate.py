@@ -1,0 +1,74 @@
+"""``slam calibrate``: what recordings say of their rig, in a table and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.table import Table
+
+from slam.commands.display import Progress
+from slam.data import FrameResult
+from slam.run.calibrating import Calibrated, Targets
+from slam.run.calibrating import calibrate as run
+from slam.sequences import Sequence as StereoSequence
+from slam.sequences import open_sequence
+
+_UNIT = 1e-3  # of the table
+_COLUMNS = 3  # most recordings with a column of their own
+
+
+def calibrate(
+    texts: Sequence[str],
+    targets: Targets,
+    settings: Sequence[str],
+    frames: tuple[int, int | None],
+    format: str | None,
+    quiet: bool,
+) -> None:
+    """Run recordings of one rig; write and print what they say of it.
+
+    Raises:
+        SlamError: bad input; one line says what and where.
+    """
+
+    @contextmanager
+    def show(sequence: StereoSequence, count: int) -> Iterator[Callable[[FrameResult], None]]:
+        with Progress(count, f"…{sequence.name[-14:]}", quiet) as progress:
+            yield progress.frame
+
+    done = run([open_sequence(text, format=format) for text in texts], targets, show, settings, frames)
+    if not quiet:
+        _print(done)
+        if targets.opencv is not None or targets.kalibr is not None:
+            print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
+        print(f"Use it: slam run SEQUENCE --calibration {targets.out}")
+
+
+def _print(done: Calibrated) -> None:
+    """The table, and what it says."""
+    console, joint = Console(), done.kept.posterior
+    shown = done.found if len(done.found) <= _COLUMNS else ()
+    table = Table(title="corrections [thousandths]: mean ± standard deviation", show_lines=False)
+    table.add_column("parameter")
+    table.add_column("all", justify="right", no_wrap=True)
+    for number in range(1, len(shown) + 1):
+        table.add_column(f"({number})", justify="right", no_wrap=True)
+    if done.agreed is not None:
+        table.add_column("apart", justify="right")
+    for row, name in enumerate(joint.names):
+        beliefs = [joint, *(one.posterior for one in shown)]
+        cells = [_cell(float(p.mean[row]), float(p.sigma[row])) for p in beliefs]
+        table.add_row(name, *cells, *([] if done.agreed is None else [f"{done.agreed.largest[row]:.1f} σ"]))
+    console.print(table)
+    for number, one in enumerate(done.found, 1):
+        tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
+        console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
+    if done.agreed is not None:
+        console.print(done.agreed.words, markup=False)
+
+
+def _cell(mean: float, sigma: float) -> str:
+    """A mean with its standard deviation."""
+    return f"{mean / _UNIT:.2f} ± {sigma / _UNIT:.2f}"

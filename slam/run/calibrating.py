@@ -1,0 +1,165 @@
+"""Calibrate a rig from several of its recordings: run them, add up what they say, and write it down."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.calibration import KeptCalibration, RigModel, RigPosterior
+from slam.calibration.corrected import corrected_rig
+from slam.calibration.evidence import Evidence
+from slam.calibration.joint import Agreement, agreement, joint_calibration
+from slam.calibration.kept import RigNumbers
+from slam.config import SystemConfig
+from slam.data import FrameResult
+from slam.errors import CalibrationError, ConfigurationError
+from slam.files import require_target, write_text
+from slam.geometry.rig import StereoRig
+from slam.sequences import Sequence as StereoSequence
+from slam.sequences import is_live
+from slam.sequences.calibration_files import require_kalibr, write_kalibr, write_opencv
+from slam.system import StereoSlam
+
+_BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
+_SETTINGS = ("objects.mode=off",)
+
+#: Shows the progress of a recording of so many frames: gives what is called after each.
+Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameResult], None]]]
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Files to write.
+
+    Attributes:
+        out: what has been found, with its covariance.
+        opencv: the corrected calibration in OpenCV's form; None for none.
+        kalibr: in Kalibr's.
+    """
+
+    out: Path
+    opencv: Path | None = None
+    kalibr: Path | None = None
+
+    def require(self, rig: StereoRig) -> None:
+        """Raise where a file could not be written, before hours of work are done for it."""
+        if self.kalibr is not None:
+            require_kalibr(self.kalibr, rig)
+        files = [file for file in (self.out, self.opencv, self.kalibr) if file is not None]
+        for file in files:
+            require_target(file)
+        if len(set(files)) < len(files):
+            raise ConfigurationError(f"{files[-1]}: two files cannot have one name")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one recording says.
+
+    Attributes:
+        name: of the recording.
+        frames: how many there were.
+        pairs: of views that show motion.
+        posterior: from this recording alone.
+        evidence: without any prior; None where no motion was seen.
+    """
+
+    name: str
+    frames: int
+    pairs: int
+    posterior: RigPosterior
+    evidence: Evidence | None
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What all recordings say.
+
+    Attributes:
+        found: by each.
+        kept: by all together.
+        agreed: whether they agree; None where one alone shows motion.
+        off: how far pixels of the corrected calibration are from the corrected pixels, root mean square [px].
+    """
+
+    found: Sequence[Found]
+    kept: KeptCalibration
+    agreed: Agreement | None
+    off: float
+
+
+def calibrate(
+    sequences: Sequence[StereoSequence],
+    targets: Targets,
+    show: Show,
+    settings: Sequence[str] = (),
+    frames: tuple[int, int | None] = (0, None),
+) -> Calibrated:
+    """Run recordings of one rig, and write what they say of it.
+
+    Args:
+        sequences: the recordings.
+        targets: files to write.
+        show: the progress of each.
+        settings: as ``--set`` takes them.
+        frames: the first of each, and the one after the last; None for all.
+
+    Raises:
+        SlamError: bad input; one line says what and where.
+    """
+    _require_one_rig(sequences)
+    rig = sequences[0].rig
+    targets.require(rig)
+    found = [_run(sequence, settings, frames, show) for sequence in sequences]
+    model = RigModel(rig)
+    moving = [one for one in found if one.evidence is not None]
+    systematic = _config(sequences[0], settings).self_calibration.systematic
+    kept = joint_calibration(model, [one.evidence for one in moving if one.evidence is not None], systematic)
+    agreed = agreement([one.posterior for one in moving])
+    corrected = corrected_rig(model, kept.posterior.mean)
+    every = [
+        {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
+    ]
+    tree = {**kept.to_json(), "recordings": every, "agreement": None if agreed is None else agreed.words}
+    write_text(targets.out, json.dumps(tree, indent=1) + "\n")
+    if targets.opencv is not None:
+        write_opencv(targets.opencv, corrected.rig)
+    if targets.kalibr is not None:
+        write_kalibr(targets.kalibr, corrected.rig)
+    return Calibrated(found, kept, agreed, float(np.hypot(corrected.left_off, corrected.right_off)))
+
+
+def _require_one_rig(sequences: Sequence[StereoSequence]) -> None:
+    """Raise where recordings are of several rigs, or have no end."""
+    for sequence in sequences:
+        if is_live(sequence):
+            raise ConfigurationError(f"{sequence.name}: a recording is needed, not a camera")
+        difference = RigNumbers.of(sequences[0].rig).difference(RigNumbers.of(sequence.rig))
+        if difference:
+            raise CalibrationError(f"{sequence.name}: not the rig of {sequences[0].name}: {difference}")
+
+
+def _config(sequence: StereoSequence, settings: Sequence[str]) -> SystemConfig:
+    """The settings for a recording."""
+    config = SystemConfig.for_kind(sequence.kind, _FRONTEND, _BACKEND).with_settings([*_SETTINGS, *settings])
+    if not config.self_calibration.enabled:
+        raise ConfigurationError("slam calibrate needs self_calibration.enabled=true")
+    return config
+
+
+def _run(sequence: StereoSequence, settings: Sequence[str], frames: tuple[int, int | None], show: Show) -> Found:
+    """What one recording says."""
+    system = StereoSlam(sequence.rig, _FRONTEND, _BACKEND, config=_config(sequence, settings))
+    last = len(sequence) if frames[1] is None else min(frames[1], len(sequence))
+    count = 0
+    with show(sequence, max(last - frames[0], 0)) as on_frame:
+        for _, result in system.run(sequence.frames(*frames)):
+            on_frame(result)
+            count += 1
+    own = system.calibration
+    return Found(sequence.name, count, own.pairs, own.posterior, own.evidence())

@@ -1,0 +1,70 @@
+"""Rigs written as calibration files: OpenCV's form, and Kalibr's camchain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from slam.errors import CalibrationError
+from slam.files import write_text
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+
+_FISHEYE = "equidistant"
+
+
+def write_opencv(path: Path, rig: StereoRig) -> None:
+    """Write a rig with the entries of ``cv2.stereoCalibrate``: K1, D1, K2, D2, R, T [m], and the size of the images.
+
+    Raises:
+        SlamError: it cannot be written.
+    """
+    import cv2
+    import numpy as np
+
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    storage.write("image_width", rig.width)
+    storage.write("image_height", rig.height)
+    if rig.left.model == _FISHEYE:
+        storage.write("distortion_model", _FISHEYE)
+    for number, camera in enumerate((rig.left, rig.right), 1):
+        storage.write(f"K{number}", camera.K)
+        storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
+    storage.write("R", rig.R)
+    storage.write("T", (rig.R @ rig.b).reshape(3, 1))
+    write_text(path, storage.releaseAndGetString())
+
+
+def write_kalibr(path: Path, rig: StereoRig) -> None:
+    """Write a rig as a camchain, cam0 the left camera.
+
+    Raises:
+        CalibrationError: a camera has more than four coefficients of distortion, which the form does not have.
+        SlamError: it cannot be written.
+    """
+    import yaml
+
+    require_kalibr(path, rig)
+    left, right = _kalibr_camera(rig.left), _kalibr_camera(rig.right)
+    right["T_cn_cnm1"] = rig.T_right_left.tolist()
+    write_text(path, yaml.safe_dump({"cam0": left, "cam1": right}, default_flow_style=None, sort_keys=False))
+
+
+def require_kalibr(path: Path, rig: StereoRig) -> None:
+    """Raise where Kalibr's form cannot hold a rig.
+
+    Raises:
+        CalibrationError: a camera has more than four coefficients of distortion.
+    """
+    if max(len(camera.distortion) for camera in (rig.left, rig.right)) > 4:
+        raise CalibrationError(f"{path}: Kalibr's form has k1, k2, p1 and p2, and this rig further distortion")
+
+
+def _kalibr_camera(camera: PinholeCamera) -> dict[str, object]:
+    """A camera of a camchain."""
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fu, camera.fv, camera.u0, camera.v0],
+        "distortion_model": _FISHEYE if camera.model == _FISHEYE else "radtan",
+        "distortion_coeffs": list(camera.distortion or (0.0,) * 4),
+        "resolution": [camera.width, camera.height],
+    }

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam.calibration import SelfCalibration, SelfCalibrationConfig
+from slam.calibration.joint import agreement, joint_calibration
+from slam.calibration.prior import systematic_variance
+from slam.errors import CalibrationError, ConfigurationError
+from slam.geometry.rig import StereoRig
+from slam.system import StereoSlam
+from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose
+
+TURNED = parameters(pitch=5e-4, yaw=5e-4, roll=5e-4)
+
+
+@pytest.fixture(scope="module")
+def first():
+    return drive(TURNED, seed=1, frames=20)
+
+
+def observed(calibration, theta, seed, frames=20):
+    """The same after a drive."""
+    street = Street(seed, calibration.rig)
+    for k in range(frames):
+        calibration.observe(street.features(0.1 * k, pose(k), theta), pose(k))
+    return calibration
+
+
+def test_what_is_kept_corrects_from_the_first_frame_and_goes_on_being_learnt(first, tmp_path):
+    slam.save_calibration(tmp_path / "rig.json", first.kept())
+    kept = slam.load_calibration(tmp_path / "rig.json")
+    np.testing.assert_array_equal(kept.posterior.mean, first.posterior.mean)
+    assert kept.rig == first.kept().rig
+    second = SelfCalibration(CAR, SelfCalibrationConfig(), kept)
+    np.testing.assert_array_equal(second.applied.parameters, first.posterior.mean)
+    assert (second.posterior.sigma > 0.999 * first.posterior.sigma).all()  # the cameras may have turned since
+    alone = drive(TURNED, seed=2, frames=20)
+    after = observed(second, TURNED, seed=2).posterior
+    assert np.abs((after.mean - TURNED) / after.sigma).max() < 3
+    volume = [np.linalg.slogdet(p.covariance)[1] for p in (after, first.posterior, alone.posterior)]
+    assert volume[0] < min(volume[1:])
+
+
+def test_a_camera_that_has_turned_since_is_found(first):
+    turned = TURNED + parameters(right_cx=-1.0 / 720)  # [px]
+    second = observed(SelfCalibration(CAR, SelfCalibrationConfig(), first.kept()), turned, seed=3)
+    assert np.abs((second.posterior.mean - turned) / second.posterior.sigma).max() < 3
+    assert disparity_error(second, turned) < 0.15 < 0.9 < disparity_error(first, turned)
+
+
+def test_the_system_starts_with_it(first):
+    system = StereoSlam(CAR, None, "ekf", rig_prior=first.kept())
+    system.process_features(Street(4).features(0.0, pose(0), TURNED))
+    np.testing.assert_array_equal(system.calibration.applied.parameters, first.posterior.mean)
+
+
+def test_of_another_rig_or_switched_off_it_is_refused(first):
+    other = StereoRig.rectified_pair(730, 610, 173, 0.54, 1242, 375)
+    with pytest.raises(CalibrationError, match=r"another rig: focal 720 there, 730 here"):
+        StereoSlam(other, None, "ekf", rig_prior=first.kept())
+    with pytest.raises(ConfigurationError, match="enabled"):
+        SelfCalibration(CAR, SelfCalibrationConfig(enabled=False), first.kept())
+
+
+def spoilt(tree, change):
+    tree = json.loads(json.dumps(tree))
+    change(tree)
+    return tree
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop("rig"), "of which rig"),
+        (lambda t: t["rig"].update(focal="long"), "of which rig"),
+        (lambda t: t["rig"].update(focal=float("nan")), "finite"),
+        (lambda t: t.update(residual_scale="x"), "residual_scale"),
+        (lambda t: t.pop("parameters"), "no calibration"),
+        (lambda t: t["parameters"].pop(), "cannot be read"),
+        (lambda t: t["parameters"][0].update(name="colour"), "not those of this version"),
+        (lambda t: t["covariance"][0].__setitem__(0, -1.0), "covariance"),
+        (lambda t: t["covariance"][0].__setitem__(1, float("nan")), "finite"),
+    ],
+)
+def test_bad_files_get_one_line(first, tmp_path, change, message):
+    file = tmp_path / "bad.json"
+    file.write_text(json.dumps(spoilt(first.kept().to_json(), change)))
+    with pytest.raises(CalibrationError, match=message) as raised:
+        slam.load_calibration(file)
+    assert str(file) in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", "[" * 100_000, "{}"])
+def test_files_of_another_kind_get_one_line(tmp_path, content):
+    (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(CalibrationError, match=r"summary\.json"):
+        slam.load_calibration(tmp_path)
+    with pytest.raises(CalibrationError, match=r"none\.json"):
+        slam.load_calibration(tmp_path / "none.json")
+
+
+def test_one_recording_jointly_is_that_recording(first):
+    joint = joint_calibration(first.model, [first.evidence()], first.config.systematic).posterior
+    np.testing.assert_allclose(joint.mean, first.posterior.mean, rtol=1e-9)
+    # The run counts a part that is incomplete; here there is none, so that the covariance is the same as well.
+    np.testing.assert_allclose(joint.covariance, first.posterior.covariance, rtol=1e-6, atol=1e-14)
+
+
+def test_recordings_together_are_surer_and_agree(first):
+    drives = [first, *(drive(TURNED, seed=seed, frames=20) for seed in (2, 3))]
+    joint = joint_calibration(first.model, [d.evidence() for d in drives], first.config.systematic).posterior
+    assert np.abs((joint.mean - TURNED) / joint.sigma).max() < 3
+    assert np.linalg.slogdet(joint.covariance)[1] < min(np.linalg.slogdet(d.posterior.covariance)[1] for d in drives)
+    # The systematic error of each recording averages out over recordings, and not within them.
+    thirds = 3 * [first.evidence().scaled(1 / 3)]
+    one, three = (
+        joint_calibration(first.model, parts, first.config.systematic).posterior.covariance
+        for parts in ([first.evidence()], thirds)
+    )
+    np.testing.assert_allclose(one - three, np.diag(2 / 3 * systematic_variance(first.model, 0.05)), atol=1e-12)
+    found = agreement([d.posterior for d in drives])
+    assert found.words.startswith("The recordings agree") and found.largest.shape == joint.mean.shape
+    assert agreement([first.posterior]) is None
+
+
+def test_recordings_of_another_rig_do_not_agree(first):
+    other = replace(first.posterior, mean=first.posterior.mean + 5 * first.posterior.sigma * (np.arange(21) == 18))
+    found = agreement([first.posterior, other])
+    assert found.words.startswith("The recordings do not agree in roll: the largest difference is 3.5 sigma")
+    assert found.pairs[18].tolist() == [0, 1]
+
+
+def test_without_motion_there_is_nothing_to_join(first):
+    assert drive(step=0.0, frames=3).evidence() is None
+    with pytest.raises(CalibrationError, match="no recording"):
+        joint_calibration(first.model, [], 0.05)

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import slam
+from slam.calibration import RigModel
+from slam.calibration.corrected import corrected_rig
+from slam.commands.cli import app
+from slam.errors import SlamError
+from slam.run.repeat import load
+
+WORLD = "synthetic:aisle?frames=6&speed=16&turn_error=1"
+QUIET = ("-q", "--no-picture")
+
+
+def command(*words):
+    """The command in this process; an error of its own is raised."""
+    done = CliRunner().invoke(app, [*map(str, words)])
+    if isinstance(done.exception, SlamError):
+        raise done.exception
+    assert done.exit_code == 0, (done.output, done.exception)
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """What two recordings of one rig leave, and what is printed."""
+    folder = tmp_path_factory.mktemp("made")
+    files = {"--out": "rig.json", "--opencv": "rig.yaml", "--kalibr": "camchain.yaml"}
+    words = [str(word) for option, name in files.items() for word in (option, folder / name)]
+    return folder, command("calibrate", WORLD, f"{WORLD}&seed=1", *words)
+
+
+def test_two_recordings_of_one_rig(made):
+    folder, printed = made
+    tree = json.loads((folder / "rig.json").read_text())
+    assert [one["frames"] for one in tree["recordings"]] == [6, 6]
+    turn = [row for row in tree["parameters"] if row["name"] in ("pitch", "yaw", "roll")]
+    assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
+    assert any(abs(row["mean"]) > 1e-4 for row in turn)
+    assert tree["agreement"].startswith("The recordings agree")
+    assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
+    model = RigModel(slam.open_sequence(WORLD).rig)
+    expected = corrected_rig(model, np.array([row["mean"] for row in tree["parameters"]])).rig
+    for name in ("rig.yaml", "camchain.yaml"):
+        rig = slam.load_rig(folder / name)
+        assert (rig.left, rig.right) == (expected.left, expected.right)
+        np.testing.assert_allclose(rig.T_right_left, expected.T_right_left, atol=1e-9)
+
+
+def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):
+    folder, _ = made
+    file = folder / "rig.json"
+    command("run", WORLD, "--calibration", file, "--frames", "0:2", "--out", tmp_path / "first", *QUIET)
+    found = json.loads((tmp_path / "first" / "summary.json").read_text())["self_calibration"]["parameters"]
+    expected = json.loads(file.read_text())["parameters"]
+    assert [row["mean"] for row in found] == [row["mean"] for row in expected]
+    assert load(tmp_path / "first").origin.calibration == file
+    command("run", "--config", tmp_path / "first", "--out", tmp_path / "second", *QUIET)
+    one, two = ((tmp_path / name / "trajectory.txt").read_bytes() for name in ("first", "second"))
+    assert one == two
+    command("run", WORLD, "--calibration", tmp_path / "first", "--frames", "0:1", "--out", tmp_path / "third", *QUIET)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", WORLD, "--calibration", "none.json"], r"none\.json"),
+        (["run", "synthetic:aisle?frames=3&width=200", "--calibration", "{rig}"], "of another rig: width"),
+        (["run", WORLD, "--calibration", "{rig}", "--set", "self_calibration.enabled=false"], "enabled"),
+        (["calibrate", WORLD, "synthetic:aisle?frames=3&baseline=0.2"], "not the rig of"),
+        (["calibrate", WORLD, "--set", "self_calibration.enabled=false"], "enabled"),
+        (["calibrate", "synthetic:desk?frames=1"], "no recording"),
+        (["calibrate", WORLD, "--out", "nowhere/rig.json"], "nowhere"),
+        (["calibrate", WORLD, "--out", "a.yaml", "--opencv", "a.yaml"], "one name"),
+    ],
+)
+def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [word.replace("{rig}", str(made[0] / "rig.json")) for word in words]
+    with pytest.raises(SlamError, match=message):
+        command(*words, "-q")
+    assert not list(tmp_path.glob("*.yaml"))
