@@ -53,8 +53,8 @@ def pair_evidence(
         disparity_sigma: noise of d [px].
     """
     noise = np.diag(np.square([pixel_sigma, pixel_sigma, disparity_sigma]))
-    first = pair.first + model.field(pair.first) @ parameters
-    second = pair.second + model.field(pair.second) @ parameters
+    first = pair.first + model.shift(pair.first, parameters)
+    second = pair.second + model.shift(pair.second, parameters)
     points, R, t = first, pair.R, pair.t
     for _ in range(_ITERATIONS):
         moved, J_point, J_motion = move(points, R, t, model.focal)

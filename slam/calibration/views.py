@@ -115,7 +115,7 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, seed:
     """
     a, b = match(first, second)
     one, two = first.points[a], second.points[b]
-    ideal = [p + model.field(p) @ parameters for p in (one, two)]
+    ideal = [p + model.shift(p, parameters) for p in (one, two)]
     T: Array = inverse(second.T_world_left) @ first.T_world_left
     near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
     rig = model.rig.rectified.rig
