@@ -347,7 +347,7 @@ def test_covariances_that_gtsam_gives_with_some_digits_only_come_out_symmetric(m
     rough = np.random.default_rng(0).normal(0, 1e-6, (6, 6))
     monkeypatch.setattr(solver, "_root_of", lambda *_: None)
     monkeypatch.setattr(BrokenIsam, "marginalCovariance", lambda self, key: np.eye(6) + rough, raising=False)
-    graph_solver = backend._graph._solver
+    graph_solver = backend._graph.solver
     monkeypatch.setattr(graph_solver, "_isam", BrokenIsam(gtsam.ISAM2Params()))
     P = graph_solver._joint_covariance([0])
     assert np.array_equal(P, P.T) and np.allclose(P, np.eye(6), atol=1e-5)
