@@ -1,10 +1,8 @@
-"""What the back ends cost: against the bare arithmetic, and against the size of the problem.
+"""What the EKF's predict and update cost over the bare ``dsyrk``.
 
-    python benchmarks/backends.py [--quick]              both sections, and the figure
-    python benchmarks/backends.py --only ratios          the EKF's predict and update over the bare ``dsyrk``
-    python benchmarks/backends.py --only growth          cost with landmarks, observations and frames
+    python benchmarks/backends.py [--quick]
 
-Times are CPU times, medians of one run; compare ratios, not milliseconds. Long runs: `experiments/long_run.py`.
+Times are CPU times, medians of one run; compare ratios, not milliseconds. How cost grows: `benchmarks/growth.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from threadpoolctl import threadpool_limits
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
-from experiments.long_run import DT, MODELS, RIG, Corridor, measured, run
+from experiments.long_run import DT, MODELS, RIG, measured
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
@@ -65,20 +63,20 @@ def mapped(
     return backend, points, known, DT * (turns + 4)
 
 
-def standing(name: str, size: int, count: int, frames: int, **options: object) -> Iterator[tuple[float, float]]:
-    """CPU seconds of predict and update, frame by frame, where `count` of a map of `size` are measured."""
+def standing(name: str, size: int, count: int, frames: int, **options: object) -> Iterator[tuple[float, float, float]]:
+    """CPU seconds of predict, of update and of gtsam in both, where `count` of a map of `size` are measured."""
     rng = np.random.default_rng(0)
     backend, points, known, stamp = mapped(name, size, count + 10 + count // 10, rng, **options)
     ids = np.array(sorted(known))
     for k in range(1, frames + 1):
         seen = measured(np.eye(4), points[ids], ids, rng).select(np.arange(count))
-        yield (
-            seconds(partial(backend.predict, stamp + k * DT)),
-            seconds(partial(backend.update, seen)),
-        )
+        before = getattr(backend, "solver_seconds", 0.0)
+        predict = seconds(partial(backend.predict, stamp + k * DT))
+        update = seconds(partial(backend.update, seen))
+        yield predict, update, getattr(backend, "solver_seconds", 0.0) - before
 
 
-def turning(name: str, size: int, count: int, frames: int, **options: object) -> Iterator[tuple[float, float]]:
+def turning(name: str, size: int, count: int, frames: int, **options: object) -> Iterator[tuple[float, float, float]]:
     """As `standing`, but the camera turns right around once, so that what is measured changes all the time."""
     rng = np.random.default_rng(0)
     backend, points, known, stamp = mapped(name, size, count + 10 + count // 10, rng, **options)
@@ -90,6 +88,7 @@ def turning(name: str, size: int, count: int, frames: int, **options: object) ->
         yield (
             seconds(partial(backend.predict, stamp + k * DT)),
             seconds(partial(backend.update, seen)),
+            0.0,
         )
 
 
@@ -117,7 +116,7 @@ def ratios(sizes: Sequence[tuple[int, int]], frames: int) -> None:
                     1e3
                     * np.array(
                         [
-                            (seconds(bare), *times)
+                            (seconds(bare), *times[:2])
                             for times in drive("ekf", landmarks, count, frames, landmarks=coordinates)
                         ]
                     )
@@ -132,66 +131,12 @@ def ratios(sizes: Sequence[tuple[int, int]], frames: int) -> None:
                 )
 
 
-# --- how cost grows ---
-
-
-def growth(names: Sequence[str], quick: bool, out: Path) -> None:
-    """Prints and draws milliseconds a frame against landmarks, observations and frames."""
-    maps, counts = ((60, 120), (10, 40)) if quick else ((60, 150, 300, 600), (10, 30, 60, 120))
-    repeats, frames = (10, 60) if quick else (30, 400)
-    curves: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
-    for name in names:
-        by_map = [per_frame(name, n, 30, repeats) for n in maps]
-        by_count = [per_frame(name, 2 * max(counts), m, repeats) for m in counts]
-        along = list(run(name, frames, frames // 10, Corridor()))
-        curves[name] = {
-            "landmarks in the map (30 measured)": (list(maps), by_map),
-            f"landmarks measured (of {2 * max(counts)})": (list(counts), by_count),
-            "frame of a walk along a corridor": ([c.frame for c in along], [c.milliseconds for c in along]),
-        }
-        for what, (x, y) in curves[name].items():
-            print(f"{name}, ms by {what}: " + ", ".join(f"{a}: {b:.2f}" for a, b in zip(x, y)), flush=True)
-    draw(out, curves)
-
-
-def per_frame(name: str, landmarks: int, count: int, frames: int) -> float:
-    """Median milliseconds of predict and update."""
-    return 1e3 * float(np.median([sum(pair) for pair in standing(name, landmarks, count, frames)]))
-
-
-def draw(path: Path, curves: dict[str, dict[str, tuple[list[float], list[float]]]]) -> None:
-    """A panel each for landmarks, observations and frames."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    titles = list(next(iter(curves.values())))
-    figure, axes = plt.subplots(1, len(titles), figsize=(4 * len(titles), 3.2))
-    for title, panel in zip(titles, axes):
-        for name, lines in curves.items():
-            panel.plot(*lines[title], "o-", label=name)
-        panel.set(xlabel=title, ylim=(0, None))
-    axes[0].set_ylabel("CPU time of a frame [ms]")
-    axes[0].legend()
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small sizes and few frames")
-    parser.add_argument("--only", choices=("ratios", "growth"))
-    parser.add_argument("--backends", nargs="*", default=("ekf", "smoother"))
-    parser.add_argument("--out", type=Path, default=Path("results/backends"))
-    arguments = parser.parse_args()
-    if arguments.only in (None, "ratios"):
-        sizes = [(60, 20), (318, 30)] if arguments.quick else [(50, 30), (150, 30), (318, 30), (318, 60), (1000, 30)]
-        ratios(sizes, 20 if arguments.quick else 100)
-    if arguments.only in (None, "growth"):
-        growth(arguments.backends, arguments.quick, arguments.out / "cost.png")
+    parser.add_argument("--quick", action="store_true", help="two sizes and few frames")
+    quick = parser.parse_args().quick
+    sizes = [(60, 20), (318, 30)] if quick else [(50, 30), (150, 30), (318, 30), (318, 60), (1000, 30)]
+    ratios(sizes, 20 if quick else 100)
 
 
 if __name__ == "__main__":

@@ -232,7 +232,7 @@ class StereoSlam:
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
             prediction = self.backend.predict(features.stamp)
-            self._stamp = features.stamp
+            dt, self._stamp = features.stamp - self._stamp, features.stamp
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
@@ -240,8 +240,9 @@ class StereoSlam:
             held = self.objects.suspects
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
-            report = self.backend.update(matches.observations(features), matches.T_world_left)
-            state = self._localizer.state_after(self._last.state, prediction, features, matches, report)
+            asked, spared = self._localizer.informative(prediction, matches, self.backend.positions(matches.ids), dt)
+            report = self.backend.update(asked.observations(features), asked.T_world_left)
+            state = self._localizer.state_after(self._last.state, prediction, features, asked, report)
             pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
             self.calibration.observe(raw, pose)
         with stages.stage("estimate"):
@@ -251,7 +252,7 @@ class StereoSlam:
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
-            step = Step(index, features, prediction, matches, held, report, state, estimate, labels)
+            step = Step(index, features, prediction, matches, held, spared, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)

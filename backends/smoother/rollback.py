@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from backends.smoother.landmarks import Track
 from backends.smoother.measurement_log import MeasurementLog
 
 
@@ -20,22 +19,20 @@ def snapshot(log: MeasurementLog) -> Callable[[], None]:
     """A function that puts the log back to how it is now."""
     parts = (log.path, log.measurements, log.landmarks, log.history)
     states = [_state(part) for part in parts]
-    tracks = {slot: (track, *_of_track(track)) for slot, track in log.landmarks.tracks.items()}
+    # There are hundreds, in every call: no function is called for each.
+    tracks = [
+        (slot, t, len(t.rows), t.rows, t.points, t.keys, t.stereo, t.factor) for slot, t in log.landmarks.tracks.items()
+    ]
 
     def restore() -> None:
         for part, state in zip(parts, states):
             _put_back(part, state)
-        for track, count, rows, points, keys, stereo, factor in tracks.values():
+        for _, track, count, rows, points, keys, stereo, factor in tracks:
             track.rows, track.points, track.keys = rows[:count], points[:count], keys[:count]
             track.stereo, track.factor = stereo, factor
-        log.landmarks.tracks = {slot: entry[0] for slot, entry in tracks.items()}
+        log.landmarks.tracks = {slot: track for slot, track, *_ in tracks}
 
     return restore
-
-
-def _of_track(track: Track) -> tuple[int, list[int], list[Any], list[int], int, int]:
-    """What may change of a track: the length of its lists, these, and the rest; there are hundreds, in every call."""
-    return len(track.rows), track.rows, track.points, track.keys, track.stereo, track.factor
 
 
 #: Arrays that only grow, and are revised in place: poses and measurements.
@@ -50,8 +47,9 @@ def _state(part: Any) -> dict[str, Any]:
             out[name] = value.copy()
         elif isinstance(value, list):
             out[name] = (value, len(value))
-        elif isinstance(value, dict):
-            out[name] = {key: (v, len(v)) if isinstance(v, list) else v for key, v in value.items()}
+        elif isinstance(value, dict) and name != "tracks":  # all values of one are of the same type
+            lists = isinstance(next(iter(value.values()), None), list)
+            out[name] = (value.copy(), [len(v) for v in value.values()] if lists else None)
         else:
             out[name] = value
     return out
@@ -59,13 +57,14 @@ def _state(part: Any) -> dict[str, Any]:
 
 def _put_back(part: Any, state: dict[str, Any]) -> None:
     for name, value in state.items():
-        if isinstance(value, dict):
-            value = {key: _shortened(v) for key, v in value.items()}
-        setattr(part, name, copy(_shortened(value)))
+        setattr(part, name, copy(_as_it_was(value)))
 
 
-def _shortened(value: Any) -> Any:
-    """A list as long as it was; anything else as it is."""
-    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], list):
-        return value[0][: value[1]]
-    return value
+def _as_it_was(value: Any) -> Any:
+    """A list, or the lists in a dictionary, as long as they were; anything else as it is."""
+    if not isinstance(value, tuple):
+        return value
+    before, length = value
+    if isinstance(before, list):
+        return before[:length]
+    return before if length is None else {key: v[:n] for (key, v), n in zip(before.items(), length)}

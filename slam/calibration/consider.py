@@ -103,7 +103,7 @@ class RigUncertainty:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
         assert self._T_world is not None
         kept = self._landmarks.select(~np.isin(self._landmarks.ids, erased))
-        new = ~np.isin(ids, [*kept.ids, *erased])
+        new = ~np.isin(ids, np.concatenate([kept.ids, erased]))
         local = transform(inverse(self._T_world), positions[new])
         R = self._T_world[:3, :3]
         back = np.linalg.inv(self._by_point(local))

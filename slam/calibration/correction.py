@@ -28,13 +28,13 @@ class RigCorrection:
     def rows(self, z: Array) -> Array:
         """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]; uR NaN stays NaN."""
         points = self.model.points(z)
-        return self.model.rows(points + self.model.field(points) @ self.parameters)
+        return self.model.rows(points + self.model.shift(points, self.parameters))
 
     def undone(self, z: Array) -> Array:
         """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
         corrected = points = self.model.points(z)
         for _ in range(_ROUNDS):
-            points = corrected - self.model.field(points) @ self.parameters
+            points = corrected - self.model.shift(points, self.parameters)
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:

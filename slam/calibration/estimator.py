@@ -16,7 +16,7 @@ from slam.calibration.motion import Pair, noise_variances, pair_evidence, parall
 from slam.calibration.posterior import RigPosterior, Solution, solve
 from slam.calibration.prior import as_delivered, as_found, prior_information, residual_variance, systematic_variance
 from slam.calibration.rows import row_evidence
-from slam.calibration.views import View, match, pair_of
+from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
@@ -149,19 +149,21 @@ class SelfCalibration:
         """Compare a view with the earlier ones that wait for a partner, the oldest first, until one goes on waiting."""
         c, self._open = self.config, None
         waiting = self._waiting
-        common = len(match(waiting[-1], view)[0]) if waiting else 0
+        newest = match(waiting[-1], view) if waiting else NO_MATCHES
+        common = len(newest[0])
         apart = not waiting or common < (1 - _SPACING * (1 - c.kept_share)) * len(waiting[-1])
         ended = 0
         for first in waiting:
-            n = common if first is waiting[-1] else len(match(first, view)[0])
+            matched = newest if first is waiting[-1] else match(first, view)
+            n = len(matched[0])
             if n > max(c.kept_share * len(first), c.minimum_common):
                 break
             ended += 1
-            evidence = self._evidence(first, view) if n >= c.minimum_common else None
+            evidence = self._evidence(first, view, matched) if n >= c.minimum_common else None
             if evidence is not None:
                 self._motion.add(evidence)
         if waiting and not ended and self.pairs < _FEW:
-            self._open = self._evidence(waiting[0], view)
+            self._open = self._evidence(waiting[0], view, matched)
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
     def evidence(self) -> Evidence | None:
@@ -192,13 +194,13 @@ class SelfCalibration:
 
     def _ideal(self, pair: Pair) -> Pair:
         """A pair of views with its points corrected by what is known now."""
-        first, second = (p + self.model.field(p) @ self._solution.mean for p in (pair.first, pair.second))
+        first, second = (p + self.model.shift(p, self._solution.mean) for p in (pair.first, pair.second))
         return replace(pair, first=first, second=second)
 
-    def _evidence(self, first: View, second: View) -> Evidence | None:
-        """What a pair of views says; None where it is nothing."""
+    def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
+        """What a pair of views says, by the features that look alike; None where it is nothing."""
         c = self.config
-        pair = pair_of(self.model, first, second, self._solution.mean, self._noise, self._seen)
+        pair = pair_of(self.model, first, second, self._solution.mean, self._noise, self._seen, matched)
         if len(pair.first) < c.minimum_common:
             self.unsolved += 1
             return None

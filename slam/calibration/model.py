@@ -29,6 +29,7 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 #: ones are left out: `LENS` and `POSE` have them.
 _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
+_FIRST, _SECOND = (list(degrees) for degrees in zip(*RESIDUAL))
 _BEYOND = 1.1  # polynomials are held constant beyond the image, this many half widths from its centre
 
 
@@ -80,7 +81,15 @@ class RigModel:
         the pose does not turn with each revision, the ideal rig is turned such that the left image as a whole stays
         where it is.
         """
-        return self._unturned(points) + _turn(points, self.focal) @ self._gauge
+        by_turn = _turn(points, self.focal).reshape(-1, 3) @ self._gauge
+        return np.asarray(self._unturned(points) + by_turn.reshape(len(points), 3, len(self.names)))
+
+    def shift(self, points: Array, parameters: Array) -> Array:
+        """Change (N, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by parameters (n,): ``field(points) @ parameters``."""
+        field = self._unturned(points)
+        shift = field.reshape(-1, field.shape[2]) @ parameters
+        shift += _turn(points, self.focal).reshape(-1, 3) @ (self._gauge @ parameters)
+        return np.asarray(shift.reshape(-1, 3))
 
     @cached_property
     def _gauge(self) -> Array:
@@ -94,12 +103,16 @@ class RigModel:
     def _unturned(self, points: Array) -> Array:
         """`field` without the rotation."""
         x, y, d = points.T / self.focal
-        left, right = lens_change(x, y), lens_change(x - d, y)
-        turn = np.stack([-(x - d) * y, 1 + (x - d) ** 2, -y], axis=1)
-        none = np.zeros((len(points), len(LENS) + len(POSE)))
-        along_d = [left[0], -right[0], -turn, 0 * x[:, None], (d * (x - d))[:, None]]
-        rows = [[left[0], none], [left[1], none], along_d]
-        return np.asarray(self.focal * np.stack([np.concatenate(row, axis=1) for row in rows], axis=1))
+        right, n = x - d, len(LENS)
+        out = np.zeros((len(points), 3, len(self.names)))
+        _lens(x, y, out[:, 0, :n], out[:, 1, :n])
+        out[:, 2, :n] = out[:, 0, :n]
+        _lens(right, y, out[:, 2, n : 2 * n], None)
+        pose = out[:, 2, 2 * n :]
+        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 4] = right * y, -1 - right**2, y, d * right
+        out[:, 2, n : 2 * n] *= -1
+        out *= self.focal
+        return out
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
@@ -108,42 +121,66 @@ class RigModel:
         ``d · (forward · y - down)``, which the correction takes away.
         """
         x, y, d = points.T / self.focal
-        left, right = lens_change(x, y)[1], lens_change(x - d, y)[1]
-        turn = np.stack([-1 - y**2, (x - d) * y, x - d], axis=1)
-        return np.asarray(self.focal * np.concatenate([-left, right, turn, d[:, None], (-d * y)[:, None]], axis=1))
+        right, n = x - d, len(LENS)
+        out = np.zeros((len(points), len(self.names)))
+        _lens(x, y, None, out[:, :n])
+        out[:, :n] *= -1
+        _lens(right, y, None, out[:, n : 2 * n])
+        pose = out[:, 2 * n :]
+        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3], pose[:, 4] = -1 - y**2, right * y, right, d, -d * y
+        out *= self.focal
+        return out
 
     def residual_field(self, points: Array) -> Array:
         """As `field`, by the residual fields (N, 3, m): of x and y of the left camera, then of the right one."""
         x, y, d = points.T / self.focal
-        left, right = self._polynomials(x, y), self._polynomials(x - d, y)
-        none = 0 * left
-        rows = [[left, none, none, none], [none, left, none, none], [left, none, -right, none]]
-        return np.asarray(self.focal * np.stack([np.concatenate(row, axis=1) for row in rows], axis=1))
+        n = len(RESIDUAL)
+        out = np.zeros((len(points), 3, 4 * n))
+        out[:, 0, :n] = out[:, 1, n : 2 * n] = out[:, 2, :n] = self.focal * self._polynomials(x, y)
+        out[:, 2, 2 * n : 3 * n] = -self.focal * self._polynomials(x - d, y)
+        return out
 
     def residual_vertical(self, points: Array) -> Array:
         """As `vertical`, by the residual fields (N, m)."""
         x, y, d = points.T / self.focal
-        left, right = self._polynomials(x, y), self._polynomials(x - d, y)
-        return np.asarray(self.focal * np.concatenate([0 * left, -left, 0 * left, right], axis=1))
+        n = len(RESIDUAL)
+        out = np.zeros((len(points), 4 * n))
+        out[:, n : 2 * n] = -self.focal * self._polynomials(x, y)
+        out[:, 3 * n :] = self.focal * self._polynomials(x - d, y)
+        return out
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
         at = [np.clip((v - c) / h, -_BEYOND, _BEYOND) for v, c, h in zip((x, y), self._centre, self._half)]
         a, b = (legvander(v, n) * np.sqrt(2 * np.arange(n + 1) + 1) for v, n in zip(at, _DEGREES))
-        return np.stack([a[:, i] * b[:, j] for i, j in RESIDUAL], axis=1)
+        return np.asarray((a.T[_FIRST] * b.T[_SECOND]).T)
 
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
     """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera."""
-    none, r2 = 0 * x, x * x + y * y
-    along_x = [none + 1, none, x, none, x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x]
-    along_y = [none, none + 1, y, y, y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y]
-    return np.stack(along_x, axis=1), np.stack(along_y, axis=1)
+    along_x, along_y = np.zeros((2, len(x), len(LENS)))
+    _lens(x, y, along_x, along_y)
+    return along_x, along_y
+
+
+def _lens(x: Array, y: Array, along_x: Array | None, along_y: Array | None) -> None:
+    """`lens_change`, into what holds zeros."""
+    r2 = x * x + y * y
+    r4, both = r2**2, 2 * x * y
+    if along_x is not None:
+        along_x[:, 0], along_x[:, 2], along_x[:, 4], along_x[:, 5] = 1, x, x * r2, x * r4
+        along_x[:, 6], along_x[:, 7] = both, r2 + 2 * x * x
+    if along_y is not None:
+        along_y[:, 1], along_y[:, 2], along_y[:, 3], along_y[:, 4], along_y[:, 5] = 1, y, y, y * r2, y * r4
+        along_y[:, 6], along_y[:, 7] = r2 + 2 * y * y, both
 
 
 def _turn(points: Array, focal: float) -> Array:
     """Change (N, 3, 3) [px] of points ``(x, y, d)`` (N, 3) [px] by a small rotation of the rig [rad]."""
     x, y, d = points.T / focal
-    none = 0 * x
-    change = [[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x], [-d * y, d * x, none]]
-    return np.asarray(focal * np.stack([np.stack(row, axis=1) for row in change], axis=1))
+    out = np.zeros((len(points), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = -x * y, 1 + x * x, -y
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = -1 - y * y, x * y, x
+    out[:, 2, 0], out[:, 2, 1] = -d * y, d * x
+    out *= focal
+    return out

@@ -112,8 +112,8 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
         parameters: where to linearise (n,).
         noise: covariance of a point (3, 3) [px²]; only its form matters, the scale is estimated.
     """
-    first = pair.first + model.field(pair.first) @ parameters
-    second = pair.second + model.field(pair.second) @ parameters
+    first = pair.first + model.shift(pair.first, parameters)
+    second = pair.second + model.shift(pair.second, parameters)
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
     if fit is None:
         return None

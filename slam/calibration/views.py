@@ -24,6 +24,11 @@ _REFITS = 2  # times that motion and matches that agree with it are found anew
 _HYPOTHESES = 100  # poses tried in the geometric check of a pair of views
 
 
+#: Rows of features in one view and in another, in pairs.
+Rows = tuple[NDArray[np.intp], NDArray[np.intp]]
+NO_MATCHES: Rows = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
 @dataclass(frozen=True)
 class View:
     """The stereo features of one frame, as measured.
@@ -75,10 +80,10 @@ class View:
         )
 
 
-def match(first: View, second: View) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def match(first: View, second: View) -> Rows:
     """Rows of features that look alike in two views: each the other's nearest, and clearly nearer than the next."""
     if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+        return NO_MATCHES
     found = [
         (rows[i], others[j])
         for sign, (rows, descriptors) in first.by_sign.items()
@@ -104,7 +109,15 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
     return rows, best[rows]
 
 
-def pair_of(model: RigModel, first: View, second: View, parameters: Array, noise: Array, seed: int) -> Pair:
+def pair_of(
+    model: RigModel,
+    first: View,
+    second: View,
+    parameters: Array,
+    noise: Array,
+    seed: int,
+    matched: Rows | None = None,
+) -> Pair:
     """What two views have in common: matches that agree with one motion, and that motion.
 
     The motion of the system's poses is the first guess; it is the only one where most matches agree with it.
@@ -116,10 +129,11 @@ def pair_of(model: RigModel, first: View, second: View, parameters: Array, noise
         parameters: of the rig (n,), as known so far.
         noise: covariance (3, 3) of a point [px²]; only its form matters.
         seed: of the random choice in the geometric check.
+        matched: features that look alike, where that is known already.
     """
-    a, b = match(first, second)
+    a, b = match(first, second) if matched is None else matched
     one, two = first.points[a], second.points[b]
-    ideal = [p + model.field(p) @ parameters for p in (one, two)]
+    ideal = [p + model.shift(p, parameters) for p in (one, two)]
     T: Array = inverse(second.T_world_left) @ first.T_world_left
     near = (ideal[0][:, 2] > _NEAREST) & (ideal[1][:, 2] > _NEAREST)
     rig = model.rig.rectified.rig

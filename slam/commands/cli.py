@@ -135,6 +135,7 @@ def run_command(
     quiet: QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
+    from slam.commands.compile_beside import compiled_beside
     from slam.commands.display import Progress, print_summary
     from slam.commands.folders import run_folder
     from slam.commands.run import Wanted, prepare
@@ -148,6 +149,7 @@ def run_command(
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
+        stack.enter_context(compiled_beside(options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
         watches = []

@@ -33,8 +33,9 @@ class Step:
         index: of the frame.
         features: all of them, corrected by the calibration.
         prediction: of the back end.
-        matches: landmarks that were given to the back end's update.
-        held: ids of landmarks that were not, because they may move.
+        matches: landmarks that were recognised.
+        held: ids of landmarks that were not given to the back end's update, because they may move.
+        spared: ids of those of the matches that were not, because others tell more.
         report: of the update.
         state: whether the pose is known.
         estimate: the camera's pose after the update.
@@ -46,6 +47,7 @@ class Step:
     prediction: Prediction
     matches: LandmarkMatches
     held: IdArray
+    spared: IdArray
     report: UpdateReport
     state: TrackingState
     estimate: Estimate
@@ -215,7 +217,7 @@ class Mapper:
     def _count(self, landmarks: LandmarkRows, view: MapView, step: Step) -> LandmarkRows:
         """Count what was seen and missed; a frame without a measured pose says nothing of single landmarks."""
         m, matches = self.config, step.matches
-        measured = np.isin(matches.ids, step.report.used)
+        measured = np.isin(matches.ids, np.concatenate([step.report.used, step.spared]))
         expected = landmarks.ids[:0]
         if not step.state.unmatched:
             size = (self.rig.width, self.rig.height)

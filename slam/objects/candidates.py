@@ -11,12 +11,14 @@ tracks that made it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
+from slam.geometry.gauss_kernels import squared_distances
 from slam.geometry.se3 import Array
 from slam.objects.tracks import MOVES, ConstantVelocity
 
@@ -79,12 +81,12 @@ class MovingTracks:
         moves = (some.test > MOVES) & (np.linalg.norm(some.velocity, axis=1) > min_speed)
         return cls(rows[kept], ids[kept], some, radius[kept], moves)
 
-    @property
+    @cached_property
     def places(self) -> Array:
         """Covariances (N, 3, 3) of a region's middle as each sees it."""
         return self.motion.covariance + self.spread
 
-    @property
+    @cached_property
     def spread(self) -> Array:
         """Covariances (N, 3, 3) of the points in a region about each: as of a ball's."""
         return np.eye(3) * (self.radius**2 / 3.0)[:, None, None]
@@ -156,11 +158,12 @@ def follow_candidates(
 
 
 def _advanced(candidate: Candidate, dt: float, acceleration: float) -> Candidate:
-    F = np.eye(6)
-    F[:3, 3:] = dt * np.eye(3)
-    P = F @ candidate.covariance @ F.T
-    P[3:, 3:] += acceleration**2 * dt * np.eye(3)
-    return replace(candidate, state=F @ candidate.state, covariance=P)
+    state, P = candidate.state.copy(), candidate.covariance.copy()
+    state[:3] += dt * state[3:]
+    P[:3] += dt * P[3:]
+    P[:, :3] += dt * P[:, 3:]
+    P.reshape(-1)[21::7] += acceleration**2 * dt
+    return replace(candidate, state=state, covariance=P)
 
 
 def _near(candidate: Candidate, tracks: MovingTracks, places: Array) -> BoolArray:
@@ -239,4 +242,5 @@ def _velocity_information(covariances: Array) -> Array:
 
 def _squares(gaps: Array, covariances: Array) -> Array:
     """χ² (...) of gaps (..., 3) with covariances (..., 3, 3)."""
-    return np.asarray((gaps * np.linalg.solve(covariances, gaps[..., None])[..., 0]).sum(axis=-1))
+    flat = squared_distances(gaps.reshape(-1, 3), covariances.reshape(-1, 3, 3))
+    return np.asarray(flat.reshape(gaps.shape[:-1]))

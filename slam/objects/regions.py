@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
 from slam.objects.tracks import median, times_vectors
@@ -151,7 +151,7 @@ class _Problem:
     def mean_gap(self, rows: NDArray[np.intp], common: Array) -> float:
         """How far tracks went against a common motion, in the weighted mean [m]."""
         moved, W = self.moved, self.moved.W[rows]
-        shift = np.cross(common[:3], moved.points[rows]) + common[3:]
+        shift = moved.points[rows] @ hat(common[:3]).T + common[3:]
         gap = moved.d[rows] - moved.lag[rows, None] * shift
         mean = np.linalg.solve(W.sum(axis=0), times_vectors(W, gap).sum(axis=0))
         return float(np.linalg.norm(mean))

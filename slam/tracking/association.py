@@ -67,6 +67,8 @@ class AssociationConfig:
         rematch_after: landmarks that were outside of the image for so many frames are looked for from any view angle
             and ratio: what they tell about the drift meanwhile is worth more than what the point may have slid. Found,
             they count as first seen from there.
+        measured: matches that a back end gets in a frame at most, those that tell most of the camera's motion (see
+            `slam.tracking.informative`); 0 for all.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
     """
 
@@ -91,6 +93,7 @@ class AssociationConfig:
     view_angle: float = 20.0
     view_ratio: float = 1.4
     rematch_after: int = 10
+    measured: int = 0
     refined_window: float = 3.0
 
     __pydantic_config__ = FORBID_UNKNOWN
@@ -113,6 +116,8 @@ class AssociationConfig:
             raise ConfigurationError("association: view_ratio must be at least 1")
         if min(self.hypotheses, self.wide_hypotheses) < 1 or self.minimum_consistent < 3:
             raise ConfigurationError("association: hypotheses >= 1 and minimum_consistent >= 3 are required")
+        if 0 < self.measured < 10:
+            raise ConfigurationError("association: measured must be 0, for all matches, or at least 10")
         if self.kidnapped_after < 1:
             raise ConfigurationError("association: kidnapped_after must be at least 1")
 

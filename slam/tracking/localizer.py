@@ -18,6 +18,7 @@ from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
 from slam.tracking.hypotheses import PoseHypotheses
+from slam.tracking.informative import most_informative
 from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
 
@@ -109,6 +110,17 @@ class Localizer:
             return LandmarkMatches.nothing()
         self._hypotheses = PoseHypotheses()
         return replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+
+    def informative(
+        self, prediction: Prediction, matches: LandmarkMatches, positions: Array, dt: float
+    ) -> tuple[LandmarkMatches, IdArray]:
+        """The matches at `positions` (K, 3) that a back end shall get, and the ids of the others."""
+        most = self.config.measured
+        if not most or len(matches) <= most or not np.isfinite(dt):
+            return matches, matches.ids[:0]
+        rows = most_informative(self.rig, self._models, prediction, matches.ids, positions, dt, most)
+        others = np.setdiff1d(matches.ids, matches.ids[rows])
+        return matches.without(others), others
 
     def state_after(
         self,

@@ -1,0 +1,159 @@
+"""How the cost of a frame grows: with landmarks, measurements, features, moving objects and frames.
+
+    python benchmarks/growth.py [--quick] [--out DIR]
+
+Each curve stands beside its floor, what cannot be done without: for the filter the bare ``dsyrk`` of its covariance,
+for the smoother gtsam's own calls, for features SURF alone; for objects, the same frames without their detector. CPU
+times, medians, floors from the same run; prints a Markdown table and draws the curves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.backends import bare_dsyrk, seconds, standing
+from experiments.long_run import Corridor, run
+from experiments.tables import markdown, write_json
+from slam.config import SystemConfig
+from slam.sequences import open_sequence
+from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "smoother")
+HEADER = ("by", "what", "size", "CPU [ms]", "floor [ms]", "ratio")
+LANDMARKS, MEASURED, FEATURES, OBJECTS, FRAMES = (
+    "landmarks in the map, 30 measured", "landmarks measured, of 240", "features, 320x240", "moving cars", "frame",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of a curve.
+
+    Attributes:
+        by: what grows.
+        what: whose time it is.
+        size: how much there is of it.
+        milliseconds: of a frame, or of the part of it that the curve is about.
+        floor: of what cannot be done without; None where it was not measured.
+    """
+
+    by: str
+    what: str
+    size: int
+    milliseconds: float
+    floor: float | None
+
+    def row(self) -> list[object]:
+        """As `HEADER`."""
+        ratio = None if not self.floor else self.milliseconds / self.floor
+        return [self.by, self.what, self.size, self.milliseconds, self.floor, ratio]
+
+
+def by_size(by: str, name: str, landmarks: int, count: int, frames: int) -> Point:
+    """Predict and update of a camera that stands still, over the bare ``dsyrk`` or over gtsam's calls."""
+    predict, update, gtsam = np.array(list(standing(name, landmarks, count, frames))).T
+    with threadpool_limits(1, user_api="blas"):
+        bare = bare_dsyrk(landmarks, count)
+        floor = np.median([seconds(bare) for _ in range(frames)]) if name == "ekf" else np.median(gtsam)
+    size = landmarks if by == LANDMARKS else count
+    return Point(by, name, size, 1e3 * float(np.median(predict + update)), 1e3 * float(floor))
+
+
+def by_features(name: str, count: int, frames: int) -> Point:
+    """Whole frames over SURF alone."""
+    sequence = open_sequence(f"synthetic:desk?frames={frames}")
+    config = SystemConfig.for_kind(sequence.kind, "surf", name).with_settings([f"frontend.features={count}"])
+    system, whole, surf = StereoSlam(sequence.rig, backend=name, kind=sequence.kind, config=config), [], []
+    for frame in sequence:
+        start = time.process_time()
+        features = system.frontend.extract(frame)  # type: ignore[union-attr]
+        surf.append(time.process_time() - start)
+        system.process_features(features)
+        whole.append(time.process_time() - start)
+    return Point(FEATURES, name, count, *(1e3 * float(np.median(t[frames // 3 :])) for t in (whole, surf)))
+
+
+def by_objects(name: str, cars: int, frames: int) -> Point:
+    """Frames without their features, over the same without the detector of moving objects."""
+    sequence = open_sequence(f"synthetic:street?cars={cars}&frames={frames}")
+    features, found = [sequence.observations(k) for k in range(frames)], []  # type: ignore[attr-defined]
+    for mode in ("detect", "off"):
+        config = SystemConfig.for_kind(sequence.kind, None, name).with_settings([f"objects.mode={mode}"])
+        system, times = StereoSlam(sequence.rig, None, name, kind=sequence.kind, config=config), []
+        for seen in features:
+            start = time.process_time()
+            system.process_features(seen)
+            times.append(time.process_time() - start)
+        found.append(1e3 * float(np.median(times[frames // 3 :])))
+    return Point(OBJECTS, name, cars, *found)
+
+
+def along(name: str, frames: int) -> list[Point]:
+    """A walk along a corridor."""
+    return [Point(FRAMES, name, c.frame, c.milliseconds, None) for c in run(name, frames, frames // 6, Corridor())]
+
+
+def points(quick: bool) -> list[Point]:
+    """All curves."""
+    maps, counts = ((60, 120), (10, 40)) if quick else ((60, 150, 300, 600), (10, 30, 60, 120))
+    features, cars = ((100, 400), (0, 2)) if quick else ((100, 200, 400, 800, 1600), (0, 1, 2, 3))
+    repeats, images, length = (10, 6, 60) if quick else (20, 24, 300)
+    found = []
+    for name in BACKENDS:
+        found += [by_size(LANDMARKS, name, n, 30, repeats) for n in maps]
+        found += [by_size(MEASURED, name, 240, m, repeats) for m in counts]
+        found += [by_features(name, n, images) for n in features]
+        found += [by_objects(name, n, images) for n in cars]
+        found += along(name, length)
+    return found
+
+
+def draw(path: Path, found: list[Point]) -> None:
+    """A panel for each thing that grows, floors dashed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    kinds = list(dict.fromkeys(p.by for p in found))
+    figure, axes = plt.subplots(1, len(kinds), figsize=(3.4 * len(kinds), 3.2))
+    for kind, panel in zip(kinds, axes):
+        for name, colour in zip(BACKENDS, ("C0", "C1")):
+            mine = sorted((p for p in found if p.by == kind and p.what == name), key=lambda p: p.size)
+            sizes = [p.size for p in mine]
+            panel.plot(sizes, [p.milliseconds for p in mine], "o-", color=colour, label=name, markersize=3)
+            if all(p.floor is not None for p in mine):
+                panel.plot(sizes, [p.floor for p in mine], "--", color=colour, label=f"{name}, floor")
+        panel.set(xlabel=kind, ylim=(0, None))
+    axes[0].set_ylabel("CPU time of a frame [ms]")
+    axes[0].legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small sizes and few frames")
+    parser.add_argument("--out", type=Path, default=Path("results/growth"))
+    arguments = parser.parse_args()
+    found = points(arguments.quick)
+    table = [p.row() for p in found]
+    print(markdown(HEADER, table, 2))
+    write_json(arguments.out / "table.json", HEADER, table)
+    draw(arguments.out / "growth.png", found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
