@@ -37,7 +37,18 @@ MAY_IMPORT = {
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
     "testing": {"system", "worlds", "data", "geometry"},
-    "commands": {"compare", "run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime"},
+    "commands": {
+        "compare",
+        "run",
+        "objects",
+        "system",
+        "sequences",
+        "worlds",
+        "evaluation",
+        "data",
+        "geometry",
+        "runtime",
+    },
 }
 
 #: The root's modules that make up the room "system"; all others belong to "data", what everybody needs.
