@@ -51,10 +51,6 @@ class Measurements:
         self._z[rows], self._frame[rows], self._landmark[rows] = z, frame, landmarks
         return rows
 
-    def shift_right(self, shift: float) -> None:
-        """Move all right pixels by `shift`."""
-        self._z = self._z + np.array([0.0, 0.0, shift])
-
     def keep(self, rows: NDArray[np.bool_]) -> None:
         """Forget all but some of the rows (n,); the others move up."""
         count = int(rows.sum())

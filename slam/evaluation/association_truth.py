@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from slam.data import FrameResult, IdArray
+from slam.data import IdArray
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
@@ -100,24 +99,6 @@ def surface_points(camera: PinholeCamera, depth: np.ndarray, uv: Array) -> Array
     z = np.where(depth[row, column] > 0, depth[row, column], np.nan).astype(float)
     xy = camera.normalise(uv)
     return np.column_stack([xy * z[:, None], z])
-
-
-def score_associations(world: TrueWorld, results: Iterable[FrameResult], tolerance: float = 3.0) -> AssociationScore:
-    """Count which associations of a run are right.
-
-    Args:
-        world: the sequence that was run, from its first frame on.
-        results: of its frames, in order.
-        tolerance: largest distance of a feature from the landmark's true place [px].
-    """
-    points = SurfacePoints(world)
-    right = wrong = 0
-    for frame, result in enumerate(results):
-        error = points.errors(frame, result.matched, result.features.uv_left[result.matched_features])
-        right += int((error < tolerance).sum())
-        wrong += int((error >= tolerance).sum())
-        points.add(frame, result.added, result.features.uv_left[result.added_features])
-    return AssociationScore(right, wrong)
 
 
 def _nearest_pixels(uv: Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
