@@ -39,7 +39,7 @@ def frame_result(
         index=step.index,
         status=status,
         reason=reason,
-        estimate=atlas.estimate(step.estimate),
+        estimate=atlas.estimate(step.estimate, step.common),
         report=step.report,
         features=step.features,
         predicted=len(step.prediction.ids),

@@ -14,6 +14,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
+from slam.mapping.atlas.keyframes import CommonError
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -39,6 +40,7 @@ class Step:
         state: whether the pose is known.
         estimate: the camera's pose after the update.
         labels: which features move.
+        common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
     """
 
     index: int
@@ -50,6 +52,7 @@ class Step:
     state: TrackingState
     estimate: Estimate
     labels: MotionLabels
+    common: CommonError = field(default_factory=CommonError)
 
 
 @dataclass(frozen=True)
