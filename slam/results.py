@@ -55,6 +55,7 @@ def frame_result(
         revision=revision,
         T_map_odom=atlas.T_map_odom,
         loop=atlas.closed_in(step.index),
+        refused_loop=atlas.refused_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=change.returned.ids,
     )

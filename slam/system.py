@@ -239,6 +239,7 @@ class StereoSlam:
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
+            held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
             report = self.backend.update(matches.observations(features), matches.T_world_left)
@@ -252,7 +253,7 @@ class StereoSlam:
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
-            step = Step(index, features, prediction, matches, held, report, state, estimate, labels)
+            step = Step(index, features, prediction, matches, held, held_rows, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)

@@ -224,7 +224,9 @@ def encode(saved: SavedMap) -> bytes:
     texts = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
     header = {**texts, "holds": saved.holds}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
-    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(saved.keyframes, saved.keyframe_poses, saved.loops)
+    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(
+        saved.keyframes, saved.keyframe_poses, saved.loops
+    )
     for name, values in arrays.items():
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(values), (1, 0), allow_pickle=False)

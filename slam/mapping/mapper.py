@@ -36,6 +36,7 @@ class Step:
         prediction: of the back end.
         matches: landmarks that were given to the back end's update.
         held: ids of landmarks that were not, because they may move.
+        held_rows: features that were matched with some of these.
         report: of the update.
         state: whether the pose is known.
         estimate: the camera's pose after the update.
@@ -48,6 +49,7 @@ class Step:
     prediction: Prediction
     matches: LandmarkMatches
     held: IdArray
+    held_rows: NDArray[np.intp]
     report: UpdateReport
     state: TrackingState
     estimate: Estimate
@@ -154,11 +156,11 @@ class Mapper:
         """Let landmarks of a place seen again rejoin the map, where the back end can place them.
 
         Under their old ids, where they had one. What the back end still had of them, where it had last left them, is
-        erased first. Features that are landmarks of the map already are left alone.
+        erased first. Features that are landmarks of the map already, or that move, are left alone.
         """
         if not isinstance(backend, MapBackend):
             return change
-        taken = np.concatenate([step.matches.rows, change.added.rows])
+        taken = np.concatenate([step.matches.rows, change.added.rows, step.held_rows, step.labels.moving])
         free = np.flatnonzero(~np.isin(returned.rows, taken))
         if not len(free):
             return change

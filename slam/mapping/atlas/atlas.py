@@ -56,7 +56,7 @@ class Atlas:
         keyframes: in order of time.
         index: which of them look alike.
         loops: those that the pose graph holds.
-        refused: number of sightings that contradicted the path.
+        refused: sightings that contradicted the path, as the numbers of both keyframes.
         corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
         anchor: how well the last of these is known; None without a loop.
         T_map_odom: pose (4, 4) of the back end's frame in the map.
@@ -69,7 +69,7 @@ class Atlas:
     keyframes: tuple[Keyframe, ...] = ()
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
-    refused: int = 0
+    refused: tuple[tuple[int, int], ...] = ()
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     anchor: Anchor | None = None
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
@@ -107,13 +107,19 @@ class Atlas:
         """
         closed = sum(loop.second >= self.known for loop in self.loops)
         known = {"known": self.known} if self.known else {}
-        return {"keyframes": len(self), **known, "closed": closed, "refused": self.refused}
+        return {"keyframes": len(self), **known, "closed": closed, "refused": len(self.refused)}
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""
         if not self.loops or self.keyframes[self.loops[-1].second].frame != frame:
             return None
         return self.keyframes[self.loops[-1].first].frame
+
+    def refused_in(self, frame: int) -> int | None:
+        """Index of the frame whose place `frame` seemed to show again, where that was refused."""
+        if not self.refused or self.keyframes[self.refused[-1][1]].frame != frame:
+            return None
+        return self.keyframes[self.refused[-1][0]].frame
 
     def chain(self, scale: Array, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now.

@@ -198,9 +198,7 @@ class LoopCloser:
             landmark_of[rows],
         )
 
-    def _candidates(
-        self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray
-    ) -> NDArray[np.intp]:
+    def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray) -> NDArray[np.intp]:
         """Numbers of keyframes that may show this place again, the likeliest first.
 
         Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
@@ -279,7 +277,7 @@ class LoopCloser:
         T, P = relative_pose(chain, atlas.loops, start, loop.first, loop.second)
         limit = self._config.gate_sigmas**2
         if _distance(T, loop.T_first_second, P + loop.covariance) > limit:
-            return replace(atlas, refused=atlas.refused + 1), None
+            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second))), None
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas, None
@@ -289,7 +287,7 @@ class LoopCloser:
         loops = (*atlas.loops, loop)
         solution = solve(chain, loops, start)
         if (solution.disagreement > limit).any():
-            return replace(atlas, refused=atlas.refused + 1, pending=None), None
+            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second)), pending=None), None
         atlas = replace(
             atlas,
             loops=loops,
