@@ -38,9 +38,9 @@ class Chain:
             object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
 
     def carried(self, ends: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Covariance by noise (K, 6, 6), and derivative by the common errors (K, 6, m), of each keyframe in its stretch.
+        """How far each keyframe is off by what its stretch has carried to it: noise, and the common errors' part.
 
-        From where the stretch begins, perturbing the pose at which it ends.
+        Covariance (K, 6, 6) and derivative (K, 6, m), perturbing the pose at which the stretch ends.
 
         Args:
             ends: the keyframes that bound stretches, ascending, the first and the last one among them.

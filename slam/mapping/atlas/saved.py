@@ -17,7 +17,8 @@ ATLAS_TYPES = {
     "keyframe_stamps": np.float64, "keyframe_poses": np.float64, "keyframe_odometry": np.float64,
     "keyframe_covariances": np.float64, "keyframe_steps": np.float64, "keyframe_shares": np.float64,
     "keyframe_travelled": np.float64, "keyframe_depths": np.float64, "keyframe_features": np.int64,
-    "place_points": np.float32, "place_descriptors": np.float16, "place_laplacian": np.int8, "place_landmarks": np.int64,
+    "place_points": np.float32, "place_descriptors": np.float16, "place_laplacian": np.int8,
+    "place_landmarks": np.int64,
     "loop_pairs": np.int64, "loop_motions": np.float64, "loop_covariances": np.float64, "loop_inliers": np.int64,
 }  # fmt: skip
 
