@@ -195,8 +195,10 @@ class _Normal:
 
         Args:
             count: number of poses, the fixed first one included.
-            a, b: rows of the poses (E,).
-            A, B: derivatives by them (E, 6, 6).
+            a: rows of the first poses (E,).
+            b: rows of the second poses (E,).
+            A: derivatives by the first poses (E, 6, 6).
+            B: by the second poses (E, 6, 6).
             C: by the common errors (E, 6, m).
             W: information (E, 6, 6).
             r: residuals (E, 6).

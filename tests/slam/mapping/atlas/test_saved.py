@@ -21,8 +21,8 @@ def keyframe(seed: int) -> Keyframe:
     points = np.column_stack([rng.normal(size=(count, 2)), rng.uniform(2, 9, count)])
     P = np.diag(rng.uniform(1e-4, 1e-2, 6))
     return Keyframe(
-        -1, float(seed), exp(rng.normal(size=6)), P, 0.1 * P, rng.normal(size=(6, 3)), 2.0 * seed, float(np.median(points[:, 2])),
-        points.astype(np.float32), rng.normal(size=(count, 16)).astype(np.float16),
+        -1, float(seed), exp(rng.normal(size=6)), P, 0.1 * P, rng.normal(size=(6, 3)), 2.0 * seed,
+        float(np.median(points[:, 2])), points.astype(np.float32), rng.normal(size=(count, 16)).astype(np.float16),
         np.sign(rng.normal(size=count)).astype(np.int8), np.arange(-1, count - 1),
     )  # fmt: skip
 
