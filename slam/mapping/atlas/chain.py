@@ -70,21 +70,28 @@ class Chain:
         return T, P
 
 
-def spread(chain: Chain, ends: NDArray[np.intp], moved: Array, common: Array) -> Array:
-    """Poses (K, 4, 4) of all keyframes, from those of some (M, 4, 4): each stretch's change is shared out.
+def spread(chain: Chain, ends: NDArray[np.intp], carried: tuple[Array, Array], moved: Array, common: Array) -> Array:
+    """Poses (K, 4, 4) of all keyframes, from those of some: each stretch's change is shared out.
 
-    What the common errors (m,) say of each step goes to that step, the rest in proportion to the noise.
+    What the common errors say of each step goes to that step, the rest in proportion to the noise.
+
+    Args:
+        chain: the path.
+        ends: the keyframes (M,) that bound stretches.
+        carried: see `Chain.carried`.
+        moved: their new poses (M, 4, 4).
+        common: the common errors (m,).
     """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1)
     begin, end = ends[at - 1], ends[at]
-    carried, by_common = chain.carried(ends)
+    noise, by_common = carried
     known = by_common @ common
     a = inverse(chain.poses[begin])
     step = a @ chain.poses[end]
     change = log(inverse(step) @ inverse(moved[at - 1]) @ moved[at])
-    whole = carried[end] + _LEAST * np.eye(6)
-    part = known + (carried @ np.linalg.solve(whole, (change - known[end])[:, :, None]))[:, :, 0]
+    whole = noise[end] + _LEAST * np.eye(6)
+    part = known + (noise @ np.linalg.solve(whole, (change - known[end])[:, :, None]))[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change[ends[1:]]
     out = shared_out(moved[at - 1], a @ chain.poses, inverse(chain.poses) @ chain.poses[end], part)

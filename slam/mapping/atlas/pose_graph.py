@@ -60,7 +60,7 @@ def solve(chain: Chain, loops: Sequence[Loop], start: Array) -> Solution:
     last = len(poses) - 1
     P = problem.normal(poses, common).covariance([last])
     disagreement = np.square(problem.whitened(r)).sum(axis=1)[len(r) - len(loops) :]
-    return Solution(spread(chain, problem.ends, poses, common), P, common, disagreement)
+    return Solution(spread(chain, problem.ends, problem.carried, poses, common), P, common, disagreement)
 
 
 def relative_pose(chain: Chain, loops: Sequence[Loop], start: Array, first: int, second: int) -> tuple[Array, Array]:
@@ -92,6 +92,7 @@ class _Problem:
         motions: measured (E, 4, 4).
         roots: of their information (E, 6, 6): a residual r weighs |root r|².
         common: derivative of the motions by the common errors (E, 6, m).
+        carried: of all keyframes, see `slam.mapping.atlas.chain.Chain.carried`.
     """
 
     ends: NDArray[np.intp]
@@ -100,6 +101,7 @@ class _Problem:
     motions: Array
     roots: Array
     common: Array
+    carried: tuple[Array, Array]
 
     @classmethod
     def of(cls, chain: Chain, loops: Sequence[Loop], also: Sequence[int]) -> _Problem:
@@ -117,6 +119,7 @@ class _Problem:
             np.concatenate([motions, np.array([x.T_first_second for x in loops]).reshape(-1, 4, 4)]),
             np.linalg.inv(np.linalg.cholesky(covariances)),
             np.concatenate([common[end], np.zeros((len(loops), *common.shape[1:]))]),
+            (noise, common),
         )
 
     def residuals(self, poses: Array, common: Array) -> Array:
