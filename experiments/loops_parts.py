@@ -20,8 +20,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.loops import QUICK, ROW_TEXTS, ate, drive, false_loops, row
 from experiments.loops import HEADER as ROW_HEADER
+from experiments.loops import QUICK, ROW_TEXTS, ate, drive, false_loops, nees, row
 from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.geometry.se3 import exp, inverse
@@ -50,13 +50,12 @@ def alike(seeds: int) -> str:
         run = drive(f"{TOWN}&alike=0.5&seed={seed}&layout={seed}", "ekf", list(QUICK))
         s = run.atlas.summary()
         errors = [ate(poses, run.truth) for poses in (run.odometry, run.final.poses)]
+        at = [r.index for r in run.results if r.loop is not None]
+        errors.append(nees(run, at[-1], len(run.results)) if at else float("nan"))
         rows.append([seed, s["keyframes"], s["closed"], false_loops(run), s["refused"], *errors])
-    total = [
-        "all",
-        *(sum(r[i] for r in rows) for i in range(1, 5)),
-        *(float(np.mean([r[i] for r in rows])) for i in (5, 6)),
-    ]
-    header = ("seed", "keyframes", "loops", "false", "refused", "ATE without [m]", "final [m]")
+    columns = list(zip(*rows))
+    total = ["all", *map(sum, columns[1:5]), *(float(np.mean(column)) for column in columns[5:])]
+    header = ("seed", "keyframes", "loops", "false", "refused", "ATE without [m]", "final [m]", "NEES after the last")
     return markdown(header, [*rows, total])
 
 

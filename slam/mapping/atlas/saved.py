@@ -84,8 +84,8 @@ def from_arrays(
         for i, s in enumerate(slice(x, y) for x, y in pairwise(begin))
     )  # fmt: skip
     loops = tuple(
-        Loop(*pair, motion, covariance, inliers)
-        for pair, motion, covariance, inliers in zip(
+        Loop(first, second, motion, covariance, inliers)
+        for (first, second), motion, covariance, inliers in zip(
             a["loop_pairs"].tolist(), a["loop_motions"], a["loop_covariances"], a["loop_inliers"].tolist()
         )
     )
