@@ -23,7 +23,7 @@ from slam.mapping.atlas.keyframes import Loop
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
 
-_LEAST = 1e-12  # variance [rad², m²] that keeps a motion's covariance invertible
+_LEAST = 1e-12  # variance [rad², m²], and share of one, that keeps a motion's covariance invertible
 _ROUNDS = 30  # of least squares, at most
 _CONVERGED = 1e-3  # decrease of χ² that is none any more
 _HALVINGS = 8  # of a step that makes χ² larger
@@ -110,14 +110,13 @@ class _Problem:
         noise, common = chain.carried(ends)
         begin, end = ends[:-1], ends[1:]
         covariances = np.concatenate([noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
-        covariances = 0.5 * (covariances + np.swapaxes(covariances, 1, 2)) + _LEAST * np.eye(6)
         motions = inverse(chain.poses[begin]) @ chain.poses[end]
         return cls(
             ends,
             np.searchsorted(ends, [*begin, *(x.first for x in loops)]),
             np.searchsorted(ends, [*end, *(x.second for x in loops)]),
             np.concatenate([motions, np.array([x.T_first_second for x in loops]).reshape(-1, 4, 4)]),
-            np.linalg.inv(np.linalg.cholesky(covariances)),
+            _root_of_information(covariances),
             np.concatenate([common[end], np.zeros((len(loops), *common.shape[1:]))]),
             (noise, common),
         )
@@ -255,6 +254,13 @@ class _Normal:
 
 #: The matrix is symmetric and positive definite: no pivots are looked for off its diagonal.
 _SYMMETRIC = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+
+
+def _root_of_information(covariances: Array) -> Array:
+    """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), which rounding may have made none."""
+    scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) + _LEAST)
+    values, vectors = np.linalg.eigh(covariances / (scale[:, :, None] * scale[:, None, :]))
+    return np.asarray(np.swapaxes(vectors / np.sqrt(np.maximum(values, _LEAST))[:, None, :], 1, 2) / scale[:, None, :])
 
 
 def _by_perturbation(xi: Array) -> Array:
