@@ -25,6 +25,7 @@ from slam.mapping.atlas.keyframes import (
 )
 from slam.mapping.atlas.loops import Sighting, alike, sighting
 from slam.mapping.atlas.places import Vectors
+from slam.mapping.atlas.shelf import Shelf
 from slam.mapping.mapper import KnownPlace, Returned, Step
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
@@ -78,6 +79,7 @@ class LoopCloser:
         self._rig = rig.rectified.rig
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
+        self._shelf = Shelf() if config.on_disk else None
         self._localizer = Localizer(self._rig, replace(association, wide_hypotheses=_HYPOTHESES), models)
 
     @one_blas_thread
@@ -104,7 +106,8 @@ class LoopCloser:
         candidates = self._candidates(atlas, new, step, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
         index = atlas.index.with_new(descriptors)
-        atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=index, restarts=restarts)
+        kept = new if self._shelf is None else self._shelf.put(new)
+        atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
         best = self._best_sighting(atlas, candidates, step.features, step.index)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common.scale, path)
 
