@@ -12,7 +12,6 @@ import numpy as np
 from slam.errors import SlamError
 from slam.mapping.atlas.keyframes import Keyframe
 
-_ARRAYS = ("landmarks", "points", "descriptors", "laplacian")  # from large to small numbers, so that all are aligned
 _ALIGNMENT = 8  # bytes
 
 
@@ -34,8 +33,9 @@ class Shelf:
         Raises:
             SlamError: the file cannot be written.
         """
-        arrays = {name: np.ascontiguousarray(getattr(keyframe, name)) for name in _ARRAYS}
-        data = b"".join(a.tobytes() for a in arrays.values())
+        k = keyframe  # from large to small numbers, so that all are aligned
+        arrays = [np.ascontiguousarray(a) for a in (k.landmarks, k.points, k.descriptors, k.laplacian)]
+        data = b"".join(a.tobytes() for a in arrays)
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="slam_keyframes_")  # noqa: SIM115
@@ -46,8 +46,9 @@ class Shelf:
             whole = np.memmap(self._file, np.uint8, "r", begin, (len(data),))
         except OSError as error:
             raise SlamError(f"atlas.on_disk: {error.strerror or error}") from error
-        found, at = {}, 0
-        for name, a in arrays.items():
-            found[name] = whole[at : at + a.nbytes].view(a.dtype).reshape(a.shape)
+        found, at = [], 0
+        for a in arrays:
+            found.append(whole[at : at + a.nbytes].view(a.dtype).reshape(a.shape))
             at += a.nbytes
-        return replace(keyframe, **found)
+        landmarks, points, descriptors, laplacian = found
+        return replace(keyframe, landmarks=landmarks, points=points, descriptors=descriptors, laplacian=laplacian)
