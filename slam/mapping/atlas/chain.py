@@ -90,7 +90,7 @@ def spread(chain: Chain, ends: NDArray[np.intp], carried: tuple[Array, Array], m
     a = inverse(chain.poses[begin])
     step = a @ chain.poses[end]
     change = log(inverse(step) @ inverse(moved[at - 1]) @ moved[at])
-    whole = noise[end] + _LEAST * np.eye(6)
+    whole = noise[end] + LEAST_VARIANCE * np.eye(6)
     part = known + (noise @ np.linalg.solve(whole, (change - known[end])[:, :, None]))[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change[ends[1:]]

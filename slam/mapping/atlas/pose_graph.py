@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import Array, adjoint, exp, hat, inverse, log
+from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
 from slam.mapping.atlas.chain import Chain, adjoints, spread
 from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
 
-_LEAST = 1e-12  # variance [rad², m²], and share of one, that keeps a motion's covariance invertible
 _ROUNDS = 30  # of least squares, at most
 _CONVERGED = 1e-3  # decrease of χ² that is none any more
 _HALVINGS = 8  # of a step that makes χ² larger
@@ -258,9 +257,11 @@ _SYMMETRIC = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
 
 def _root_of_information(covariances: Array) -> Array:
     """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), which rounding may have made none."""
-    scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) + _LEAST)
+    scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) + LEAST_VARIANCE)
     values, vectors = np.linalg.eigh(covariances / (scale[:, :, None] * scale[:, None, :]))
-    return np.asarray(np.swapaxes(vectors / np.sqrt(np.maximum(values, _LEAST))[:, None, :], 1, 2) / scale[:, None, :])
+    return np.asarray(
+        np.swapaxes(vectors / np.sqrt(np.maximum(values, LEAST_VARIANCE))[:, None, :], 1, 2) / scale[:, None, :]
+    )
 
 
 def _by_perturbation(xi: Array) -> Array:

@@ -25,10 +25,10 @@ ATLAS_TYPES = {
 _LARGEST = 1e12  # entry of a covariance [rad², m²]
 _TURNED = 1e-6  # by which a rotation matrix may be none
 _LIMITS = {
-    "keyframe_stamps": _LARGEST, "keyframe_poses": _FARTHEST, "keyframe_odometry": _FARTHEST,
+    "keyframe_stamps": _LARGEST, "keyframe_poses": FARTHEST_POSITION, "keyframe_odometry": FARTHEST_POSITION,
     "keyframe_covariances": _LARGEST, "keyframe_steps": _LARGEST, "keyframe_shares": _LARGEST,
-    "keyframe_travelled": _FARTHEST, "keyframe_depths": _FARTHEST, "place_points": _FARTHEST,
-    "place_descriptors": np.float16(65504), "loop_motions": _FARTHEST, "loop_covariances": _LARGEST,
+    "keyframe_travelled": FARTHEST_POSITION, "keyframe_depths": FARTHEST_POSITION, "place_points": FARTHEST_POSITION,
+    "place_descriptors": np.float16(65504), "loop_motions": FARTHEST_POSITION, "loop_covariances": _LARGEST,
 }  # fmt: skip
 
 
@@ -114,7 +114,7 @@ def _require_possible(arrays: Mapping[str, np.ndarray], source: str) -> None:
     landmarks, inliers = arrays["place_landmarks"], arrays["loop_inliers"]
     if (arrays["keyframe_features"] < 0).any() or (inliers < 0).any():
         raise SlamError(f"{source}: a keyframe or a loop has an impossible number")
-    if (landmarks < -1).any() or (landmarks > _MOST_ID).any():
+    if (landmarks < -1).any() or (landmarks > MOST_ID).any():
         raise SlamError(f"{source}: a keyframe has an impossible landmark")
     for name, limit in _LIMITS.items():
         if not (np.abs(arrays[name]) <= limit).all():
