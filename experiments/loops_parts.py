@@ -66,7 +66,7 @@ def bounded() -> str:
         online, final, slowest = [], [], []
         for lag in ("50", "none"):
             sequence = open_sequence(world)
-            config = SystemConfig.for_kind(sequence.kind, None, "smoother").with_settings([f"smoother.lag={lag}"])
+            config = SystemConfig.for_kind(sequence.kind, None, "smoother").with_settings([f"backend.lag={lag}"])
             system = StereoSlam(sequence.rig, None, "smoother", config=config)
             poses, times = [], []
             for k in range(len(sequence)):
