@@ -64,7 +64,7 @@ def bounded() -> str:
     rows = []
     for name, world in SHORT.items():
         online, final, slowest = [], [], []
-        for lag in ("50", "none"):
+        for lag in ("50", "null"):
             sequence = open_sequence(world)
             config = SystemConfig.for_kind(sequence.kind, None, "smoother").with_settings([f"backend.lag={lag}"])
             system = StereoSlam(sequence.rig, None, "smoother", config=config)
