@@ -6,7 +6,7 @@
 Features of streets along true roads (``kitti_paths`` of the data folder), or of the built-in town where there is no
 such folder. The system is told a focal length that is 0.5 % too long, so that the path drifts. Prints a Markdown table
 and draws the paths. A loop is false where its two frames are farther apart than it may see (``_FAR``), or its pose is
-wrong by more than a tenth of that.
+wrong by more than a tenth of that. Tables of `experiments.loops_parts` follow.
 """
 
 from __future__ import annotations
@@ -33,10 +33,13 @@ from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
 BACKENDS = ("ekf", "smoother")
+QUICK = ("map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off")  # settings of short runs
+ROW_TEXTS = 2
 HEADER = (
     "path", "back end", "frames", "keyframes", "loops", "false", "refused", "places found again [%]",
     "ATE without [m]", "online [m]", "final [m]", "error at the last loop [m]", "its 3σ [m]",
-    "NEES after it", "ms a keyframe, most", "memory [kB a frame]",
+    "NEES before loops", "NEES after the last", "longest frame with a loop [ms]",
+    "median frame [ms]", "memory [kB a frame]",
 )  # fmt: skip
 
 _FAR = 40.0  # from which a place can be seen again, at most [m]
@@ -53,7 +56,7 @@ class Drive:
         atlas: at the end.
         final: the path as estimated at the end.
         truth: in the axes of its first pose (F, 4, 4).
-        memory: bytes that each frame leaves, the results that are kept here included.
+        memory: bytes that each frame leaves in the system.
     """
 
     results: list[FrameResult] = field(default_factory=list)
@@ -73,25 +76,45 @@ class Drive:
         return np.array([inverse(r.T_map_odom) @ r.estimate.T_world_left for r in self.results])
 
 
-def drive(name: str, backend: str, settings: list[str]) -> Drive:
-    """Drive along a world's path, from its features."""
+def drive(name: str, backend: str, settings: list[str], images: bool = False, memory: bool = False) -> Drive:
+    """Drive along a world's path, from its features, or from images.
+
+    Args:
+        name: of the sequence.
+        backend: its name.
+        settings: as of the command.
+        images: take them; else the features that a world gives.
+        memory: measure it, which takes time.
+    """
     sequence = open_sequence(name)
-    config = SystemConfig.for_kind(sequence.kind, None, backend).with_settings(settings)
-    system = StereoSlam(sequence.rig, None, backend, config=config)
+    frontend = "surf" if images else None
+    config = SystemConfig.for_kind("driving", frontend, backend).with_settings(settings)
+    system = StereoSlam(sequence.rig, frontend, backend, config=config)
     out, count = Drive(), len(sequence)
-    tracemalloc.start()
+    frames = iter(sequence) if images else None
     begin = 0
+    if memory:
+        tracemalloc.start()
     for k in range(count):
-        result = system.process_features(sequence.observations(k))
-        out.results.append(_light(result))
-        if k == count // 10:
-            begin = tracemalloc.get_traced_memory()[0]
-    out.memory = (tracemalloc.get_traced_memory()[0] - begin) / max(count - count // 10, 1)
-    tracemalloc.stop()
+        one = system.process_features(sequence.observations(k)) if frames is None else system.process(next(frames))
+        out.results.append(_light(one))
+        if memory and k == count // 10:
+            begin = _kept()
+    if memory:
+        out.memory = (_kept() - begin) / max(count - count // 10, 1)
+        tracemalloc.stop()
     assert sequence.ground_truth is not None
     truth = sequence.ground_truth.poses[:count]
     out.atlas, out.final, out.truth = system.atlas, system.trajectory(), inverse(truth[0]) @ truth
     return out
+
+
+def _kept() -> int:
+    """Bytes that the package holds, without what worlds keep to make recordings of."""
+    root = str(Path(__file__).resolve().parents[1])
+    mine = [tracemalloc.Filter(True, f"{root}/{room}/*") for room in ("slam", "backends")]
+    snapshot = tracemalloc.take_snapshot().filter_traces([*mine, tracemalloc.Filter(False, f"{root}/slam/worlds/*")])
+    return sum(trace.size for trace in snapshot.traces)
 
 
 def _light(result: FrameResult) -> FrameResult:
@@ -136,23 +159,32 @@ def found_again(run: Drive) -> float:
     return 100.0 * sum(held) / whole if whole else float("nan")
 
 
+def nees(run: Drive, first: int, stop: int) -> float:
+    """Mean NEES of the online poses of some frames, from the start of the path; 6 is right."""
+    estimates = [r.estimate for r in run.results[first:stop]]
+    errors = [log(inverse(e.T_world_left) @ T) for e, T in zip(estimates, run.truth[first:stop])]
+    values = [x @ np.linalg.solve(e.covariance, x) for x, e in zip(errors, estimates)]
+    return float(np.mean(values)) if values else float("nan")
+
+
 def row(name: str, backend: str, run: Drive) -> list[str]:
     """One row of the table."""
     closed = [r.index for r in run.results if r.loop is not None]
     last = closed[-1] if closed else len(run.results) - 1
     e = run.results[last].estimate
     error = log(inverse(e.T_world_left) @ run.truth[last])
-    later = [r.estimate for r in run.results[last:]]
-    errors = [log(inverse(x.T_world_left) @ run.truth[last + i]) for i, x in enumerate(later)]
-    nees = np.mean([x @ np.linalg.solve(y.covariance, x) for x, y in zip(errors, later)])
+    first = closed[0] if closed else len(run.results)
     sigma = 3 * np.sqrt(np.trace(e.covariance[3:, 3:]))
     figures = [ate(run.odometry, run.truth), ate(run.online, run.truth), ate(run.final.poses, run.truth)]
-    slowest = max(r.milliseconds["atlas"] for r in run.results)
+    times = np.array([sum(r.milliseconds.values()) for r in run.results])
+    slowest = times[closed].max(initial=0.0) if closed else float("nan")
     s = run.atlas.summary()
     return [
         name, backend, str(len(run.results)), str(s["keyframes"]), str(s["closed"]), str(false_loops(run)),
         str(s["refused"]), f"{found_again(run):.0f}", *(f"{x:.2f}" for x in figures),
-        f"{np.linalg.norm(error[3:]):.2f}", f"{sigma:.2f}", f"{nees:.1f}", f"{slowest:.0f}", f"{run.memory / 1e3:.1f}",
+        f"{np.linalg.norm(error[3:]):.2f}", f"{sigma:.2f}", f"{nees(run, 1, first):.1f}",
+        f"{nees(run, last, len(run.results)):.1f}", f"{slowest:.0f}", f"{np.median(times):.0f}",
+        f"{run.memory / 1e3:.1f}" if run.memory else "–",
     ]  # fmt: skip
 
 
@@ -193,22 +225,35 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--paths", nargs="*", default=["06", "07"])
     parser.add_argument("--backend", nargs="*", default=list(BACKENDS))
+    parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
+    parser.add_argument("--only-paths", action="store_true")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--option", nargs="*", default=[])
     parser.add_argument("--out", type=Path, default=Path("results/loops"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    quick = ["map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off"] if given.quick else []
+    quick = list(QUICK) if given.quick else []
     runs = {
-        (name, backend): drive(sequence, backend, [*quick, *given.set])
+        (name, backend): drive(sequence, backend, [*quick, *given.set], memory=given.memory)
         for name, sequence in worlds(given).items()
         for backend in (given.backend[:1] if given.quick else given.backend)
     }
     rows = [row(name, backend, run) for (name, backend), run in runs.items()]
     print("Features of streets along true roads; the focal length that the system is told is 0.5 % too long.\n")
-    print(markdown(HEADER, rows, texts=2))
+    print(markdown(HEADER, rows, texts=ROW_TEXTS))
     write_json(given.out / "loops.json", HEADER, rows)
     draw(runs, given.out)
+    if given.only_paths:
+        return
+    from experiments import loops_parts as parts
+
+    print("\nTowns where half of the stretches of the streets look like another one, driven with `ekf`:\n")
+    print(parts.alike(1 if given.quick else 10))
+    if not given.quick:
+        print("\n`smoother`, bounded as by default, against the full one, on the same features:\n")
+        print(parts.bounded())
+    print("\nA path of laps, with loops back to the first one:\n")
+    print(parts.cost(500 if given.quick else 5000))
 
 
 if __name__ == "__main__":

@@ -311,6 +311,7 @@ class FrameResult:
             before the first loop.
         loop: index of the frame whose place this one shows again, where that closed a loop; −1 for a place of the map
             that the system was started with; None where no loop was closed.
+        refused_loop: the same of a frame whose place seemed to be this one, where the path contradicts that.
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of that place that came back into the map.
     """
@@ -335,6 +336,7 @@ class FrameResult:
     revision: Revision | None = None
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     loop: int | None = None
+    refused_loop: int | None = None
     keyframe: bool = False
     returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 

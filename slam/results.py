@@ -39,7 +39,7 @@ def frame_result(
         index=step.index,
         status=status,
         reason=reason,
-        estimate=atlas.estimate(step.estimate),
+        estimate=atlas.estimate(step.estimate, step.common),
         report=step.report,
         features=step.features,
         predicted=len(step.prediction.ids),
@@ -55,6 +55,7 @@ def frame_result(
         revision=revision,
         T_map_odom=atlas.T_map_odom,
         loop=atlas.closed_in(step.index),
+        refused_loop=atlas.refused_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=change.returned.ids,
     )

@@ -18,6 +18,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.keyframes import CommonError
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
@@ -141,7 +142,7 @@ class StereoSlam:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
             self.landmarks = known_map.rows
-            self.atlas = Atlas.of_earlier_run(known_map.keyframes)
+            self.atlas = Atlas.of_earlier_run(known_map.keyframes, known_map.keyframe_poses, known_map.loops)
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
     @overload
@@ -238,6 +239,7 @@ class StereoSlam:
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
             held = self.objects.suspects
+            held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
             asked, spared = self._localizer.informative(prediction, matches, self.backend.positions(matches.ids), dt)
@@ -252,12 +254,12 @@ class StereoSlam:
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
-            step = Step(index, features, prediction, matches, held, spared, report, state, estimate, labels)
+            step = Step(index, features, prediction, matches, held, held_rows, spared, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
-            step = replace(step, estimate=self._considered(estimate))
+            step = replace(step, estimate=self._considered(estimate), common=self._common_error())
             atlas, change = self._close_loops(step, change)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
@@ -318,7 +320,7 @@ class StereoSlam:
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
-        return self.atlas.estimate(self._considered(self.backend.estimate()))
+        return self.atlas.estimate(self._considered(self.backend.estimate()), self._common_error())
 
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.
@@ -335,8 +337,7 @@ class StereoSlam:
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             rows = self.landmarks.moved(self.atlas.T_map_odom)
-            keyframes = self.atlas.in_map_as_keyframes()
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, keyframes)
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, self.atlas)
 
     @property
     def warnings(self) -> list[str]:
@@ -358,6 +359,13 @@ class StereoSlam:
         if not self.calibration.config.enabled:
             return estimate
         return self._uncertainty.added_to(estimate, self.calibration.posterior.covariance)
+
+    def _common_error(self) -> CommonError:
+        """The part of the pose's error that it shares with those of other frames."""
+        if not self.calibration.config.enabled:
+            return CommonError()
+        covariance = self.calibration.posterior.covariance
+        return CommonError(*self._uncertainty.shared(covariance, self._accounted.parameters))
 
     def _revise(self) -> Revision | None:
         """Apply what has become known of the rig's error, also to what a back end was given before, if it can do that.

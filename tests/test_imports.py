@@ -70,7 +70,7 @@ def test_gtsam_and_numba_stay_in_their_place():
             place = file.relative_to(ROOT).as_posix()
             names = imported(file)
             if names & {"gtsam", "gtsam_unstable"}:
-                assert place.startswith(("backends/smoother", "backends/batch", "slam/mapping/atlas/pose_graph")), place
+                assert place.startswith(("backends/smoother", "backends/batch")), place
             if "numba" in names:
                 assert place == "slam/runtime/compilation.py", place
 

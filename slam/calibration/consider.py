@@ -141,12 +141,8 @@ class RigUncertainty:
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
-        n = self._columns
-        factor = np.zeros((n, n))
-        values, vectors = np.linalg.eigh(covariance)
-        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0))
-        factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
-        J = adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose @ factor
+        factor = self._factor(covariance)
+        J = self._by_left_camera() @ factor
         positions = estimate.covariances
         if len(estimate.ids) and len(self._landmarks.ids):
             rows = np.searchsorted(self._landmarks.ids, estimate.ids).clip(0, len(self._landmarks.ids) - 1)
@@ -155,6 +151,37 @@ class RigUncertainty:
             positions = positions.copy()
             positions[known] += L @ np.swapaxes(L, 1, 2)
         return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
+
+    def shared(self, covariance: Array, kept: Array) -> tuple[Array, Array]:
+        """What the errors of this pose and of those of other frames have in common, as two factors.
+
+        The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
+        ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is the last frame's.
+
+        Args:
+            covariance: of the parameters (n, n).
+            kept: the correction (n,) that the path was made with, after all changes told to `path_keeps`.
+
+        Returns:
+            J (6, n + 2), in the axes of the left camera, and S (n + 2, n + 2).
+        """
+        J, change = self._by_left_camera(), np.eye(self._columns)
+        J[:, -1] -= J[:, :-2] @ kept
+        change[:-2, -1] = kept
+        return J, change @ self._factor(covariance)
+
+    def _by_left_camera(self) -> Array:
+        """Derivative of the pose (6, n + 2) in the axes of the left camera."""
+        return adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose
+
+    def _factor(self, covariance: Array) -> Array:
+        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept."""
+        n = self._columns
+        factor = np.zeros((n, n))
+        values, vectors = np.linalg.eigh(covariance)
+        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0))
+        factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
+        return factor
 
     def _solve(self, R: Array, local: Array, landmarks: _Landmarks) -> None:
         """Sensitivity of the pose from landmarks at `local` (M, 3) [m] in the rectified left camera's coordinates."""

@@ -105,6 +105,7 @@ class Collector:
                 result.map_size,
                 dict(result.milliseconds),
                 result.located,
+                result.T_map_odom,
             )
         )
 
@@ -127,6 +128,7 @@ class Collector:
         final = final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0)
         metrics = {
             **_accuracy(tracked, final, self.sequence),
+            **_loop_figures(tracked, np.array([f.T_map_odom for f in frames])[rows], self.sequence, summary),
             **_consistency(tracked, honest, self.sequence, frames),
             **self._landmark_errors(final, ids, positions),
             **self._map_figures(),
@@ -202,6 +204,7 @@ class _Frame:
     map_size: int
     milliseconds: dict[str, float]
     located: bool
+    T_map_odom: Array
 
     @property
     def tracked(self) -> bool:
@@ -244,6 +247,18 @@ def _accuracy(online: Trajectory, final: Trajectory, sequence: Sequence) -> dict
     if pairs is not None:
         figures.update(_over_a_second(*pairs))
     return figures
+
+
+def _loop_figures(
+    online: Trajectory, T_map_odom: Array, sequence: Sequence, summary: Mapping[str, Any]
+) -> dict[str, float]:
+    """Loops closed and refused, and the error of the path as the back end has it, which knows of none."""
+    loops = summary.get("loops")
+    if not isinstance(loops, Mapping) or not loops["closed"] + loops["refused"]:
+        return {}
+    odometry = Trajectory(online.stamps, inverse(T_map_odom) @ online.poses)
+    error = evaluate(odometry, sequence).get("ATE RMSE [m]", np.nan)
+    return {"ate_without_loops_m": error, "loops_closed": loops["closed"], "loops_refused": loops["refused"]}
 
 
 def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:

@@ -54,6 +54,9 @@ COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
 METRICS = (
     Metric("ate_online_m", "ATE RMSE, online", "lower", True, "mm", 1e3),
     Metric("ate_final_m", "ATE RMSE, final", "lower", True, "mm", 1e3),
+    Metric("ate_without_loops_m", "ATE RMSE, online, loops left out", "lower", False, "mm", 1e3),
+    Metric("loops_closed", "loops closed"),
+    Metric("loops_refused", "loops refused"),
     Metric("rpe_1s_m", "RPE RMSE over 1 s", "lower", False, "mm", 1e3),
     Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg"),
     Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%"),

@@ -24,8 +24,9 @@ from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
-from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.atlas.saved import KEYFRAME_TYPES, from_arrays, to_arrays
+from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.keyframes import Keyframe, Loop
+from slam.mapping.atlas.saved import ATLAS_TYPES, from_arrays, to_arrays
 from slam.mapping.known_landmarks import require_known
 from slam.showing import count
 
@@ -71,7 +72,9 @@ class SavedMap:
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
-        keyframes: places that the camera has been to, with their poses in the map's world frame.
+        keyframes: places that the camera has been to, with their poses as a back end estimated them at the time.
+        keyframe_poses: their poses in the map's world frame (K, 4, 4); by default the same.
+        loops: between keyframes, that led from the ones to the others.
 
     Raises:
         SlamError: arrays that do not fit together, or landmarks that no back end would take.
@@ -90,6 +93,8 @@ class SavedMap:
     source: str = "the map"
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
     keyframes: tuple[Keyframe, ...] = ()
+    keyframe_poses: Array = field(default=None)  # type: ignore[arg-type]
+    loops: tuple[Loop, ...] = ()
 
     def __post_init__(self) -> None:
         if any(np.ndim(getattr(self, name)) == 0 for name in _TYPES if name != "seen_from"):
@@ -97,6 +102,9 @@ class SavedMap:
         n = len(self.ids)
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((n, 3), np.nan))
+        if self.keyframe_poses is None:
+            poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
+            object.__setattr__(self, "keyframe_poses", poses)
         for name, dtype in _TYPES.items():
             array = getattr(self, name)
             if array.dtype != dtype or array.ndim == 0 or len(array) != n:
@@ -127,7 +135,13 @@ class SavedMap:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"SavedMap({count(len(self), 'landmark')}, {self.dimensions}-D, {self.world_frame})"
+        return f"SavedMap({self.holds}, {self.dimensions}-D, {self.world_frame})"
+
+    @property
+    def holds(self) -> str:
+        """What is in it, for people."""
+        numbers = (len(self), "landmark"), (len(self.keyframes), "keyframe"), (len(self.loops), "loop")
+        return ", ".join(count(number, name) for number, name in numbers)
 
     @property
     def dimensions(self) -> int:
@@ -155,14 +169,15 @@ class SavedMap:
         frontend: str,
         world_frame: str,
         version: str,
-        keyframes: tuple[Keyframe, ...] = (),
+        atlas: Atlas,
     ) -> SavedMap:
-        """The map of a running system: its rows, its back end's estimate, what they belong to, and its keyframes."""
+        """The map of a running system: its rows, its back end's estimate, what they belong to, and its places."""
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
             landmarks.laplacian.astype(np.int8), landmarks.seen, landmarks.in_view, frontend, world_frame,
-            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from, keyframes=keyframes,
+            f"surf-stereo-slam {version}", seen_from=landmarks.seen_from,
+            keyframes=atlas.keyframes, keyframe_poses=atlas.poses_in_map(), loops=atlas.loops,
         )  # fmt: skip
 
     def require_fits(self, frontend: str, dimensions: int | None = None) -> None:
@@ -206,9 +221,12 @@ def load_map(path: str | Path) -> SavedMap:
 
 def encode(saved: SavedMap) -> bytes:
     """The bytes of a file; the same for the same map."""
-    header = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
+    texts = {"world_frame": saved.world_frame, "frontend": saved.frontend, "written_by": saved.written_by}
+    header = {**texts, "holds": saved.holds}
     members = {"header.json": json.dumps(header, indent=2, sort_keys=True, ensure_ascii=False).encode() + b"\n"}
-    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(saved.keyframes)
+    arrays = {name: getattr(saved, name) for name in _TYPES} | to_arrays(
+        saved.keyframes, saved.keyframe_poses, saved.loops
+    )
     for name, values in arrays.items():
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(values), (1, 0), allow_pickle=False)
@@ -235,10 +253,10 @@ def decode(data: bytes, source: str) -> SavedMap:
     return SavedMap(**_members(body, source, version != "2"), source=source)
 
 
-def _members(body: bytes, source: str, with_keyframes: bool) -> dict[str, Any]:
+def _members(body: bytes, source: str, with_places: bool) -> dict[str, Any]:
     """The attributes of `SavedMap` in an archive."""
     members = unpack(body, source)
-    kinds = _TYPES | (KEYFRAME_TYPES if with_keyframes else {})
+    kinds = _TYPES | (ATLAS_TYPES if with_places else {})
     missing = {"header.json", *(f"{name}.npy" for name in kinds)} - set(members)
     if missing:
         raise SlamError(f"{source}: the map lacks {min(missing)}")
@@ -251,7 +269,8 @@ def _members(body: bytes, source: str, with_keyframes: bool) -> dict[str, Any]:
         content[name] = found = array(members[f"{name}.npy"], name, source)
         if found.dtype != kind:  # of the other byte order, or of another kind
             raise SlamError(f"{source}: {name} must be of {np.dtype(kind)}")
-    if with_keyframes:
-        arrays = {name: content.pop(name) for name in KEYFRAME_TYPES}
-        content["keyframes"] = from_arrays(arrays, content["descriptors"].shape[1:], source)
+    if with_places:
+        arrays = {name: content.pop(name) for name in ATLAS_TYPES}
+        names = ("keyframes", "keyframe_poses", "loops")
+        content |= dict(zip(names, from_arrays(arrays, content["descriptors"].shape[1:], source)))
     return content

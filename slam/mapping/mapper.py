@@ -14,6 +14,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
+from slam.mapping.atlas.keyframes import CommonError
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -35,11 +36,13 @@ class Step:
         prediction: of the back end.
         matches: landmarks that were recognised.
         held: ids of landmarks that were not given to the back end's update, because they may move.
-        spared: ids of those of the matches that were not, because others tell more.
+        held_rows: features that were matched with some of these.
+        spared: ids of those of the matches that were not given to the update, because others tell more.
         report: of the update.
         state: whether the pose is known.
         estimate: the camera's pose after the update.
         labels: which features move.
+        common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
     """
 
     index: int
@@ -47,11 +50,13 @@ class Step:
     prediction: Prediction
     matches: LandmarkMatches
     held: IdArray
+    held_rows: NDArray[np.intp]
     spared: IdArray
     report: UpdateReport
     state: TrackingState
     estimate: Estimate
     labels: MotionLabels
+    common: CommonError = field(default_factory=CommonError)
 
 
 @dataclass(frozen=True)
@@ -153,11 +158,11 @@ class Mapper:
         """Let landmarks of a place seen again rejoin the map, where the back end can place them.
 
         Under their old ids, where they had one. What the back end still had of them, where it had last left them, is
-        erased first. Features that are landmarks of the map already are left alone.
+        erased first. Features that are landmarks of the map already, or that move, are left alone.
         """
         if not isinstance(backend, MapBackend):
             return change
-        taken = np.concatenate([step.matches.rows, change.added.rows])
+        taken = np.concatenate([step.matches.rows, change.added.rows, step.held_rows, step.labels.moving])
         free = np.flatnonzero(~np.isin(returned.rows, taken))
         if not len(free):
             return change

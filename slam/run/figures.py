@@ -44,6 +44,8 @@ class RunData:
         folder: where it was read from.
         truth_is_exact: whether the truth has no errors of its own: that of a world.
         loops: rows of `final` whose places are the same (L, 2), the later one first.
+        refused: rows of `final` whose places only looked alike (L, 2), the later one first.
+        keyframes: rows of `final` that are keyframes (K,).
     """
 
     name: str
@@ -61,6 +63,8 @@ class RunData:
     folder: Path = Path()
     truth_is_exact: bool = True
     loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    keyframes: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @classmethod
     def read(cls, folder: Path, name: str) -> RunData:
@@ -98,15 +102,27 @@ class RunData:
             str(config["backend"]),
             folder,
             config["format"] == "synthetic",
-            _loops(frames, final),
+            _pairs(frames, final, "loop"),
+            _pairs(frames, final, "refused"),
+            _keyframes(frames, final),
         )
 
 
-def _loops(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
-    """Rows of the final path (L, 2) whose places are the same."""
+def _pairs(frames: list[dict[str, str]], final: Trajectory, column: str) -> np.ndarray:
+    """Rows of the final path (L, 2) of the frames that a column names a place for, and of that place."""
     stamps = {row["frame"]: float(row["stamp"]) for row in frames}
-    pairs = [(stamps[row["frame"]], stamps[row["loop"]]) for row in frames if (row.get("loop") or "").isdigit()]
-    return np.searchsorted(final.stamps, np.array(pairs).reshape(-1, 2) - 1e-9).clip(0, max(len(final) - 1, 0))
+    pairs = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row.get(column) or "").isdigit()]
+    return _rows_at(final, np.array(pairs).reshape(-1, 2))
+
+
+def _keyframes(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
+    """Rows of the final path (K,) that are keyframes."""
+    return _rows_at(final, np.array([float(row["stamp"]) for row in frames if row.get("keyframe") == "1"]))
+
+
+def _rows_at(final: Trajectory, stamps: Array) -> np.ndarray:
+    """Rows of the final path at stamps."""
+    return np.searchsorted(final.stamps, stamps - 1e-9).clip(0, max(len(final) - 1, 0))
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -165,12 +181,14 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
 
 
 def draw_loops(axis: Axes, run: RunData) -> None:
-    """The path that loops have corrected, from above, and the places where they were closed."""
-    if not len(run.loops):
-        return
+    """The path that loops have corrected, from above, its keyframes, and the places where loops were found."""
     final = run.final.positions[:, [0, 2]]
-    axis.plot(*final.T, color=_COLOURS[2], lw=1.5, label="path, corrected by loops")
-    axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_COLOURS[1], label="loops closed")
+    if len(run.loops):
+        axis.plot(*final.T, color=_COLOURS[2], lw=1.5, label="path, corrected by loops")
+        axis.plot(*final[run.keyframes].T, ".", ms=3, color=_COLOURS[2], label="keyframes")
+        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_COLOURS[1], label="loops closed")
+    if len(run.refused):
+        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=_COLOURS[3], label="loops refused")
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:

@@ -64,13 +64,14 @@ class RunFiles:
     ) -> None:
         self._stack.close()
 
-    def write_frame(self, number: int, result: FrameResult, loop: int | str = "") -> None:
+    def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
         """Append one frame to trajectory.txt, frames.csv and objects.csv.
 
         Args:
             number: of the frame in its sequence.
             result: of its step.
             loop: number of the frame whose place it shows again, where it closed a loop, or ``map``.
+            refused: the same of a place that it only seemed to show again.
 
         Raises:
             SlamError: a row cannot be written whole; those before stay.
@@ -82,7 +83,7 @@ class RunFiles:
         row += [len(result.matched), len(r.used), len(r.rejected)]
         row += [len(result.added), len(result.erased), result.map_size]
         deviations = _deviations(e) if result.located else [float("nan")] * 4
-        row += [int(result.keyframe), loop]
+        row += [int(result.keyframe), loop, refused]
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         line = tum_line(e.stamp, e.T_world_left) if result.located else ""

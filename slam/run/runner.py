@@ -174,7 +174,7 @@ def _drive(
         try:
             for number, result in results:
                 record.add(number, result)
-                files.write_frame(number, result, _loop(result, record))
+                files.write_frame(number, result, _place(result.loop, record), _place(result.refused_loop, record))
                 if score is not None:
                     score.add(number, result, labels_in_images(sequence, number, result.features))
                 if options.record is not None:
@@ -197,11 +197,11 @@ def _drive(
     return summary
 
 
-def _loop(result: FrameResult, record: RunRecord) -> int | str:
+def _place(step: int | None, record: RunRecord) -> int | str:
     """The frame whose place was seen again, ``map`` for one of the map that the run started in; empty for none."""
-    if result.loop is None:
+    if step is None:
         return ""
-    return record.numbers[result.loop] if result.loop >= 0 else "map"
+    return record.numbers[step] if step >= 0 else "map"
 
 
 def _write_copies(

@@ -58,9 +58,10 @@ FRAME_TABLE = (
     Columns(("used", "rejected"), "", "number of matches that the back end used; that it rejected"),
     Columns(("added", "erased", "map_size"), "", "number of landmarks added; erased; in the map after the frame"),
     Columns(
-        ("keyframe", "loop"),
+        ("keyframe", "loop", "refused"),
         "",
-        "1 for a keyframe, else 0; the frame whose place was seen again, closing a loop (`map`: of the known map)",
+        "1 for a keyframe, else 0; the frame whose place was seen again, closing a loop (`map`: of the known map); "
+        "the same where that contradicts the path",
     ),
     Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
     Columns(

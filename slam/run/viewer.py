@@ -25,6 +25,7 @@ LIVE = "live"
 
 _SIGMAS = 2.0
 _SEEN, _UNSEEN, _NEW, _PATH, _TRUTH = (229, 57, 53), (124, 179, 66), (255, 235, 59), (21, 101, 192), (120, 120, 120)
+_PLACE, _CLOSED, _REFUSED = (0, 137, 123), (142, 36, 170), (240, 98, 146)
 _MOVING = (255, 145, 0)
 _MAP_EVERY = 10  # frames between two pictures of the whole map, whose covariances take their time
 
@@ -84,6 +85,8 @@ class Viewer:
             self._log(f"world/objects/{moving.id}", _transform(rr, T))
             boxes = rr.Boxes3D(centers=[box.mean(axis=0)], half_sizes=[np.ptp(box, axis=0) / 2], colors=_MOVING)
             self._log(f"world/objects/{moving.id}/box", boxes)
+        if result.keyframe:
+            self._draw_places(system)
         if result.index % _MAP_EVERY == 0:
             whole = system.estimate()
             self.show_map(whole.positions, whole.covariances, np.isin(whole.ids, result.matched))
@@ -118,6 +121,19 @@ class Viewer:
             pinhole = rr.Pinhole(image_from_camera=K, resolution=[left.width, left.height], image_plane_distance=0.2)
             self._log("world/camera/image", pinhole)
         self._log("world/path", rr.LineStrips3D([np.array(self._path)], colors=_PATH))
+
+    def _draw_places(self, system: StereoSlam) -> None:
+        """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
+        rr, atlas = self._rr, system.atlas
+        at = atlas.positions()
+        self._log("world/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
+        self._log("world/places/path", rr.LineStrips3D([at[atlas.known :]], colors=_PLACE))
+        for name, pairs, colour in (
+            ("closed", [(loop.first, loop.second) for loop in atlas.loops], _CLOSED),
+            ("refused", atlas.refused, _REFUSED),
+        ):
+            strips = at[np.array(pairs, int).reshape(-1, 2)]
+            self._log(f"world/places/loops_{name}", rr.LineStrips3D(strips, colors=colour))
 
     def _draw_truth(self, first: Estimate) -> None:
         """The true path, placed by the first pose."""

@@ -15,10 +15,37 @@ import numpy as np
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.chain import Chain, shared_out
-from slam.mapping.atlas.keyframes import Keyframe, what_was_added
-from slam.mapping.atlas.loops import Loop
+from slam.mapping.atlas.chain import Chain, adjoints, shared_out
+from slam.mapping.atlas.keyframes import CommonError, Keyframe, Loop, what_was_added
 from slam.mapping.atlas.places import PlaceIndex
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What the pose graph said of the last keyframe when a loop was closed last.
+
+    Attributes:
+        covariance: of its pose, perturbing on the right, and of the common errors (6 + m, 6 + m).
+        common: the common errors (m,), where their variance was one.
+        scale: what they stand for (m, m), see `slam.mapping.atlas.keyframes.CommonError`.
+    """
+
+    covariance: Array
+    common: Array
+    scale: Array
+
+    def later(self, back: Array, shares: Array) -> Array:
+        """Covariance (6, 6) of a later pose, without the noise since.
+
+        Its path goes on with the common errors uncorrected: what they were found to be counts as an error too.
+
+        Args:
+            back: adjoint (6, 6) of the keyframe's pose seen from the later one.
+            shares: derivative (6, m) of the motion since by the common errors.
+        """
+        J = np.concatenate([back, shares @ self.scale], axis=1)
+        found = shares @ self.scale @ self.common
+        return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
 
 
 @dataclass(frozen=True)
@@ -29,9 +56,9 @@ class Atlas:
         keyframes: in order of time.
         index: which of them look alike.
         loops: those that the pose graph holds.
-        refused: number of sightings that contradicted the path.
+        refused: sightings that contradicted the path, as the numbers of both keyframes.
         corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
-        anchor: covariance (6, 6) of the last of these; None without a loop.
+        anchor: how well the last of these is known; None without a loop.
         T_map_odom: pose (4, 4) of the back end's frame in the map.
         pending: the last loop that was seen, whether the pose graph holds it or not.
         confirmed: whether a keyframe just before it had seen the same return.
@@ -42,9 +69,9 @@ class Atlas:
     keyframes: tuple[Keyframe, ...] = ()
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
-    refused: int = 0
+    refused: tuple[tuple[int, int], ...] = ()
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    anchor: Array | None = None
+    anchor: Anchor | None = None
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     pending: Loop | None = None
     confirmed: bool = False
@@ -55,21 +82,32 @@ class Atlas:
         return len(self.keyframes)
 
     @classmethod
-    def of_earlier_run(cls, keyframes: Sequence[Keyframe]) -> Atlas:
-        """The places of a saved map; poses of its keyframes are in the map."""
+    def of_earlier_run(cls, keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop] = ()) -> Atlas:
+        """The places of a saved map.
+
+        Args:
+            keyframes: their poses are in the frame of the back end that saw them.
+            poses: theirs in the map (K, 4, 4).
+            loops: that led to these.
+        """
         index = PlaceIndex()
         for keyframe in keyframes:
             index = index.with_new(keyframe.descriptors.astype(np.float32))
-        poses = np.array([k.T_odom_left for k in keyframes]).reshape(-1, 4, 4)
-        return cls(tuple(replace(k, frame=-1) for k in keyframes), index, corrected=poses, known=len(keyframes))
+        known = tuple(replace(k, frame=-1) for k in keyframes)
+        return cls(known, index, loops=tuple(loops), corrected=poses, known=len(known))
 
-    def in_map_as_keyframes(self) -> tuple[Keyframe, ...]:
-        """The keyframes for a saved map, their poses in the map."""
-        return tuple(replace(k, T_odom_left=self.pose_in_map(i)) for i, k in enumerate(self.keyframes))
+    def poses_in_map(self) -> Array:
+        """Poses T_map_left (K, 4, 4) of all keyframes."""
+        return np.array([self.pose_in_map(k) for k in range(len(self))]).reshape(-1, 4, 4)
 
     def summary(self) -> dict[str, int]:
-        """Numbers of keyframes, of loops in the pose graph, and of sightings that contradicted the path."""
-        return {"keyframes": len(self), "closed": len(self.loops), "refused": self.refused}
+        """Numbers of keyframes, of loops closed in this run, and of sightings that contradicted the path.
+
+        In a known map, its keyframes are counted too, and apart as ``known``.
+        """
+        closed = sum(loop.second >= self.known for loop in self.loops)
+        known = {"known": self.known} if self.known else {}
+        return {"keyframes": len(self), **known, "closed": closed, "refused": len(self.refused)}
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""
@@ -77,13 +115,28 @@ class Atlas:
             return None
         return self.keyframes[self.loops[-1].first].frame
 
-    def chain(self, path: Trajectory | None = None) -> Chain:
-        """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now."""
+    def refused_in(self, frame: int) -> int | None:
+        """Index of the frame whose place `frame` seemed to show again, where that was refused."""
+        if not self.refused or self.keyframes[self.refused[-1][1]].frame != frame:
+            return None
+        return self.keyframes[self.refused[-1][0]].frame
+
+    def chain(self, scale: Array, path: Trajectory | None = None) -> Chain:
+        """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now.
+
+        Args:
+            scale: what common errors of unit variance stand for (m, m).
+            path: the path so far.
+        """
         poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
         if path is not None:
             rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
             poses[self.known :] = path.poses[rows]
-        return Chain(poses, np.array([k.step_covariance for k in self.keyframes]))
+        fits = [k.shares.shape[1] == len(scale) for k in self.keyframes]  # not where a known map was made without them
+        none = np.zeros((6, len(scale)))
+        common = np.array([k.shares if fit else none for k, fit in zip(self.keyframes, fits)]) @ scale
+        common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
+        return Chain(poses, np.array([k.step_covariance for k in self.keyframes]), common)
 
     def in_map(self, chain: Chain) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
@@ -101,29 +154,34 @@ class Atlas:
         T = self.T_map_odom
         return np.concatenate([self.corrected[:, :3, 3], since @ T[:3, :3].T + T[:3, 3]])
 
-    def estimate(self, estimate: Estimate) -> Estimate:
-        """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says."""
+    def estimate(self, estimate: Estimate, common: CommonError) -> Estimate:
+        """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says.
+
+        Args:
+            estimate: with covariances by noise and by the common error.
+            common: what the pose's error has in common with those of other frames.
+        """
         if self.anchor is None:
             return estimate
         T, R = self.T_map_odom, self.T_map_odom[:3, :3]
         before = self.keyframes[len(self.corrected) - 1]
         back = adjoint(inverse(estimate.T_world_left) @ before.T_odom_left)
-        since = what_was_added(estimate.covariance, back @ before.covariance @ back.T)
+        noise = what_was_added(estimate.covariance - common.covariance, back @ before.covariance @ back.T)
         return replace(
             estimate,
             T_world_left=T @ estimate.T_world_left,
-            covariance=back @ self.anchor @ back.T + since,
+            covariance=self.anchor.later(back, common.shares - back @ before.shares) + noise,
             positions=estimate.positions @ R.T + T[:3, 3],
             covariances=R @ estimate.covariances @ R.T,
         )
 
     def path(self, path: Trajectory) -> Trajectory:
         """A path in odom, taken to the map; what loops move two keyframes by is shared out evenly in time between."""
-        if not self.loops or not len(path):
+        if self.anchor is None or not len(path):
             return path
         from slam.mapping.atlas.pose_graph import solve
 
-        chain = self.chain(path)
+        chain = self.chain(self.anchor.scale, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))

@@ -1,8 +1,16 @@
-"""The path of the keyframes, step by step with covariances, and how a change of its ends moves what lies between."""
+"""The path of the keyframes, step by step with covariances, and how a change of its ends moves what lies between.
+
+A step is uncertain in two ways: by noise of its own, and by what all steps share, the rig's error. The latter adds up
+along the path, where noise averages out, so the two are kept apart: with T the estimated motion,
+
+    T_true = T exp(noise + C c),
+
+where c are common errors of unit variance, the same for all steps (a consider state: Schmidt, 1966).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,33 +24,45 @@ class Chain:
 
     Attributes:
         poses: T_odom_left (K, 4, 4).
-        steps: covariance (K, 6, 6) of the motion from the keyframe before, perturbing on the right; the first has no
-            meaning.
+        steps: covariance (K, 6, 6) of the motion from the keyframe before by noise, perturbing on the right; the first
+            has no meaning.
+        common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; none by default.
     """
 
     poses: Array
     steps: Array
+    common: Array = field(default=None)  # type: ignore[arg-type]
 
-    def carried(self, ends: NDArray[np.intp]) -> Array:
-        """Covariance (K, 6, 6) of each keyframe within its stretch, seen from where the stretch ends.
+    def __post_init__(self) -> None:
+        if self.common is None:
+            object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
+
+    def carried(self, ends: NDArray[np.intp]) -> tuple[Array, Array]:
+        """How far each keyframe is off by what its stretch has carried to it: noise, and the common errors' part.
+
+        Covariance (K, 6, 6) and derivative (K, 6, m), perturbing the pose at which the stretch ends.
 
         Args:
             ends: the keyframes that bound stretches, ascending, the first and the last one among them.
         """
         number = np.arange(len(self.poses))
         end = ends[np.searchsorted(ends, number)]
-        A = adjoints(inverse(self.poses[end]) @ self.poses)
-        Q = A @ self.steps @ np.swapaxes(A, 1, 2)
-        Q[ends[0]] = 0
-        total = np.cumsum(Q, axis=0)
         begin = ends[np.maximum(np.searchsorted(ends, number) - 1, 0)]
-        return np.asarray(total - total[begin])
+        A = adjoints(inverse(self.poses[end]) @ self.poses)
+        parts = []
+        for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common):
+            step[ends[0]] = 0
+            total = np.cumsum(step, axis=0)
+            parts.append(np.asarray(total - total[begin]))
+        return parts[0], parts[1]
 
     def motion(self, first: int, second: int) -> tuple[Array, Array]:
         """Motion (4, 4) from one keyframe to another, and its covariance (6, 6), perturbing on the right."""
         a, b = sorted((first, second))
-        part = Chain(self.poses[a : b + 1], self.steps[a : b + 1])
-        P = part.carried(np.unique([0, b - a]))[-1]
+        rows = slice(a, b + 1)
+        part = Chain(self.poses[rows], self.steps[rows], self.common[rows])
+        noise, common = (each[-1] for each in part.carried(np.unique([0, b - a])))
+        P = noise + common @ common.T
         T = inverse(self.poses[first]) @ self.poses[second]
         if first > second:
             A = adjoint(inverse(T))
@@ -50,17 +70,28 @@ class Chain:
         return T, P
 
 
-def spread(chain: Chain, ends: NDArray[np.intp], moved: Array) -> Array:
-    """Poses (K, 4, 4) of all keyframes, from those of some (M, 4, 4): each stretch's change is shared out."""
+def spread(chain: Chain, ends: NDArray[np.intp], carried: tuple[Array, Array], moved: Array, common: Array) -> Array:
+    """Poses (K, 4, 4) of all keyframes, from those of some: each stretch's change is shared out.
+
+    What the common errors say of each step goes to that step, the rest in proportion to the noise.
+
+    Args:
+        chain: the path.
+        ends: the keyframes (M,) that bound stretches.
+        carried: see `Chain.carried`.
+        moved: their new poses (M, 4, 4).
+        common: the common errors (m,).
+    """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1)
     begin, end = ends[at - 1], ends[at]
-    carried = chain.carried(ends)
+    noise, by_common = carried
+    known = by_common @ common
     a = inverse(chain.poses[begin])
     step = a @ chain.poses[end]
     change = log(inverse(step) @ inverse(moved[at - 1]) @ moved[at])
-    whole = carried[end] + LEAST_VARIANCE * np.eye(6)
-    part = (carried @ np.linalg.solve(whole, change[:, :, None]))[:, :, 0]
+    whole = noise[end] + LEAST_VARIANCE * np.eye(6)
+    part = known + (noise @ np.linalg.solve(whole, (change - known[end])[:, :, None]))[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change[ends[1:]]
     out = shared_out(moved[at - 1], a @ chain.poses, inverse(chain.poses) @ chain.poses[end], part)

@@ -30,6 +30,7 @@ class AtlasConfig:
         agreeing: keyframes that must see the same return, at once or within three, before it is believed: 1 or 2.
         gate_sigmas: a return is refused where it contradicts the path by more than this many standard deviations.
         give_back: landmarks of a place seen again return to the back end, where it can place landmarks.
+        on_disk: features of keyframes are kept in a temporary file; some 6 kB of a keyframe stay in memory.
     """
 
     enabled: bool = True
@@ -45,6 +46,7 @@ class AtlasConfig:
     agreeing: int = 2
     gate_sigmas: float = 5.0
     give_back: bool = True
+    on_disk: bool = False
 
     __pydantic_config__ = FORBID_UNKNOWN
 

@@ -1,8 +1,8 @@
-"""Keyframes: what the camera saw, in its own coordinates, and how it got there from the keyframe before."""
+"""Keyframes: what the camera saw, in its own coordinates, how it got there from the one before; loops between them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,25 @@ from slam.mapping.atlas.config import AtlasConfig
 
 
 @dataclass(frozen=True)
+class CommonError:
+    """The part of a pose's error that all poses of a run share, as the rig's error makes it: ``shares @ scale @ c``.
+
+    Attributes:
+        shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
+        scale: these errors by ones of unit variance, c, as they are known now (m, m).
+    """
+
+    shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def covariance(self) -> Array:
+        """What it adds to the pose's covariance (6, 6)."""
+        root = self.shares @ self.scale
+        return np.asarray(root @ root.T)
+
+
+@dataclass(frozen=True)
 class Keyframe:
     """One frame that is kept.
 
@@ -21,8 +40,10 @@ class Keyframe:
         frame: index of the step.
         stamp: [s].
         T_odom_left: pose (4, 4) that the back end estimated then.
-        covariance: its covariance (6, 6) then.
-        step_covariance: covariance (6, 6) of the motion since the keyframe before, perturbing this pose on the right.
+        covariance: its covariance (6, 6) then, by noise alone.
+        step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
+            right.
+        shares: derivative (6, m) of the pose by the errors that all poses share, see `CommonError`.
         travelled: length of the path up to here [m].
         depth: median depth of the features [m].
         points: features in coordinates of the rectified left camera (F, 3) [m].
@@ -36,6 +57,7 @@ class Keyframe:
     T_odom_left: Array
     covariance: Array
     step_covariance: Array
+    shares: Array
     travelled: float
     depth: float
     points: NDArray[np.float32]
@@ -45,6 +67,24 @@ class Keyframe:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Two keyframes that show the same place.
+
+    Attributes:
+        first, second: their numbers, the older one first.
+        T_first_second: the second one's pose in the first one's coordinates (4, 4).
+        covariance: its covariance (6, 6), perturbing on the right.
+        inliers: number of features that agree.
+    """
+
+    first: int
+    second: int
+    T_first_second: Array
+    covariance: Array
+    inliers: int
 
 
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
@@ -94,21 +134,23 @@ def kept_features(
     return np.sort(rows[order])
 
 
-def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array, floor: Array) -> Array:
-    """Covariance (6, 6) of the motion since a keyframe, from the covariances of both poses.
+def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) by noise of the motion since a keyframe, from the covariances of both poses.
 
     The motion's error is taken to be independent of the first pose's: then ``P = Ad P₀ Adᵀ + Q`` with the adjoint of
     the motion's inverse, and Q is what has been added. Where a back end becomes surer meanwhile, as it sees landmarks
-    of before again, Q has no positive part; it is never less than `floor`.
+    of before again, Q has no positive part.
+
+    A pose is off by what the path has drifted, and by what its own frame adds, which is forgotten in the next one. Q
+    holds the drift alone, so that steps can be added; what frames add belongs to the loops that end at them.
 
     Args:
         before: the earlier keyframe.
         T_odom_left: the later pose (4, 4).
-        covariance: of the later pose (6, 6).
-        floor: covariance (6, 6) of a pose that one frame's measurements give.
+        covariance: of the later pose (6, 6), by noise.
     """
     back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
-    return what_was_added(covariance, back @ before.covariance @ back.T) + floor
+    return what_was_added(covariance, back @ before.covariance @ back.T)
 
 
 def what_was_added(after: Array, before: Array) -> Array:

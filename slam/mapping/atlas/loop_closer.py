@@ -12,12 +12,20 @@ from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.atlas import Anchor, Atlas
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.config import AtlasConfig
-from slam.mapping.atlas.keyframes import Keyframe, features_with_depth, kept_features, step_covariance, view_has_changed
-from slam.mapping.atlas.loops import Loop, Sighting, alike, refined_pose, sighting
+from slam.mapping.atlas.keyframes import (
+    Keyframe,
+    Loop,
+    features_with_depth,
+    kept_features,
+    step_covariance,
+    view_has_changed,
+)
+from slam.mapping.atlas.loops import Sighting, alike, sighting
 from slam.mapping.atlas.places import Vectors
+from slam.mapping.atlas.shelf import Shelf
 from slam.mapping.mapper import KnownPlace, Returned, Step
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
@@ -71,6 +79,7 @@ class LoopCloser:
         self._rig = rig.rectified.rig
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
+        self._shelf = Shelf() if config.on_disk else None
         self._localizer = Localizer(self._rig, replace(association, wide_hypotheses=_HYPOTHESES), models)
 
     @one_blas_thread
@@ -94,12 +103,13 @@ class LoopCloser:
         new = self._keyframe(atlas, step, landmark_of, restarts > atlas.restarts)
         if new is None:
             return atlas, None
-        candidates = self._candidates(atlas, new, step.features, landmark_of)
+        candidates = self._candidates(atlas, new, step, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
         index = atlas.index.with_new(descriptors)
-        atlas = replace(atlas, keyframes=(*atlas.keyframes, new), index=index, restarts=restarts)
+        kept = new if self._shelf is None else self._shelf.put(new)
+        atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
         best = self._best_sighting(atlas, candidates, step.features, step.index)
-        return (atlas, None) if best is None else self._close(atlas, *best, path)
+        return (atlas, None) if best is None else self._close(atlas, *best, step.common.scale, path)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, seed: int) -> Found | None:
@@ -146,7 +156,7 @@ class LoopCloser:
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the camera sees other things, or from elsewhere, than in the last keyframe."""
-        if not len(atlas) or self._in_doubt(atlas):
+        if len(atlas) == atlas.known or self._in_doubt(atlas):
             return True
         last = atlas.keyframes[-1]
         X = self._rectified.T_left_rectified
@@ -166,7 +176,7 @@ class LoopCloser:
         points = self._rig.triangulate(features.uv_left[rows], features.uv_right[rows])
         if len(rows) < _MINIMAL:
             return None
-        T, P = step.estimate.T_world_left, step.estimate.covariance
+        T, P = step.estimate.T_world_left, step.estimate.covariance - step.common.covariance
         travelled = 0.0
         added: Array = np.diag(np.repeat(_UNKNOWN_MOTION, 3) ** 2)
         if len(atlas):
@@ -175,16 +185,14 @@ class LoopCloser:
         if len(atlas) > atlas.known and not moved_blindly:
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
-            z, _ = self._rig.project_stereo(points, jacobian=False)
-            _, single = refined_pose(self._rig, points, z, np.eye(4), self._sigma)
-            A = adjoint(self._rectified.T_left_rectified)
-            added = step_covariance(last, T, P, A @ single @ A.T)
+            added = step_covariance(last, T, P)
         return Keyframe(
             step.index,
             features.stamp,
             T,
             P,
             added,
+            step.common.shares,
             travelled,
             float(np.median(points[:, 2])),
             points.astype(np.float32),
@@ -193,21 +201,19 @@ class LoopCloser:
             landmark_of[rows],
         )
 
-    def _candidates(
-        self, atlas: Atlas, new: Keyframe, features: StereoFeatures, landmark_of: IdArray
-    ) -> NDArray[np.intp]:
+    def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray) -> NDArray[np.intp]:
         """Numbers of keyframes that may show this place again, the likeliest first.
 
         Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
         it knows by itself.
         """
-        possible = self._within_reach(atlas, new)
+        possible = self._within_reach(atlas, new, step.estimate.covariance)
         if not possible.any():
             return np.zeros(0, np.intp)
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
         known = landmark_of[landmark_of >= 0]
         rows = [k for k in likely.tolist() if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
-        return self._ranked(atlas, np.array(rows, np.intp), features)
+        return self._ranked(atlas, np.array(rows, np.intp), step.features)
 
     def _most_alike(self, atlas: Atlas, descriptors: Vectors, possible: BoolArray) -> NDArray[np.intp]:
         """Numbers of the possible keyframes (K,) whose descriptors as a whole are most similar."""
@@ -222,7 +228,7 @@ class LoopCloser:
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
         return likely[order[number[order] >= self._config.inliers]]
 
-    def _within_reach(self, atlas: Atlas, new: Keyframe) -> BoolArray:
+    def _within_reach(self, atlas: Atlas, new: Keyframe, covariance: Array) -> BoolArray:
         """Which keyframes (K,) the camera has left, but may be back at, as far as its path is known."""
         if not len(atlas):
             return np.zeros(0, bool)
@@ -230,7 +236,7 @@ class LoopCloser:
         positions = atlas.positions()
         here = atlas.T_map_odom[:3, :3] @ new.T_odom_left[:3, 3] + atlas.T_map_odom[:3, 3]
         far = np.linalg.norm(positions - here, axis=1)
-        sigma = np.sqrt(np.trace(new.covariance[3:, 3:]))
+        sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
 
@@ -253,7 +259,8 @@ class LoopCloser:
         for k in candidates.tolist():
             seen = sighting(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
-                T, P = X @ seen.T_keyframe_left @ inverse(X), A @ seen.covariance @ A.T
+                # Both poses have what their frames add, which is no more than what such measurements are off by.
+                T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
                 found.append((Loop(k, len(atlas) - 1, T, P, len(seen.matches)), seen))
         return found
 
@@ -263,17 +270,17 @@ class LoopCloser:
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
-        self, atlas: Atlas, loop: Loop, seen: Sighting, path: Callable[[], Trajectory]
+        self, atlas: Atlas, loop: Loop, seen: Sighting, scale: Array, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
         from slam.mapping.atlas.pose_graph import relative_pose, solve
 
-        chain = atlas.chain(path())
+        chain = atlas.chain(scale, path())
         start = atlas.in_map(chain)
         T, P = relative_pose(chain, atlas.loops, start, loop.first, loop.second)
         limit = self._config.gate_sigmas**2
         if _distance(T, loop.T_first_second, P + loop.covariance) > limit:
-            return replace(atlas, refused=atlas.refused + 1), None
+            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second))), None
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas, None
@@ -283,12 +290,12 @@ class LoopCloser:
         loops = (*atlas.loops, loop)
         solution = solve(chain, loops, start)
         if (solution.disagreement > limit).any():
-            return replace(atlas, refused=atlas.refused + 1, pending=None), None
+            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second)), pending=None), None
         atlas = replace(
             atlas,
             loops=loops,
             corrected=solution.poses,
-            anchor=solution.covariance,
+            anchor=Anchor(solution.covariance, solution.common, scale),
             T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
         )
         return atlas, self._returned(atlas.keyframes[loop.first], seen) if self._config.give_back else None

@@ -32,30 +32,14 @@ class Sighting:
     Attributes:
         T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
         covariance: its covariance (6, 6), perturbing on the right.
+        noise: the part of it (6, 6) that is pixel noise of both frames.
         matches: the keyframe's features that agree, by their rows, and the present frame's.
     """
 
     T_keyframe_left: Array
     covariance: Array
+    noise: Array
     matches: Matches
-
-
-@dataclass(frozen=True)
-class Loop:
-    """Two keyframes that show the same place.
-
-    Attributes:
-        first, second: their numbers, the older one first.
-        T_first_second: the second one's pose in the first one's coordinates (4, 4).
-        covariance: its covariance (6, 6), perturbing on the right.
-        inliers: number of features that agree.
-    """
-
-    first: int
-    second: int
-    T_first_second: Array
-    covariance: Array
-    inliers: int
 
 
 def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
@@ -93,10 +77,10 @@ def sighting(
     if np.sqrt(across) < config.spread * rig.width:
         return None
     measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
-    T, covariance = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
+    T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
     slide = _SLIDE / rig.left.fu
-    covariance += np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
-    return Sighting(T, covariance, Matches(ids.astype(np.intp), seen))
+    covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
+    return Sighting(T, covariance, noise, Matches(ids.astype(np.intp), seen))
 
 
 def refined_pose(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ from slam.compare.collect import SERIES_COLUMNS, Collector
 from slam.compare.measure import BY_KEY, UNTRACKED
 from slam.data import Estimate, FrameResult, FrameStatus, StereoFeatures, UpdateReport, UpdateStatus
 from slam.evaluation.summary import consistency, evaluate
-from slam.geometry.se3 import exp
+from slam.geometry.se3 import exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 
 N, SIGMA = 120, 0.01
@@ -115,3 +116,19 @@ def test_nothing_tracked_gives_no_accuracy_and_is_no_fault():
     assert measured.metrics["tracked"] == 0
     assert measured.metrics["frames_failed"] == 1
     assert not {"ate_online_m", "nees_per_dof", "rpe_1s_m"} & set(measured.metrics)
+
+
+def test_what_loops_give_is_the_error_with_and_without_them():
+    true, collector = true_path(), Collector(sequence())
+    odometry = np.array([T @ exp([0, 1e-3 * k, 0, 0, 0, 0]) for k, T in enumerate(true.poses)])  # turns too far
+    odometry[:, 0, 3] += 0.01 * np.arange(N)
+    for k in range(N):  # a loop in every frame
+        one = result(k, true.stamps[k], true.poses[k], 1e-6 * np.eye(6))
+        collector.add(replace(one, T_map_odom=true.poses[k] @ inverse(odometry[k])))
+    loops = {"keyframes": 9, "closed": 4, "refused": 1}
+    metrics = collector.finish(true, NONE, np.zeros((0, 3)), {"loops": loops}).metrics
+    without = evaluate(Trajectory(true.stamps, odometry), sequence())["ATE RMSE [m]"]
+    assert metrics["ate_without_loops_m"] == pytest.approx(without)
+    assert metrics["ate_online_m"] < 1e-6
+    assert (metrics["loops_closed"], metrics["loops_refused"]) == (4, 1)
+    assert "loops_closed" not in collected({}).metrics

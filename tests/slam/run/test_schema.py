@@ -44,8 +44,8 @@ def done(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     write = RunFiles.write_frame
 
-    def write_frame(files, number, result, loop=None):
-        write(files, number, replace(result, objects=BODIES.get(number, ())), loop)
+    def write_frame(files, number, result, *places):
+        write(files, number, replace(result, objects=BODIES.get(number, ())), *places)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RunFiles, "write_frame", write_frame)

@@ -152,7 +152,9 @@ def test_the_pose_is_surer_after_the_loop(closed):
 def test_a_loop_that_contradicts_the_path_is_refused(sequence):
     system, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.gate_sigmas=0.01")
     assert all(r.loop is None for r in results)
-    assert system.atlas.summary()["refused"] > 0
+    told = [(r.index, r.refused_loop) for r in results if r.refused_loop is not None]
+    assert system.atlas.summary()["refused"] == len(told) > 0
+    assert all(abs(now - then - LAP) <= 8 for now, then in told)
 
 
 def test_one_keyframe_alone_closes_no_loop(sequence):
@@ -219,3 +221,20 @@ def test_the_way_of_a_camera_that_was_carried_off_is_not_known(sequence):
     after = system.atlas.keyframes[before]
     assert np.sqrt(np.trace(after.step_covariance[3:, 3:])) > 50.0
     assert np.sqrt(np.trace(system.atlas.keyframes[before - 1].step_covariance[3:, 3:])) < 1.0
+
+
+def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tmp_path: Path):
+    first = closed[0]
+    slam.save_map(tmp_path / "first.map", first)
+    known = slam.load_map(tmp_path / "first.map")
+    config = system_for(sequence, "ekf").config
+    second = slam.StereoSlam(sequence.rig, None, "ekf", config=config, known_map=known)
+    results = [second.process_features(sequence.observations(40 + k)) for k in range(12)]
+    assert results[-1].status.value == "tracked"
+    before, after = first.atlas, second.snapshot()
+    assert len(after.keyframes) > len(before)
+    np.testing.assert_allclose(after.keyframe_poses[: len(before)], before.poses_in_map(), atol=0.1)
+    pairs, kept = ([(loop.first, loop.second) for loop in loops] for loops in (before.loops, after.loops))
+    assert kept[: len(pairs)] == pairs
+    assert second.atlas.summary()["known"] == len(before)
+    assert after.holds == f"{len(after)} landmarks, {len(after.keyframes)} keyframes, {len(after.loops)} loops"

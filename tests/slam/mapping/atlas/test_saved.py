@@ -10,8 +10,8 @@ import pytest
 from slam.errors import SlamError
 from slam.geometry.se3 import exp
 from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.atlas.saved import KEYFRAME_TYPES, from_arrays, to_arrays
+from slam.mapping.atlas.keyframes import Keyframe, Loop
+from slam.mapping.atlas.saved import ATLAS_TYPES, from_arrays, to_arrays
 from slam.mapping.map_io import SavedMap, decode, encode
 
 
@@ -21,30 +21,38 @@ def keyframe(seed: int) -> Keyframe:
     points = np.column_stack([rng.normal(size=(count, 2)), rng.uniform(2, 9, count)])
     P = np.diag(rng.uniform(1e-4, 1e-2, 6))
     return Keyframe(
-        -1, float(seed), exp(rng.normal(size=6)), P, 0.1 * P, 2.0 * seed, float(np.median(points[:, 2])),
-        points.astype(np.float32), rng.normal(size=(count, 16)).astype(np.float16),
+        -1, float(seed), exp(rng.normal(size=6)), P, 0.1 * P, rng.normal(size=(6, 3)), 2.0 * seed,
+        float(np.median(points[:, 2])), points.astype(np.float32), rng.normal(size=(count, 16)).astype(np.float16),
         np.sign(rng.normal(size=count)).astype(np.int8), np.arange(-1, count - 1),
     )  # fmt: skip
 
 
 KEYFRAMES = tuple(keyframe(seed) for seed in range(4))
+POSES = np.array([exp(0.1 * np.full(6, k)) for k in range(4)])
+LOOPS = (Loop(0, 2, exp(np.arange(6) / 9), np.eye(6), 20), Loop(1, 3, exp(np.arange(6) / 7), 2 * np.eye(6), 30))
 
 
 def saved(keyframes: tuple[Keyframe, ...]) -> SavedMap:
     once = np.ones(1, np.int64)
     return SavedMap(
         0 * once, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 16), np.float32), once.astype(np.int8), once, once,
-        keyframes=keyframes,
+        keyframes=keyframes, keyframe_poses=POSES[: len(keyframes)], loops=LOOPS if keyframes else (),
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("keyframes", [KEYFRAMES, ()])
 def test_all_comes_back(keyframes: tuple[Keyframe, ...]):
-    found = decode(encode(saved(keyframes)), "a.map").keyframes
+    read = decode(encode(saved(keyframes)), "a.map")
+    found = read.keyframes
     assert len(found) == len(keyframes)
+    np.testing.assert_array_equal(read.keyframe_poses, POSES[: len(keyframes)])
     for one, other in zip(keyframes, found):
         for field in fields(Keyframe):
             np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), atol=1e-12)
+    assert len(read.loops) == (2 if keyframes else 0)
+    for loop, again in zip(LOOPS, read.loops):
+        for field in fields(Loop):
+            np.testing.assert_array_equal(getattr(loop, field.name), getattr(again, field.name))
     assert encode(saved(found)) == encode(saved(keyframes))
 
 
@@ -54,10 +62,15 @@ def test_new_landmarks_get_ids_that_no_keyframe_has():
 
 
 def test_an_atlas_of_an_earlier_run_is_where_it_was():
-    atlas = Atlas.of_earlier_run(KEYFRAMES)
-    np.testing.assert_array_equal(atlas.positions(), [k.T_odom_left[:3, 3] for k in KEYFRAMES])
+    atlas = Atlas.of_earlier_run(KEYFRAMES, POSES, LOOPS)
+    np.testing.assert_array_equal(atlas.positions(), POSES[:, :3, 3])
     assert all(k.frame == -1 for k in atlas.keyframes)
-    assert atlas.summary() == {"keyframes": 4, "closed": 0, "refused": 0}
+    assert atlas.summary() == {"keyframes": 4, "known": 4, "closed": 0, "refused": 0}
+
+
+def test_a_map_says_what_it_holds():
+    assert saved(KEYFRAMES).holds == "1 landmark, 4 keyframes, 2 loops"
+    assert b"1 landmark, 4 keyframes, 2 loops" in encode(saved(KEYFRAMES))
 
 
 @pytest.mark.parametrize(("name", "value"), [
@@ -73,10 +86,17 @@ def test_an_atlas_of_an_earlier_run_is_where_it_was():
     ("place_points", np.full((26, 3), np.inf, np.float32)),
     ("place_descriptors", np.zeros((26, 8), np.float16)),
     ("place_landmarks", np.full(26, -2)),
+    ("keyframe_odometry", np.tile(2 * np.eye(4), (4, 1, 1))),
+    ("keyframe_shares", np.zeros((4, 5, 3))),
+    ("loop_pairs", np.array([[0, 2], [1, 4]])),
+    ("loop_pairs", np.array([[0, 2], [3, 3]])),
+    ("loop_inliers", np.zeros(3)),
+    ("loop_covariances", np.zeros((2, 6, 6)) - np.eye(6)),
+    ("loop_motions", np.zeros((2, 4, 4))),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
-    arrays = to_arrays(KEYFRAMES)
-    assert len(from_arrays(arrays, (16,), "a.map")) == 4
+    arrays = to_arrays(KEYFRAMES, POSES, LOOPS)
+    assert len(from_arrays(arrays, (16,), "a.map")[0]) == 4
     with pytest.raises(SlamError, match=r"^a\.map: ") as error:
-        from_arrays(arrays | {name: value.astype(KEYFRAME_TYPES[name])}, (16,), "a.map")
+        from_arrays(arrays | {name: value.astype(ATLAS_TYPES[name])}, (16,), "a.map")
     assert "\n" not in str(error.value)
