@@ -129,6 +129,9 @@ class BatchBackend:
             if serial in solution.landmarks:
                 positions[row] = solution.values.atPoint3(landmark_key(serial))
                 covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
+        path = self._smoother.measurement_log.path
+        if not path.count or path.stamps[-1] < rough.stamp:  # predicted only: its measurements are still to come
+            return Estimate(rough.stamp, rough.T_world_left, rough.covariance, rough.ids, positions, covariances)
         P = solution.covariance(pose_key(len(solution.poses) - 1), rough.covariance)
         return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
 
@@ -140,7 +143,10 @@ class BatchBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`."""
         rough = self._smoother.trajectory()
-        return Trajectory(rough.stamps, self._solved().poses.copy()) if len(rough) else rough
+        if not len(rough):
+            return rough
+        solved = self._solved().poses
+        return Trajectory(rough.stamps, np.concatenate([solved, rough.poses[len(solved) :]]))
 
     def _solved(self) -> _Solution:
         if self._solution is None:
@@ -180,7 +186,8 @@ class _Solution:
             self.landmarks.add(serial)
         self._factors = change.factors
         self.values = optimise(change, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)])
+        poses = [self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)]
+        self.poses = np.array(poses).reshape(-1, 4, 4)
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:

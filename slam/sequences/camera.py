@@ -96,11 +96,20 @@ class CameraSequence:
                         return
                     cameras.release()
                     cameras, pair = self._again(faults)
+                self._require_size(pair[1])
                 if pair[0] > last:  # the clock of the machine may have been set back
                     last = pair[0]
                     if index >= start:
                         yield StereoFrame(index, *pair)
                     index += 1
+
+    def _require_size(self, image: np.ndarray) -> None:
+        """Raise where a camera has changed the size of its images, as one may that was opened again."""
+        size, expected = image.shape[::-1], (self.rig.width, self.rig.height)
+        if size != expected:
+            raise SequenceError(
+                f"{self.name}: images are {size_text(size)} now; they were {size_text(expected)}, as in the calibration"
+            )
 
     def _again(self, faults: FaultLog) -> tuple[_Cameras, Pair]:
         """The cameras, opened again, with their first images.
