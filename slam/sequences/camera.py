@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -63,7 +63,7 @@ class CameraSequence:
         self._wait = WAIT if wait is None else wait
         self._swap = rigs.flag(options, "swap")
         self._origin = time.time() - time.monotonic()
-        paths = rigs.calibration_files(Path.cwd(), options)
+        paths = self._calibration_files(options)
         self._cameras: _Cameras | None = self._open()
         try:
             _, left, _ = self._first(self._cameras)
@@ -71,6 +71,16 @@ class CameraSequence:
         except BaseException:
             self._cameras.release()
             raise
+
+    def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
+        """Those that are named, or of the working folder, before a camera is opened in vain."""
+        try:
+            return rigs.calibration_files(Path.cwd(), options)
+        except CalibrationError:
+            if "calibration" in options:
+                raise
+            missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
+            raise CalibrationError(f"{missing}; name the file: {self.name}?calibration=FILE") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
