@@ -184,7 +184,8 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
         played({"1": [grey(0, 320)]})
         len(slam.open_sequence("camera:1"))
     (tmp_path / "calibration.yaml").unlink()
-    with pytest.raises(CalibrationError, match=r"camera:1: there is no calibration.yaml.* name the file: camera:1\?calibration=FILE"):
+    words = r"camera:1: there is no calibration.yaml.* name the file: camera:1\?calibration=FILE"
+    with pytest.raises(CalibrationError, match=words):
         slam.open_sequence("camera:1")
 
 
