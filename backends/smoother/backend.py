@@ -185,7 +185,8 @@ class SmootherBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
         self._graph.mend()
-        path, ahead = self.measurement_log.path, self._predicted
+        path = self.measurement_log.path
+        ahead = path.predicted
         if ahead is not None:  # not in the graph yet: its measurements are still to come
             return Trajectory(np.append(path.stamps, ahead.stamp), np.concatenate([path.poses, ahead.T[None]]))
         self._graph.converge()

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import backends
 from slam.data import Observations, UpdateStatus
+from slam.errors import SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import pose
 from slam.models import EstimatorModels, MotionModel
@@ -168,8 +169,14 @@ def _alike(what: str, change: Array, P: Array, expected: Array, deviations: floa
 
 
 def agree(rng: np.random.Generator, backend: Any, tolerance: tuple[float, float]) -> None:
-    """A sequence of calls, counted after each and compared twice."""
-    play = Play(rng, backend)
+    """A sequence of calls, counted after each and compared twice; none of them may be refused."""
+    try:
+        _play(rng, Play(rng, backend), tolerance)
+    except SlamError as error:
+        raise Broken(f"good data are refused: {error}") from error
+
+
+def _play(rng: np.random.Generator, play: Play, tolerance: tuple[float, float]) -> None:
     play.predict()
     play.add(least=10)
     calls = int(rng.integers(4, 14))

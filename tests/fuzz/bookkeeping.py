@@ -62,7 +62,11 @@ class Books:
             features = replace(features, uv_right=np.full_like(features.uv_right, np.nan))
         if kind == "strange":
             features = replace(features, descriptors=self.rng.permutation(features.descriptors))
-        self._account(features, self.system.process_features(features))
+        try:
+            result = self.system.process_features(features)
+        except SlamError as error:
+            raise Broken(f"a good frame is refused: {error}") from error
+        self._account(features, result)
 
     def refused(self) -> None:
         """A frame that comes too early is refused, and nothing has changed."""
@@ -80,7 +84,10 @@ class Books:
         """What the system says it holds."""
         if not self.stamps:
             return
-        estimate, path = self.system.estimate(), self.system.trajectory()
+        try:
+            estimate, path = self.system.estimate(), self.system.trajectory()
+        except SlamError as error:
+            raise Broken(f"a question is refused: {error}") from error
         ids = np.array(sorted(self.map), np.int64)
         shapes = [estimate.positions.shape, estimate.covariances.shape, estimate.covariance.shape]
         if not np.array_equal(estimate.ids, ids) or shapes != [(len(ids), 3), (len(ids), 3, 3), (6, 6)]:
