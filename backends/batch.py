@@ -81,9 +81,7 @@ class BatchBackend:
 
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`: the smoother's."""
-        prediction = self._smoother.predict(stamp)
-        self._solution = None
-        return prediction
+        return self._smoother.predict(stamp)
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`: the smoother's."""
@@ -149,7 +147,8 @@ class BatchBackend:
         return Trajectory(rough.stamps, np.concatenate([solved, rough.poses[len(solved) :]]))
 
     def _solved(self) -> _Solution:
-        if self._solution is None:
+        count = self._smoother.measurement_log.path.count  # a pose without measurements may have come since
+        if self._solution is None or len(self._solution.poses) != count:
             self._solution = _Solution(self._smoother)
         return self._solution
 
