@@ -81,9 +81,7 @@ class BatchBackend:
 
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`: the smoother's."""
-        prediction = self._smoother.predict(stamp)
-        self._solution = None
-        return prediction
+        return self._smoother.predict(stamp)
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`: the smoother's."""
@@ -129,6 +127,9 @@ class BatchBackend:
             if serial in solution.landmarks:
                 positions[row] = solution.values.atPoint3(landmark_key(serial))
                 covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
+        path = self._smoother.measurement_log.path
+        if not path.count or path.stamps[-1] < rough.stamp:  # predicted only: its measurements are still to come
+            return Estimate(rough.stamp, rough.T_world_left, rough.covariance, rough.ids, positions, covariances)
         P = solution.covariance(pose_key(len(solution.poses) - 1), rough.covariance)
         return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
 
@@ -140,10 +141,14 @@ class BatchBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`."""
         rough = self._smoother.trajectory()
-        return Trajectory(rough.stamps, self._solved().poses.copy()) if len(rough) else rough
+        if not len(rough):
+            return rough
+        solved = self._solved().poses
+        return Trajectory(rough.stamps, np.concatenate([solved, rough.poses[len(solved) :]]))
 
     def _solved(self) -> _Solution:
-        if self._solution is None:
+        count = self._smoother.measurement_log.path.count  # a pose without measurements may have come since
+        if self._solution is None or len(self._solution.poses) != count:
             self._solution = _Solution(self._smoother)
         return self._solution
 
@@ -180,7 +185,8 @@ class _Solution:
             self.landmarks.add(serial)
         self._factors = change.factors
         self.values = optimise(change, _ITERATIONS)
-        self.poses = np.array([self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)])
+        poses = [self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)]
+        self.poses = np.array(poses).reshape(-1, 4, 4)
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:

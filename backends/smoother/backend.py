@@ -185,9 +185,12 @@ class SmootherBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
         self._graph.mend()
-        self._commit()
+        path = self.measurement_log.path
+        ahead = path.predicted
+        if ahead is not None:  # not in the graph yet: its measurements are still to come
+            return Trajectory(np.append(path.stamps, ahead.stamp), np.concatenate([path.poses, ahead.T[None]]))
         self._graph.converge()
-        return Trajectory(self.measurement_log.path.stamps.copy(), self.measurement_log.path.poses.copy())
+        return Trajectory(path.stamps.copy(), path.poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 

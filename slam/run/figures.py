@@ -73,6 +73,8 @@ class RunData:
         Raises:
             SlamError: the folder does not hold a finished run.
         """
+        if not folder.exists():
+            raise SlamError(f"{folder}: there is no such folder")
         if not (folder / "landmarks.csv").exists():
             raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
         try:

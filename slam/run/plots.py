@@ -204,7 +204,7 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     axis.set(xlim=(0, 1.18 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin), title="Median time of each stage")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22 - 0.1 / len(runs)), ncols=4, fontsize=8, frameon=False)
+    axis.figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
 
 
 def _errors_of(run: RunData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -165,9 +165,25 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
     if name is None:
         below = _sequences_below(folder)
         names = ", ".join(str(p.relative_to(folder)) for p in below[:3]) + (", …" if len(below) > 3 else "")
-        hint = f"; below it are {names}" if below else ""
+        hint = _two_cameras(folder) + (f"; below it are {names}" if below else "")
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     return name
+
+
+def _two_cameras(folder: Path) -> str:
+    """How to name the cameras where the folder has two folders of images, or two videos, by other names; else empty."""
+    from slam.sequences.images import IMAGE_SUFFIXES
+    from slam.sequences.videos import VIDEO_SUFFIXES
+
+    names: list[str] = []
+    with suppress(OSError):
+        for path in sorted(islice(folder.iterdir(), _LOOKED_AT)):
+            inside = islice(path.iterdir(), _LOOKED_AT) if path.is_dir() else ()
+            images = sum(p.suffix.lower() in IMAGE_SUFFIXES for p in inside)
+            if path.suffix.lower() in VIDEO_SUFFIXES or images > 1:
+                names.append(path.name)
+    two = names if len(names) == 2 else [name for name in names if not Path(name).suffix]
+    return f"; say which is which: {folder.name}?left={two[0]}&right={two[1]}" if len(two) == 2 else ""
 
 
 def _is_ros(path: Path) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -63,7 +63,7 @@ class CameraSequence:
         self._wait = WAIT if wait is None else wait
         self._swap = rigs.flag(options, "swap")
         self._origin = time.time() - time.monotonic()
-        paths = rigs.calibration_files(Path.cwd(), options)
+        paths = self._calibration_files(options)
         self._cameras: _Cameras | None = self._open()
         try:
             _, left, _ = self._first(self._cameras)
@@ -71,6 +71,16 @@ class CameraSequence:
         except BaseException:
             self._cameras.release()
             raise
+
+    def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
+        """Those that are named, or of the working folder, before a camera is opened in vain."""
+        try:
+            return rigs.calibration_files(Path.cwd(), options)
+        except CalibrationError:
+            if "calibration" in options:
+                raise
+            missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
+            raise CalibrationError(f"{missing}; name the file: {self.name}?calibration=FILE") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")
@@ -96,11 +106,20 @@ class CameraSequence:
                         return
                     cameras.release()
                     cameras, pair = self._again(faults)
+                self._require_size(pair[1])
                 if pair[0] > last:  # the clock of the machine may have been set back
                     last = pair[0]
                     if index >= start:
                         yield StereoFrame(index, *pair)
                     index += 1
+
+    def _require_size(self, image: np.ndarray) -> None:
+        """Raise where a camera has changed the size of its images, as one may that was opened again."""
+        size, expected = image.shape[::-1], (self.rig.width, self.rig.height)
+        if size != expected:
+            raise SequenceError(
+                f"{self.name}: images are {size_text(size)} now; they were {size_text(expected)}, as in the calibration"
+            )
 
     def _again(self, faults: FaultLog) -> tuple[_Cameras, Pair]:
         """The cameras, opened again, with their first images.

@@ -50,7 +50,8 @@ class PlayedFile:
         """The next image, when it is due."""
         time.sleep(max(0.0, self._due - time.monotonic()))
         self._due = max(self._due, time.monotonic()) + self._period
-        return bool(self._capture.grab())
+        with quiet_libraries():  # a file is decoded here
+            return bool(self._capture.grab())
 
     def retrieve(self) -> tuple[bool, Any]:
         """The grabbed image."""

@@ -75,7 +75,10 @@ def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
     backend.trajectory(), backend.estimate(), backend.trajectory()
     assert solved == [20]
     backend.predict(2.0)
-    backend.trajectory()
+    assert len(backend.trajectory()) == 21
+    assert solved == [20], "a pose that is only predicted changes nothing"
+    backend.predict(2.1)
+    assert len(backend.trajectory()) == 22
     assert solved == [20, 21]
 
 

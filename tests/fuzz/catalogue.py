@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.fuzz import commands, library, readers, runs, saved, settings
+from tests.fuzz import agreement, bookkeeping, commands, library, live, readers, runs, saved, settings
 
 SUBJECTS = (
     *readers.SUBJECTS,
@@ -11,4 +11,7 @@ SUBJECTS = (
     *commands.SUBJECTS,
     *runs.SUBJECTS,
     *library.SUBJECTS,
+    *live.SUBJECTS,
+    *agreement.SUBJECTS,
+    *bookkeeping.SUBJECTS,
 )

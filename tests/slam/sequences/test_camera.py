@@ -106,6 +106,15 @@ def test_two_devices_and_one_with_both_images_give_the_same(rig_here, played):
         assert abs(frames[0].stamp - time.time()) < 60
 
 
+def test_a_camera_that_comes_back_with_another_size_ends_the_frames(rig_here, played):
+    good, other = np.hstack([grey(10), grey(20)]), np.hstack([grey(10), grey(20)])[:-1]
+    played({"0": [good, good, None, other, other]})
+    frames = slam.open_sequence("camera:0").frames()
+    assert next(frames).index == 0
+    with pytest.raises(SequenceError, match=r"camera:0: images are 160x119 now; they were 160x120"):
+        next(frames)
+
+
 def test_swapped_halves_and_a_part_of_the_frames(rig_here, played):
     played({"0": [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(9)]})
     frames = list(slam.open_sequence("camera:0?swap=yes&kind=driving").frames(2, 5))
@@ -175,7 +184,8 @@ def test_what_is_asked_for_wrongly_is_one_line(rig_here, played, tmp_path):
         played({"1": [grey(0, 320)]})
         len(slam.open_sequence("camera:1"))
     (tmp_path / "calibration.yaml").unlink()
-    with pytest.raises(CalibrationError, match="calibration is missing"):
+    words = r"camera:1: there is no calibration.yaml.* name the file: camera:1\?calibration=FILE"
+    with pytest.raises(CalibrationError, match=words):
         slam.open_sequence("camera:1")
 
 

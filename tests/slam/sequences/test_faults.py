@@ -49,6 +49,17 @@ def test_a_folder_of_no_known_format(tmp_path: Path) -> None:
         open_sequence(tmp_path)
 
 
+def test_two_folders_of_images_by_other_names_are_named(tmp_path: Path) -> None:
+    for name in ("cam_l", "cam_r"):
+        (tmp_path / name).mkdir()
+        for k in range(2):
+            (tmp_path / name / f"{k}.png").write_bytes(b"")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.png").write_bytes(b"")
+    with pytest.raises(SequenceError, match=rf"say which is which: {tmp_path.name}\?left=cam_l&right=cam_r$"):
+        open_sequence(tmp_path)
+
+
 def test_a_folder_above_sequences_names_them(kitti: Path, raw: Path) -> None:
     with pytest.raises(SequenceError, match=r"no sequence of a known format .*; below it are sequences.03$"):
         open_sequence(kitti.parent.parent)

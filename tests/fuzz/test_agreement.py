@@ -1,0 +1,47 @@
+"""Whether the comparison with the slow estimator would notice a back end that is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import backends
+from slam.data import Observations
+from tests.fuzz import agreement
+from tests.fuzz.harness import Broken
+
+
+class Wrong:
+    """A filter with one fault."""
+
+    def __init__(self, fault: str) -> None:
+        self.right, self.fault = backends.create("ekf", agreement.RIG, models=agreement.MODELS), fault
+
+    def __getattr__(self, name):
+        return getattr(self.right, name)
+
+    def estimate(self, *arguments):
+        estimate = self.right.estimate(*arguments)
+        if self.fault == "confident":
+            return replace(estimate, covariance=estimate.covariance / 2)
+        if self.fault == "off":
+            return replace(estimate, positions=estimate.positions + 0.2)
+        return replace(estimate, ids=estimate.ids + 1) if self.fault == "ids" else estimate
+
+    def update(self, observations):
+        if self.fault == "late":
+            shifted = observations.uv_left + 0.5
+            return self.right.update(Observations(observations.ids, shifted, observations.uv_right + 0.5))
+        return self.right.update(observations)
+
+
+@pytest.mark.parametrize("fault", ["confident", "off", "ids", "late"])
+def test_a_back_end_with_a_fault_is_noticed(fault):
+    with pytest.raises(Broken):
+        agreement.agree(np.random.default_rng(3), Wrong(fault), agreement.TOLERANCES["ekf"])
+
+
+def test_the_same_without_the_fault_is_not():
+    agreement.agree(np.random.default_rng(3), Wrong("none"), agreement.TOLERANCES["ekf"])
