@@ -25,6 +25,7 @@ _AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
 _SUPPORT = 3  # tracks of a frame that are a region's support
 _FRAMES = 4  # with support
 _TRACKS = 4  # different ones that have supported it
+_EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may leave, as of members of a body
 _SHARE = 0.6  # of the tracks inside that must agree with it
 _PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
@@ -171,8 +172,13 @@ def _near(candidate: Candidate, tracks: MovingTracks, places: Array) -> BoolArra
 
 def _agrees(candidate: Candidate, tracks: MovingTracks) -> BoolArray:
     """Which tracks move as the region does (N,)."""
+    return np.asarray(_unexplained(candidate, tracks) <= _AGREES)
+
+
+def _unexplained(candidate: Candidate, tracks: MovingTracks) -> Array:
+    """χ²(3) of the tracks' velocities, less the region's (N,)."""
     gap = tracks.motion.velocity - candidate.state[3:]
-    return _squares(gap, tracks.motion.velocity_covariance + candidate.covariance[3:, 3:]) <= _AGREES
+    return _squares(gap, tracks.motion.velocity_covariance + candidate.covariance[3:, 3:])
 
 
 def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> Candidate:
@@ -187,13 +193,15 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
     vector[3:] += (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
     P = np.linalg.inv(information)
     after = replace(candidate, state=P @ vector, covariance=P)
-    inside, agrees = _near(after, tracks, tracks.spread), _agrees(after, tracks)
+    inside, left = _near(after, tracks, tracks.spread), _unexplained(after, tracks)
+    agrees = left <= _AGREES
+    contradicts = ~agrees & (left > _EXPLAINED * m.test)
     return replace(
         after,
         supporters=candidate.supporters | frozenset(tracks.ids[rows].tolist()),
         frames=candidate.frames + (len(rows) >= _SUPPORT),
         agreeing=candidate.agreeing + int((inside & agrees & tracks.moves).sum()),
-        contradicting=candidate.contradicting + int((inside & ~agrees).sum()),
+        contradicting=candidate.contradicting + int((inside & contradicts).sum()),
         unseen=0,
         members=tracks.rows[rows],
         radius=float(tracks.radius[rows].mean()),

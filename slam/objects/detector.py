@@ -92,7 +92,10 @@ class MovingObjectDetector:
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
-        follow(tracks, self.bodies, T_world_left, features, local, self._dt(times), self.rig, self.sigma, self.config)
+        follow(
+            tracks, self.bodies, self._candidates, T_world_left, features, local, self._dt(times), self.rig, self.sigma,
+            self.config,
+        )  # fmt: skip
         self._measure(tracks, features, local, T_world_left)
         tracks.recognised_as(landmark)
         self._fit(tracks, times)
