@@ -31,6 +31,7 @@ class Body:
         T: pose T_world_object (4, 4) at the present frame.
         velocity: [ω, v] (6,) in world axes.
         covariance: of the pose (6, 6), body axes.
+        velocity_covariance: of the velocity (6, 6).
         history: poses at the window's slots (W, 4, 4).
         known: at which slots there is a measured one (W,).
         T_before: pose at the previous frame.
@@ -72,6 +73,7 @@ class Body:
     size: float
     reach: float
     seen_at: float
+    velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     seen: int = 1
     missed: int = 0
     measured: bool = True
@@ -98,7 +100,9 @@ class Body:
         return replace(self, T=T, history=history, known=known, measured=measured, **changes)
 
 
-def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float) -> Body:
+def new_body(
+    id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float, uncertainty: Array | None = None
+) -> Body:  # fmt: skip
     """A body found with a twist at its centre; its poses over the window follow from an even motion.
 
     Args:
@@ -108,6 +112,7 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
         times: of the window's slots less the present (W,) [s].
         stamp: the present [s].
         size: what it measures across at least [m].
+        uncertainty: covariance of the twist (6, 6); None where it is known.
     """
     history = np.tile(np.eye(4), (len(times), 1, 1))
     history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
@@ -117,7 +122,7 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
     none = np.zeros(3)
     return Body(
         id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, stamp, T, T, np.eye(4), none, none,
-        size, np.inf, stamp,
+        size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
 
@@ -130,7 +135,10 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
     linear, angular = models.velocity_variance(dt)
-    covariance = body.covariance + dt**2 * np.diag([angular] * 3 + [linear] * 3)
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T[:3, :3].T
+    velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
+    covariance = body.covariance + dt**2 * R @ velocity @ R.T
     return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1, age=body.age + 1)
 
 
@@ -159,6 +167,7 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
         T=T,
         T_body_estimate=T_body_estimate,
         velocity=at_origin if settled else body.velocity,
+        velocity_covariance=estimate.velocity_covariance if settled else body.velocity_covariance,
         covariance=change @ estimate.covariance @ change.T,
         moving=not settled or (certain and speed > min_speed),
         estimate=estimate,

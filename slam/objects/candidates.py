@@ -120,6 +120,12 @@ class Candidate:
     members: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     radius: float = 0.0
 
+    def twist(self, turn: float) -> tuple[Array, Array]:
+        """Its twist [ω, v] (6,), and the covariance (6, 6) of it; `turn` [rad/s] is the deviation of ω."""
+        P = turn**2 * np.eye(6)
+        P[3:, 3:] = self.covariance[3:, 3:]
+        return np.concatenate([np.zeros(3), self.state[3:]]), P
+
     def is_body(self, min_speed: float) -> bool:
         """Whether the region has moved for certain, and is seen well enough in this frame to found a body."""
         moved = self.state[:3] - self.start

@@ -212,14 +212,16 @@ class MovingObjectDetector:
             return
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
-        twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
-        self._found(members, centre, twist, times)
+        twist, uncertainty = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
+        self._found(members, centre, twist, uncertainty, times)
 
-    def _found(self, members: NDArray[np.intp], centre: Array, twist: Array, times: Array) -> None:
+    def _found(
+        self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array
+    ) -> None:  # fmt: skip
         """Make a body of tracks with a common twist, or let them join the one that they belong to."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
+        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
         body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
         if known is None:
@@ -267,7 +269,8 @@ class MovingObjectDetector:
         for candidate in followed:
             if candidate.is_body(c.min_speed):
                 centre = tracks.position[candidate.members].mean(axis=0)
-                self._found(candidate.members, centre, np.concatenate([np.zeros(3), candidate.state[3:]]), times)
+                twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
+                self._found(candidate.members, centre, twist, uncertainty, times)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
