@@ -138,8 +138,10 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T[:3, :3].T
     velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
-    covariance = body.covariance + dt**2 * R @ velocity @ R.T
-    return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1, age=body.age + 1)
+    return body.placed(
+        T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
+        velocity_covariance=velocity, missed=body.missed + 1, age=body.age + 1,
+    )  # fmt: skip
 
 
 def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:

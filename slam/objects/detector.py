@@ -212,7 +212,11 @@ class MovingObjectDetector:
             return
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
-        twist, uncertainty = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
+        twist, uncertainty = fit_twist(
+            motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre
+        )
+        linear, angular = self.models.velocity_variance(-float(times.min()) / 3.0)  # it is the mean over the window
+        uncertainty = uncertainty + np.diag([angular] * 3 + [linear] * 3)
         self._found(members, centre, twist, uncertainty, times)
 
     def _found(
@@ -407,8 +411,10 @@ class MovingObjectDetector:
         mine = np.flatnonzero((tracks.body == body.id) & tracks.seen & (tracks.misfit == 0))
         mine = mine[np.argsort(tracks.ids[mine])]
         rows = tracks.row[mine]
-        guess = body.T @ body.T_body_estimate
-        return ObjectObservations(body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], guess)
+        guess, sigma = body.T @ body.T_body_estimate, np.sqrt(body.velocity_covariance.diagonal())
+        return ObjectObservations(
+            body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], guess, body.velocity, sigma
+        )
 
     def _report(self, body: Body) -> MovingObject:
         tracks, estimate = self.tracks, body.estimate
