@@ -22,7 +22,8 @@ from slam.objects.tracks import MOVES, ConstantVelocity
 
 _NEAR = 7.8  # χ²(3) at 95 %: tracks inside the region
 _AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
-_SUPPORT = 3  # tracks of a frame that are a region's support
+_SUPPORT = 2  # tracks of a frame that are a region's support
+_MEMBERS = 3  # tracks of a frame that found a body
 _FRAMES = 4  # with support
 _TRACKS = 4  # different ones that have supported it
 _EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may leave, as of members of a body
@@ -133,7 +134,7 @@ class Candidate:
         if length <= max(2.0 * self.radius, 1e-9) or np.linalg.norm(self.state[3:]) <= min_speed:
             return False
         deviation = np.sqrt(moved @ (self.covariance[:3, :3] + self.start_covariance) @ moved) / length
-        enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
+        enough = len(self.members) >= _MEMBERS and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
         agree = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
         return bool(enough and agree and length > 3.0 * deviation)
 

@@ -229,7 +229,7 @@ class MovingObjectDetector:
         body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
         if known is None:
-            body = self._grown(body, members)
+            body = self._again(self._grown(body, members))
             self.bodies[body.id] = body
             self._next_body = max(self._next_body, body.id + 1)
         membership.enter(known or body, tracks, members, sure=True)
@@ -243,6 +243,18 @@ class MovingObjectDetector:
             if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
                 return body
         return None
+
+    def _again(self, body: Body) -> Body:
+        """A new body, or in its place the one out of view that it is: that keeps its id, but not its points."""
+        tracks, known = self.tracks, None
+        assert tracks is not None
+        if body.id not in self.bodies:
+            known = membership.returned(self.bodies, body)
+        if known is None:
+            return body
+        tracks.give_up(np.flatnonzero(tracks.body == known.id))
+        self._forgotten.append(known.id)
+        return continued(body, known)
 
     def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
         """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
