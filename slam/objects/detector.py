@@ -45,6 +45,7 @@ _MERGES = 24  # frames in which a body turns out to be a part of another at once
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
+_TO_START = 3  # points with a depth that a back end needs to start a body
 _REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
 _LIKELY = 0.5  # probability from which a body rather exists than not
 
@@ -384,8 +385,8 @@ class MovingObjectDetector:
         self._forgotten.clear()
         told = [body for body in self.bodies.values() if body.measured]
         observations = [self._observations(body, features) for body in told]
-        fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= 3]
-        estimates = backend.update_objects(fit_to_start)
+        fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= _TO_START]
+        estimates = self._begun_anew(backend, backend.update_objects(fit_to_start), observations)
         strangers = [e.id for e in estimates if e.id not in self.bodies]  # of before `restart`
         if strangers:
             backend.remove_objects(strangers)
@@ -405,6 +406,24 @@ class MovingObjectDetector:
                 self.bodies[body.id] = counted(body)
                 reported.append(self._report(body))
         return tuple(reported)
+
+    def _begun_anew(
+        self, backend: ObjectBackend, estimates: list[ObjectEstimate], observations: list[ObjectObservations]
+    ) -> list[ObjectEstimate]:
+        """The estimates; bodies of which nothing was used, though their points agree here, start anew under their id.
+
+        They bring the velocity that they had: what was wrong is where the back end has their points.
+        """
+        refused = {e.id for e in estimates if not e.measured}
+        anew = [o for o in observations if o.id in refused and o.has_stereo.sum() >= _TO_START]
+        if not anew:
+            return estimates
+        ids = {o.id for o in anew}
+        backend.remove_objects(sorted(ids))
+        for id in ids:
+            self.bodies[id] = replace(self.bodies[id], estimate=None, refused=0)
+        begun = {e.id: e for e in backend.update_objects(anew) if e.id in ids}
+        return [begun.get(e.id, e) for e in estimates]
 
     def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
         """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""

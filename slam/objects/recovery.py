@@ -82,7 +82,7 @@ def _predicted(
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
     A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
-    the other. At least two points must agree, and most.
+    the other. At least two points must agree.
     """
     local = measured[rows]
     deep = np.flatnonzero(np.isfinite(local).all(axis=1))
@@ -97,7 +97,7 @@ def _predicted(
     spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
     agrees = _squares(gaps, np.linalg.inv(spread)) < _FITS
     known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
-    while agrees.sum() >= _LEAST_PREDICTED and 2 * agrees.sum() > len(deep):
+    while agrees.sum() >= _LEAST_PREDICTED:
         normal = known + (JA[agrees] @ J[agrees]).sum(axis=0)
         change = np.linalg.solve(normal, (JA[agrees] @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
         off = np.where(agrees, _squares(gaps - J @ change, information), 0.0)
