@@ -26,8 +26,8 @@ class ObjectObservations:
         points: ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked.
         uv_left: left pixels (M, 2), finite.
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
-        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement, it only
-            says where to linearise first. None where there is no guess.
+        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement: it says
+            where to linearise first, and where a new body's frame lies. None where there is no guess.
         velocity: of a new body, [ω, v] (6,) in world axes [rad/s], [m/s], as far as it is known before; else None.
         velocity_sigma: standard deviations of it (6,).
 

@@ -102,6 +102,7 @@ class ObjectSmoother:
     def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         frame, X = path.count - 1, path.poses[-1].copy()
         T, near = first_frame(X, seen.local)
+        T = T if seen.guess is None else seen.guess
         window = opened(frame, float(path.stamps[-1]), T, X, seen.first_velocity)
         cameras = _cameras(window.frames, path, camera)
         window, _ = self._join(window, cameras, seen, near)

@@ -93,6 +93,11 @@ class Body:
         """Diagonal of its extent, but no less than its least size [m]."""
         return max(math.dist(self.upper, self.lower), self.size)
 
+    @property
+    def middle(self) -> Array:
+        """Middle of its extent (3,) in world coordinates."""
+        return np.asarray(self.T[:3, :3] @ (0.5 * (self.lower + self.upper)) + self.T[:3, 3])
+
     def placed(self, T: Array, slot: int, measured: bool, **changes: Any) -> Body:
         """The body with its pose at the present frame, whose slot is `slot`, and other changes."""
         history, known = self.history.copy(), self.known.copy()
@@ -190,10 +195,17 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A body found anew where it was known already in part: with its id and what has been learnt of its existence."""
+    """A body found anew where it was known already in part: with its id and what has been learnt of its existence.
+
+    The back end's frame for it goes on as predicted, but for a shift from what was seen of it to what is now.
+    """
+    shift = np.eye(4)
+    shift[:3, 3] = body.middle - known.middle
+    T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
-        body, id=known.id, proved=known.proved, existence=known.existence, age=known.age, reported=known.reported,
-        reported_unmeasured=known.reported_unmeasured, measured_at=known.measured_at,
+        body, id=known.id, T_body_estimate=T_body_estimate, proved=known.proved, existence=known.existence,
+        age=known.age, reported=known.reported, reported_unmeasured=known.reported_unmeasured,
+        measured_at=known.measured_at,
     )  # fmt: skip
 
 

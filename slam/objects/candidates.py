@@ -22,8 +22,8 @@ from slam.objects.tracks import MOVES, ConstantVelocity
 
 _NEAR = 7.8  # χ²(3) at 95 %: tracks inside the region
 _AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
-_SUPPORT = 2  # tracks of a frame that are a region's support
-_MEMBERS = 3  # tracks of a frame that found a body
+_BEGIN = 2  # tracks that begin a region
+_SUPPORT = 3  # tracks of a frame that are a region's support
 _FRAMES = 4  # with support
 _TRACKS = 4  # different ones that have supported it
 _EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may leave, as of members of a body
@@ -134,7 +134,7 @@ class Candidate:
         if length <= max(2.0 * self.radius, 1e-9) or np.linalg.norm(self.state[3:]) <= min_speed:
             return False
         deviation = np.sqrt(moved @ (self.covariance[:3, :3] + self.start_covariance) @ moved) / length
-        enough = len(self.members) >= _MEMBERS and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
+        enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
         agree = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
         return bool(enough and agree and length > 3.0 * deviation)
 
@@ -218,7 +218,7 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
 def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     """Regions of free tracks that lie together and move alike, the largest first."""
     rows, m = np.flatnonzero(free), tracks.motion
-    if len(rows) < _SUPPORT:
+    if len(rows) < _BEGIN:
         return []
     places = tracks.places[rows]
     gaps = m.position[rows][:, None] - m.position[rows]
@@ -229,7 +229,7 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     left, found = np.ones(len(rows), bool), []
     for i in np.argsort(-near.sum(axis=1), kind="stable"):
         group = near[i] & left
-        if left[i] and group.sum() >= _SUPPORT:
+        if left[i] and group.sum() >= _BEGIN:
             left &= ~group
             found.append(_begun(tracks, rows[group]))
     return found
@@ -243,7 +243,7 @@ def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
     velocity = P[3:, 3:] @ (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
     return Candidate(
         np.concatenate([place, velocity]), P, place, P[:3, :3].copy(), frozenset(tracks.ids[rows].tolist()),
-        members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
+        frames=int(len(rows) >= _SUPPORT), members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
     )  # fmt: skip
 
 

@@ -270,13 +270,12 @@ def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
     Where the middle of what is seen lies in the body is known to within the body's half.
     """
     best, least = None, _RETURNED
-    middle = 0.5 * (new.lower + new.upper)
     for body in bodies.values():
         if body.measured or not body.proved:
             continue
         y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
         place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
-        gap = transform(new.T, middle[None])[0] - transform(body.T, y[None])[0]
+        gap = new.middle - body.middle
         change = new.velocity[3:] - body.velocity[3:]
         velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
         off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
