@@ -112,7 +112,8 @@ def add_motion(
     if len(T) < 2 or not len(steps):
         return
     sigmas = scales[1:, None] * impulse_sigmas(models, 1.0, 1.0) * np.sqrt(np.diff(stamps))[:, None]  # a random walk
-    first, mean = steps.start, np.zeros(6)
+    first = steps.start
+    mean: Array = np.zeros(6)
     if first_velocity is not None:
         dt, mean = float(stamps[1] - stamps[0]), first_velocity.mean
         sigmas[0] = first_sigmas(first_velocity, models, dt, float(scales[1]))

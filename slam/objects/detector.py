@@ -16,23 +16,21 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
-from slam.object_data import MotionLabels, MovingObject, ObjectEstimate, ObjectObservations
+from slam.object_data import MotionLabels, MovingObject
 from slam.objects import membership
 from slam.objects.bodies import (
     Body,
     advanced,
     continued,
-    counted,
-    from_estimate,
     from_fit,
     new_body,
-    outermost,
     with_evidence,
     with_extent,
 )
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
+from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
@@ -45,9 +43,6 @@ _MERGES = 24  # frames in which a body turns out to be a part of another at once
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
-_TO_START = 3  # points with a depth that a back end needs to start a body
-_REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
-_LIKELY = 0.5  # probability from which a body rather exists than not
 
 
 class MovingObjectDetector:
@@ -71,7 +66,7 @@ class MovingObjectDetector:
         self._next_track = 0
         self._next_body = 1
         self._forgotten: list[int] = []
-        self._estimated: set[int] = set()  # bodies that the back end knows
+        self._estimates = BodyEstimates(config, self.models)
         self._candidates: list[Candidate] = []
         self._camera: Array = np.zeros(3)
         self.suspects = np.zeros(0, np.int64)
@@ -80,7 +75,8 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._estimated, self._candidates = [], set(), []
+        self._forgotten, self._candidates = [], []
+        self._estimates = BodyEstimates(self.config, self.models)
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
@@ -378,84 +374,6 @@ class MovingObjectDetector:
                     self.bodies[body.id] = from_fit(body, body.T, dt, self.slot)
             self._forgotten.clear()
             return ()
-        known = {body.id for body in self.bodies.values() if body.estimate is not None}
-        gone = [id for id in self._forgotten if id in self._estimated]
-        if gone:
-            backend.remove_objects(gone)
-        self._forgotten.clear()
-        told = [body for body in self.bodies.values() if body.measured]
-        observations = [self._observations(body, features) for body in told]
-        fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= _TO_START]
-        estimates = self._begun_anew(backend, backend.update_objects(fit_to_start), observations)
-        strangers = [e.id for e in estimates if e.id not in self.bodies]  # of before `restart`
-        if strangers:
-            backend.remove_objects(strangers)
-            estimates = [e for e in estimates if e.id in self.bodies]
-        self._estimated = {e.id for e in estimates}
-        reported = []
-        for estimate in estimates:
-            body = self.bodies[estimate.id]
-            body = from_estimate(body, estimate, self.config.min_speed)
-            if not self._believed(body, estimate):
-                self._forgotten.append(body.id)
-                self.bodies[body.id] = replace(body, estimate=None, refused=0)
-                continue
-            self.bodies[body.id] = body
-            membership.reject(self.tracks, estimate.rejected)
-            if body.proved and self._worth_reporting(body, estimate):
-                self.bodies[body.id] = counted(body)
-                reported.append(self._report(body))
-        return tuple(reported)
-
-    def _begun_anew(
-        self, backend: ObjectBackend, estimates: list[ObjectEstimate], observations: list[ObjectObservations]
-    ) -> list[ObjectEstimate]:
-        """The estimates; bodies of which nothing was used, though their points agree here, start anew under their id.
-
-        They bring the velocity that they had: what was wrong is where the back end has their points.
-        """
-        refused = {e.id for e in estimates if not e.measured}
-        anew = [o for o in observations if o.id in refused and o.has_stereo.sum() >= _TO_START]
-        if not anew:
-            return estimates
-        ids = {o.id for o in anew}
-        backend.remove_objects(sorted(ids))
-        for id in ids:
-            self.bodies[id] = replace(self.bodies[id], estimate=None, refused=0)
-        begun = {e.id: e for e in backend.update_objects(anew) if e.id in ids}
-        return [begun.get(e.id, e) for e in estimates]
-
-    def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
-        """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
-        return body.refused < _REFUSALS and self.models.known(estimate.covariance, estimate.velocity_covariance)
-
-    def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
-        """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
-        c = self.config
-        short = estimate.stamp - body.measured_at <= c.report_unmeasured
-        seldom = body.reported_unmeasured + 1 <= c.unmeasured_share * body.reported
-        return estimate.measured or (short and seldom and body.existence > _LIKELY)
-
-    def _observations(self, body: Body, features: StereoFeatures) -> ObjectObservations:
-        tracks = self.tracks
-        assert tracks is not None
-        mine = np.flatnonzero((tracks.body == body.id) & tracks.seen & (tracks.misfit == 0))
-        mine = mine[np.argsort(tracks.ids[mine])]
-        rows = tracks.row[mine]
-        guess, sigma = body.T @ body.T_body_estimate, np.sqrt(body.velocity_covariance.diagonal())
-        return ObjectObservations(
-            body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], guess, body.velocity, sigma
-        )
-
-    def _report(self, body: Body) -> MovingObject:
-        tracks, estimate = self.tracks, body.estimate
-        assert tracks is not None and estimate is not None
-        mine = tracks.body == body.id
-        rows = tracks.row[mine & tracks.seen]
-        T = estimate.T_world_object
-        points = transform(inverse(body.T_body_estimate), tracks.local[mine & tracks.sure])
-        extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
-        return MovingObject(
-            body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
-            extent, body.moving, body.found_at, body.measured_at, body.existence,
-        )  # fmt: skip
+        assert self.tracks is not None
+        forgotten, self._forgotten = self._forgotten, []
+        return self._estimates.update(self.bodies, self.tracks, backend, features, forgotten)

@@ -253,7 +253,7 @@ class ObjectScore:
         """
         assert self._world is not None
         begun = np.array([at for at, _ in life.found])
-        values = [np.zeros(0)]
+        values: list[Array] = [np.zeros(0)]
         for at in np.unique(begun[rows]):
             mine = rows[begun[rows] == at] if np.isfinite(at) else rows
             first = life.found[mine[0]][1] if np.isfinite(at) else life.poses[0]
