@@ -299,14 +299,12 @@ def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
 def proved(body: Body, gain: Array) -> Body | None:
     """The body, known to have moved once its members say so; None where they say that it stands still and always did.
 
-    A young one may lose what it seemed to be, also where the back end finds that it does not move.
+    A young one may lose what it seemed to be.
 
     Args:
         body: the body.
         gain: by how much χ² it explains its members better than the still world (K,).
     """
-    if body.age < _PROBATION and not body.moving:
-        return None
     if body.proved and body.seen >= _PROBATION:
         return body
     typical = median(gain) if len(gain) else 0.0
