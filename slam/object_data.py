@@ -26,8 +26,10 @@ class ObjectObservations:
         points: ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked.
         uv_left: left pixels (M, 2), finite.
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
-        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement, it only
-            says where to linearise first. None where there is no guess.
+        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement: it says
+            where to linearise first, and where a new body's frame lies. None where there is no guess.
+        velocity: of a new body, [ω, v] (6,) in world axes [rad/s], [m/s], as far as it is known before; else None.
+        velocity_sigma: standard deviations of it (6,).
 
     Raises:
         MeasurementError: shapes differ, a point stands twice, or a left pixel is not finite.
@@ -38,6 +40,8 @@ class ObjectObservations:
     uv_left: Array
     uv_right: Array
     T_world_object: Array | None = None
+    velocity: Array | None = None
+    velocity_sigma: Array | None = None
 
     __repr__ = of_shapes
 
@@ -51,6 +55,8 @@ class ObjectObservations:
             raise MeasurementError(f"object {self.id}: a point stands twice")
         if not np.isfinite(self.uv_left).all():
             raise MeasurementError(f"object {self.id}: a left pixel is not finite")
+        if (self.velocity is None) != (self.velocity_sigma is None):
+            raise MeasurementError(f"object {self.id}: a velocity and its sigma belong together")
 
     @property
     def has_stereo(self) -> BoolArray:

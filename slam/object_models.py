@@ -10,6 +10,7 @@ import numpy as np
 from slam.bounds import require_positive
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array
+from slam.object_data import ObjectObservations
 
 #: For whoever reads a configuration from text with pydantic: a key that is not a field is an error.
 FORBID_UNKNOWN = {"extra": "forbid"}
@@ -65,6 +66,13 @@ class ObjectModels:
     def velocity_variance(self, dt: float) -> tuple[float, float]:
         """Variances of the impulses on the linear [m²/s²] and angular [rad²/s²] velocity over `dt` [s]."""
         return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
+
+    def first_velocity(self, o: ObjectObservations | None) -> tuple[Array, Array]:
+        """Mean and standard deviations (6,) of a new body's [ω, v]: as known before, at least as any body's is."""
+        sigmas = np.repeat([self.initial_angular_velocity_sigma, self.initial_velocity_sigma], 3)
+        if o is None or o.velocity is None or o.velocity_sigma is None:
+            return np.zeros(6), sigmas
+        return o.velocity, np.minimum(o.velocity_sigma, sigmas)
 
     def possible(self, velocity: Array, covariance: Array, before: Array, covariance_before: Array, dt: float) -> bool:
         """Whether a body can move so.

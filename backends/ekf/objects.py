@@ -158,7 +158,8 @@ class ObjectFilter:
     def _start(self, o: ObjectObservations, camera: CameraBelief) -> tuple[Body, Sight]:
         h = self._rig.triangulate(o.uv_left, o.uv_right)
         T, near = first_frame(camera.T_world_left, h)
-        body = found(o.id, T, self._models.objects, len(camera.columns))
+        T = T if o.T_world_object is None else o.T_world_object
+        body = found(o.id, T, *self._models.objects.first_velocity(o), len(camera.columns))
         body, _ = self._join(body, o, near, camera)
         return body, Sight(True, np.sort(body.ids))
 

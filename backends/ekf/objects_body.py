@@ -80,14 +80,16 @@ class Body:
     sights: IdArray
 
 
-def found(number: int, T: Array, models: ObjectModels, size: int) -> Body:
-    """A body at its first sight, without points yet. Its frame is put there: the pose has no error, by definition."""
+def found(number: int, T: Array, velocity: Array, sigmas: Array, size: int) -> Body:
+    """A body at its first sight, without points yet. Its frame is put there: the pose has no error, by definition.
+
+    Its [ω, v] (6,) has independent errors with standard deviations `sigmas` (6,).
+    """
     P = np.zeros((RIGID, RIGID))
-    sigmas = np.repeat([models.initial_angular_velocity_sigma, models.initial_velocity_sigma], 3)
     P[6:, 6:] = np.diag(sigmas**2)
     none = np.zeros(0, np.int64)
     return Body(
-        number, T, np.zeros(6), none, BodyPoints.at(T, np.zeros((0, 3))),
+        number, T, velocity, none, BodyPoints.at(T, np.zeros((0, 3))),
         P, np.zeros((RIGID, size)), np.zeros_like(P), none, none, none,
     )  # fmt: skip
 

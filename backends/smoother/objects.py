@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.smoother.objects_factors import FRAME, velocities
+from backends.smoother.objects_factors import FRAME, VelocityPrior, velocities
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
     CameraWindow,
@@ -27,6 +27,7 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
+from slam.object_models import ObjectModels
 from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
 
 _LAG = 4  # frames of a window at least
@@ -66,7 +67,7 @@ class ObjectSmoother:
         The path's last frame is the current one; `last_poses` gives the camera's poses in so many frames, and is called
         if need be.
         """
-        seen = {o.id: _Measured.of(o, self._stereo) for o in observations}
+        seen = {o.id: _Measured.of(o, self._stereo, self._models.objects) for o in observations}
         self._require_usable(observations, seen)
         if not (self._windows or seen):
             return []
@@ -101,7 +102,8 @@ class ObjectSmoother:
     def _start(self, seen: _Measured, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         frame, X = path.count - 1, path.poses[-1].copy()
         T, near = first_frame(X, seen.local)
-        window = opened(frame, float(path.stamps[-1]), T, X)
+        T = T if seen.guess is None else seen.guess
+        window = opened(frame, float(path.stamps[-1]), T, X, seen.first_velocity)
         cameras = _cameras(window.frames, path, camera)
         window, _ = self._join(window, cameras, seen, near)
         window = self._solver.solved(window, cameras)
@@ -125,7 +127,8 @@ class ObjectSmoother:
         """The body without its points, velocity and past, where it was last or where the guess has it."""
         T = window.T[-1] if seen is None or seen.guess is None else seen.guess
         spread = np.full(6, self._models.objects.initial_velocity_sigma**2)
-        window = opened(path.count - 1, float(path.stamps[-1]), T, path.poses[-1].copy(), np.diag(spread))
+        unknown = VelocityPrior(*self._models.objects.first_velocity(None))
+        window = opened(path.count - 1, float(path.stamps[-1]), T, path.poses[-1].copy(), unknown, np.diag(spread))
         return self._solver.solved(window, _cameras(window.frames, path, camera)), Sight()
 
     def _solved_step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
@@ -225,16 +228,13 @@ class ObjectSmoother:
 
     def _motion(self, window: Window) -> tuple[Array, Array]:
         """Velocity [ω, v] (6,) in the newest step, and its covariance (6, 6); of a first frame what is expected."""
-        models, P = self._models.objects, window.covariance
+        if len(window) == 1 and window.first_velocity is not None:
+            return window.first_velocity.mean.copy(), np.diag(window.first_velocity.sigmas**2)
         last = FRAME * (len(window) - 1)
-        velocity = np.zeros(6)
-        spread = np.diag(np.repeat([models.initial_angular_velocity_sigma**2, models.initial_velocity_sigma**2], 3))
-        if len(window) > 1:
-            (velocity,), (before,), (after,) = velocities(window.T[-2:], window.stamps[-2:])
-            mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
-            J = np.concatenate([before, after], axis=1)
-            spread = J @ P[np.ix_(mine, mine)] @ J.T
-        return velocity, spread
+        (velocity,), (before,), (after,) = velocities(window.T[-2:], window.stamps[-2:])
+        mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
+        J = np.concatenate([before, after], axis=1)
+        return velocity, J @ window.covariance[np.ix_(mine, mine)] @ J.T
 
 
 @dataclass(frozen=True)
@@ -246,17 +246,19 @@ class _Measured:
         z: (M, 3).
         local: where they triangulate to (M, 3), in left-camera coordinates; NaN without a depth.
         guess: of T_world_object, or None.
+        first_velocity: what is known of its velocity if it is new.
     """
 
     ids: IdArray
     z: Array
     local: Array
     guess: Array | None
+    first_velocity: VelocityPrior
 
     @classmethod
-    def of(cls, o: ObjectObservations, stereo: RectifiedStereo) -> _Measured:
+    def of(cls, o: ObjectObservations, stereo: RectifiedStereo, models: ObjectModels) -> _Measured:
         z = stereo.measure(Observations(o.points, o.uv_left, o.uv_right))
-        return cls(o.points, z, stereo.triangulate(z), o.T_world_object)
+        return cls(o.points, z, stereo.triangulate(z), o.T_world_object, VelocityPrior(*models.first_velocity(o)))
 
     @property
     def deep(self) -> BoolArray:

@@ -61,6 +61,19 @@ def add_measurements(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class VelocityPrior:
+    """What is known beforehand of a body's first [ω, v] in world axes [rad/s], [m/s].
+
+    Attributes:
+        mean: (6,).
+        sigmas: standard deviations (6,), of independent errors.
+    """
+
+    mean: Array
+    sigmas: Array
+
+
 def velocities(T: Array, stamps: Array) -> tuple[Array, Array, Array]:
     """Velocities [ω, v] (n − 1, 6) in world axes between successive poses (n, 4, 4) at `stamps` (n,).
 
@@ -76,15 +89,15 @@ def impulse_sigmas(models: ObjectModels, dt: float, scale: float) -> Array:
     return scale * np.sqrt(np.repeat([angular, linear], 3))
 
 
-def first_sigmas(models: ObjectModels, dt: float, scale: float) -> Array:
+def first_sigmas(prior: VelocityPrior, models: ObjectModels, dt: float, scale: float) -> Array:
     """Standard deviations (6,) of [ω, v] in the first step: the prior of the velocity, and its first impulse."""
-    prior = np.repeat([models.initial_angular_velocity_sigma, models.initial_velocity_sigma], 3)
-    return np.hypot(prior, impulse_sigmas(models, dt, scale))
+    return np.hypot(prior.sigmas, impulse_sigmas(models, dt, scale))
 
 
 def add_motion(
-    system: System, models: ObjectModels, T: Array, stamps: Array, scales: Array, fresh: bool, steps: range
-) -> None:
+    system: System, models: ObjectModels, T: Array, stamps: Array, scales: Array, first_velocity: VelocityPrior | None,
+    steps: range,
+) -> None:  # fmt: skip
     """Constant velocity but for an impulse before each step (paper B, section 2).
 
     Args:
@@ -93,15 +106,17 @@ def add_motion(
         T: poses (n, 4, 4).
         stamps: their times (n,) [s].
         scales: factors (n,) on the impulse before the step that leads to each pose.
-        fresh: whether the first pose is the body's first; then the first velocity has its prior.
+        first_velocity: prior of the first velocity; None where the first pose is not the body's first.
         steps: which of the n − 1 steps.
     """
     if len(T) < 2 or not len(steps):
         return
     sigmas = scales[1:, None] * impulse_sigmas(models, 1.0, 1.0) * np.sqrt(np.diff(stamps))[:, None]  # a random walk
     first = steps.start
-    if fresh:
-        sigmas[0] = first_sigmas(models, float(stamps[1] - stamps[0]), float(scales[1]))
+    mean: Array = np.zeros(6)
+    if first_velocity is not None:
+        dt, mean = float(stamps[1] - stamps[0]), first_velocity.mean
+        sigmas[0] = first_sigmas(first_velocity, models, dt, float(scales[1]))
     else:
         first = max(1, first)
-    kernels.add_motion(system.information, system.vector, *velocities(T, stamps), sigmas, first, steps.stop)
+    kernels.add_motion(system.information, system.vector, *velocities(T, stamps), mean, sigmas, first, steps.stop)

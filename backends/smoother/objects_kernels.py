@@ -160,10 +160,10 @@ def velocities(T, stamps):
 
 
 @kernel
-def add_motion(H, g, velocity, before, after, sigmas, first, last):
+def add_motion(H, g, velocity, before, after, mean, sigmas, first, last):
     """Add the steps from `first` up to `last` to the information H and the vector g: the velocity is that before.
 
-    Before step 0 it is zero.
+    Before step 0 it is the mean.
 
     Args:
         H: (U, U), changed in place.
@@ -171,6 +171,7 @@ def add_motion(H, g, velocity, before, after, sigmas, first, last):
         velocity: of each step (n − 1, 6).
         before: derivatives (n − 1, 6, 6) by the earlier pose.
         after: the same by the later one.
+        mean: of the first velocity (6,).
         sigmas: standard deviations (n − 1, 6) of the change of velocity.
         first: step.
         last: the step after the last.
@@ -178,11 +179,11 @@ def add_motion(H, g, velocity, before, after, sigmas, first, last):
     J = np.empty(18)
     for m in range(first, last):
         for k in range(6):
-            weight, change = 1 / sigmas[m, k], velocity[m, k]
+            weight, change = 1 / sigmas[m, k], velocity[m, k] - mean[k]
             for j in range(6):
                 J[6 + j], J[12 + j] = before[m, k, j], after[m, k, j]
             if m > 0:
-                change -= velocity[m - 1, k]
+                change = velocity[m, k] - velocity[m - 1, k]
                 for j in range(6):
                     J[j] = -before[m - 1, k, j]
                     J[6 + j] -= after[m - 1, k, j]

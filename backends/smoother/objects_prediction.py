@@ -44,9 +44,10 @@ def predicted(window: Window, camera: CameraWindow, stamp: float, models: Object
     """The body at `stamp` at the velocity of its last step; the last of the camera's poses is that of the new frame."""
     last, dt = FRAME * (len(window) - 1), stamp - window.stamps[-1]
     T, size = window.T[-1], len(window.covariance)
-    velocity, by_unknowns = np.zeros(6), np.zeros((6, size))
-    sigmas = first_sigmas(models, dt, 1.0)
-    if len(window) > 1:
+    by_unknowns = np.zeros((6, size))
+    if window.first_velocity is not None and len(window) == 1:
+        velocity, sigmas = window.first_velocity.mean, first_sigmas(window.first_velocity, models, dt, 1.0)
+    else:
         (velocity,), (before,), (after,) = velocities(window.T[-2:], window.stamps[-2:])
         by_unknowns[:, last - FRAME : last - FRAME + 6], by_unknowns[:, last : last + 6] = before, after
         sigmas = impulse_sigmas(models, dt, 1.0)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.objects_factors import FRAME, System, add_measurements, add_motion
+from backends.smoother.objects_factors import FRAME, System, VelocityPrior, add_measurements, add_motion
 from backends.smoother.pose_kernels import moved
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray
@@ -76,7 +76,8 @@ class Window:
         failures: how often running each point's observation was rejected (p,).
         unseen: number of frames since each point was last observed (p,).
         sights: in how many frames each point was used (p,).
-        fresh: whether the first frame is that of the first sight.
+        first_velocity: what was known beforehand of the velocity in the frame of the first sight; None once that has
+            left the window.
         prior: of what has left.
         covariance: of all unknowns (12 n + 3 p, 12 n + 3 p) after the last solution, zero for those new since.
     """
@@ -91,7 +92,7 @@ class Window:
     failures: IdArray
     unseen: IdArray
     sights: IdArray
-    fresh: bool
+    first_velocity: VelocityPrior | None
     prior: Prior
     covariance: Array
 
@@ -109,7 +110,9 @@ class Window:
         return np.asarray(self.covariance[rows[:, :, None], rows[:, None, :]])
 
 
-def opened(frame: int, stamp: float, T: Array, X: Array, covariance: Array = _EXACT) -> Window:
+def opened(
+    frame: int, stamp: float, T: Array, X: Array, first_velocity: VelocityPrior, covariance: Array = _EXACT
+) -> Window:  # fmt: skip
     """A window with one frame and no points yet.
 
     At its first sight the body's frame is put there: its pose has no error, by definition.
@@ -120,7 +123,7 @@ def opened(frame: int, stamp: float, T: Array, X: Array, covariance: Array = _EX
     points = np.zeros((0, 3))
     return Window(
         np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points,
-        none, none, none, True, Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
+        none, none, none, first_velocity, Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
     )  # fmt: skip
 
 
@@ -277,7 +280,7 @@ class Solver:
             T=window.T[count:],
             scales=window.scales[count:],
             z=window.z[count:],
-            fresh=False,
+            first_velocity=None,
             prior=prior,
             covariance=window.covariance[len(gone) :, len(gone) :],
         )
@@ -291,7 +294,7 @@ class Solver:
         system = _prior_at(window, X)
         Y = inverse(X[:measured]) @ window.T[:measured]
         add_measurements(system, self._stereo, self._sigma, window.z[:measured], Y, window.points, window.first_point)
-        add_motion(system, self._models, window.T, window.stamps, window.scales, window.fresh, steps)
+        add_motion(system, self._models, window.T, window.stamps, window.scales, window.first_velocity, steps)
         return system
 
 

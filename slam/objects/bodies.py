@@ -31,6 +31,7 @@ class Body:
         T: pose T_world_object (4, 4) at the present frame.
         velocity: [ω, v] (6,) in world axes.
         covariance: of the pose (6, 6), body axes.
+        velocity_covariance: of the velocity (6, 6).
         history: poses at the window's slots (W, 4, 4).
         known: at which slots there is a measured one (W,).
         T_before: pose at the previous frame.
@@ -72,6 +73,7 @@ class Body:
     size: float
     reach: float
     seen_at: float
+    velocity_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     seen: int = 1
     missed: int = 0
     measured: bool = True
@@ -91,6 +93,11 @@ class Body:
         """Diagonal of its extent, but no less than its least size [m]."""
         return max(math.dist(self.upper, self.lower), self.size)
 
+    @property
+    def middle(self) -> Array:
+        """Middle of its extent (3,) in world coordinates."""
+        return np.asarray(self.T[:3, :3] @ (0.5 * (self.lower + self.upper)) + self.T[:3, 3])
+
     def placed(self, T: Array, slot: int, measured: bool, **changes: Any) -> Body:
         """The body with its pose at the present frame, whose slot is `slot`, and other changes."""
         history, known = self.history.copy(), self.known.copy()
@@ -98,7 +105,9 @@ class Body:
         return replace(self, T=T, history=history, known=known, measured=measured, **changes)
 
 
-def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float) -> Body:
+def new_body(
+    id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float, uncertainty: Array | None = None
+) -> Body:  # fmt: skip
     """A body found with a twist at its centre; its poses over the window follow from an even motion.
 
     Args:
@@ -108,6 +117,7 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
         times: of the window's slots less the present (W,) [s].
         stamp: the present [s].
         size: what it measures across at least [m].
+        uncertainty: covariance of the twist (6, 6); None where it is known.
     """
     history = np.tile(np.eye(4), (len(times), 1, 1))
     history[:, :3, :3] = so3_exp(times[:, None] * twist[:3])
@@ -117,7 +127,7 @@ def new_body(id: int, centre: Array, twist: Array, times: Array, stamp: float, s
     none = np.zeros(3)
     return Body(
         id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, stamp, T, T, np.eye(4), none, none,
-        size, np.inf, stamp,
+        size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
 
@@ -130,8 +140,13 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     T[:3, :3] = so3_exp(dt * body.velocity[:3]) @ T[:3, :3]
     T[:3, 3] += dt * body.velocity[3:]
     linear, angular = models.velocity_variance(dt)
-    covariance = body.covariance + dt**2 * np.diag([angular] * 3 + [linear] * 3)
-    return body.placed(T, slot, False, T_before=body.T, covariance=covariance, missed=body.missed + 1, age=body.age + 1)
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T[:3, :3].T
+    velocity = body.velocity_covariance + np.diag([angular] * 3 + [linear] * 3)
+    return body.placed(
+        T, slot, False, T_before=body.T, covariance=body.covariance + dt**2 * R @ velocity @ R.T,
+        velocity_covariance=velocity, missed=body.missed + 1, age=body.age + 1,
+    )  # fmt: skip
 
 
 def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:
@@ -159,6 +174,7 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
         T=T,
         T_body_estimate=T_body_estimate,
         velocity=at_origin if settled else body.velocity,
+        velocity_covariance=estimate.velocity_covariance if settled else body.velocity_covariance,
         covariance=change @ estimate.covariance @ change.T,
         moving=not settled or (certain and speed > min_speed),
         estimate=estimate,
@@ -179,10 +195,17 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A body found anew where it was known already in part: with its id and what has been learnt of its existence."""
+    """A body found anew where it was known already in part: with its id and what has been learnt of its existence.
+
+    The back end's frame for it goes on as predicted, but for a shift from what was seen of it to what is now.
+    """
+    shift = np.eye(4)
+    shift[:3, 3] = body.middle - known.middle
+    T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
-        body, id=known.id, proved=known.proved, existence=known.existence, age=known.age, reported=known.reported,
-        reported_unmeasured=known.reported_unmeasured, measured_at=known.measured_at,
+        body, id=known.id, T_body_estimate=T_body_estimate, proved=known.proved, existence=known.existence,
+        age=known.age, reported=known.reported, reported_unmeasured=known.reported_unmeasured,
+        measured_at=known.measured_at,
     )  # fmt: skip
 
 

@@ -24,9 +24,11 @@ from slam.objects.tracks import MOVES, ConstantVelocity
 
 _NEAR = 7.8  # χ²(3) at 95 %: tracks inside the region
 _AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
+_BEGIN = 2  # tracks that begin a region
 _SUPPORT = 3  # tracks of a frame that are a region's support
 _FRAMES = 4  # with support
 _TRACKS = 4  # different ones that have supported it
+_EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may leave, as of members of a body
 _SHARE = 0.6  # of the tracks inside that must agree with it
 _PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
@@ -121,6 +123,12 @@ class Candidate:
     members: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     radius: float = 0.0
 
+    def twist(self, turn: float) -> tuple[Array, Array]:
+        """Its twist [ω, v] (6,), and the covariance (6, 6) of it; `turn` [rad/s] is the deviation of ω."""
+        P = turn**2 * np.eye(6)
+        P[3:, 3:] = self.covariance[3:, 3:]
+        return np.concatenate([np.zeros(3), self.state[3:]]), P
+
     def is_body(self, min_speed: float) -> bool:
         """Whether the region has moved for certain, and is seen well enough in this frame to found a body."""
         moved = self.state[:3] - self.start
@@ -174,8 +182,13 @@ def _near(candidate: Candidate, tracks: MovingTracks, places: Array) -> BoolArra
 
 def _agrees(candidate: Candidate, tracks: MovingTracks) -> BoolArray:
     """Which tracks move as the region does (N,)."""
+    return np.asarray(_unexplained(candidate, tracks) <= _AGREES)
+
+
+def _unexplained(candidate: Candidate, tracks: MovingTracks) -> Array:
+    """χ²(3) of the tracks' velocities, less the region's (N,)."""
     gap = tracks.motion.velocity - candidate.state[3:]
-    return _squares(gap, tracks.motion.velocity_covariance + candidate.covariance[3:, 3:]) <= _AGREES
+    return _squares(gap, tracks.motion.velocity_covariance + candidate.covariance[3:, 3:])
 
 
 def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> Candidate:
@@ -190,13 +203,15 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
     vector[3:] += (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
     P = np.linalg.inv(information)
     after = replace(candidate, state=P @ vector, covariance=P)
-    inside, agrees = _near(after, tracks, tracks.spread), _agrees(after, tracks)
+    inside, left = _near(after, tracks, tracks.spread), _unexplained(after, tracks)
+    agrees = left <= _AGREES
+    contradicts = ~agrees & (left > _EXPLAINED * m.test)
     return replace(
         after,
         supporters=candidate.supporters | frozenset(tracks.ids[rows].tolist()),
         frames=candidate.frames + (len(rows) >= _SUPPORT),
         agreeing=candidate.agreeing + int((inside & agrees & tracks.moves).sum()),
-        contradicting=candidate.contradicting + int((inside & ~agrees).sum()),
+        contradicting=candidate.contradicting + int((inside & contradicts).sum()),
         unseen=0,
         members=tracks.rows[rows],
         radius=float(tracks.radius[rows].mean()),
@@ -206,7 +221,7 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
 def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     """Regions of free tracks that lie together and move alike, the largest first."""
     rows, m = np.flatnonzero(free), tracks.motion
-    if len(rows) < _SUPPORT:
+    if len(rows) < _BEGIN:
         return []
     places = tracks.places[rows]
     gaps = m.position[rows][:, None] - m.position[rows]
@@ -217,7 +232,7 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     left, found = np.ones(len(rows), bool), []
     for i in np.argsort(-near.sum(axis=1), kind="stable"):
         group = near[i] & left
-        if left[i] and group.sum() >= _SUPPORT:
+        if left[i] and group.sum() >= _BEGIN:
             left &= ~group
             found.append(_begun(tracks, rows[group]))
     return found
@@ -231,7 +246,7 @@ def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
     velocity = P[3:, 3:] @ (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
     return Candidate(
         np.concatenate([place, velocity]), P, place, P[:3, :3].copy(), frozenset(tracks.ids[rows].tolist()),
-        members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
+        frames=int(len(rows) >= _SUPPORT), members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
     )  # fmt: skip
 
 

@@ -16,23 +16,21 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
-from slam.object_data import MotionLabels, MovingObject, ObjectEstimate, ObjectObservations
+from slam.object_data import MotionLabels, MovingObject
 from slam.objects import membership
 from slam.objects.bodies import (
     Body,
     advanced,
     continued,
-    counted,
-    from_estimate,
     from_fit,
     new_body,
-    outermost,
     with_evidence,
     with_extent,
 )
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import displacements
+from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
@@ -45,8 +43,6 @@ _MERGES = 24  # frames in which a body turns out to be a part of another at once
 _SETTLED = 30  # frames from which a body is remembered in any case
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 _LAG = 4  # frames between the older and the recent measurements, about
-_REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
-_LIKELY = 0.5  # probability from which a body rather exists than not
 
 
 class MovingObjectDetector:
@@ -70,7 +66,7 @@ class MovingObjectDetector:
         self._next_track = 0
         self._next_body = 1
         self._forgotten: list[int] = []
-        self._estimated: set[int] = set()  # bodies that the back end knows
+        self._estimates = BodyEstimates(config, self.models)
         self._candidates: list[Candidate] = []
         self._camera: Array = np.zeros(3)
         self.suspects = np.zeros(0, np.int64)
@@ -79,7 +75,8 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._estimated, self._candidates = [], set(), []
+        self._forgotten, self._candidates = [], []
+        self._estimates = BodyEstimates(self.config, self.models)
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
@@ -92,7 +89,10 @@ class MovingObjectDetector:
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
-        follow(tracks, self.bodies, T_world_left, features, local, self._dt(times), self.rig, self.sigma, self.config)
+        follow(
+            tracks, self.bodies, self._candidates, T_world_left, features, local, self._dt(times), self.rig, self.sigma,
+            self.config,
+        )  # fmt: skip
         self._measure(tracks, features, local, T_world_left)
         tracks.recognised_as(landmark)
         self._fit(tracks, times)
@@ -209,18 +209,24 @@ class MovingObjectDetector:
             return
         motion = even_motion(tracks, members, times, c.max_speed)
         centre = motion.position.mean(axis=0)
-        twist, _ = fit_twist(motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre)
-        self._found(members, centre, twist, times)
+        twist, uncertainty = fit_twist(
+            motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre
+        )
+        linear, angular = self.models.velocity_variance(-float(times.min()) / 3.0)  # it is the mean over the window
+        uncertainty = uncertainty + np.diag([angular] * 3 + [linear] * 3)
+        self._found(members, centre, twist, uncertainty, times)
 
-    def _found(self, members: NDArray[np.intp], centre: Array, twist: Array, times: Array) -> None:
+    def _found(
+        self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array
+    ) -> None:  # fmt: skip
         """Make a body of tracks with a common twist, or let them join the one that they belong to."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size)
+        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
         body = membership.fitted(body, tracks, members, self.slot)
         known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
         if known is None:
-            body = self._grown(body, members)
+            body = self._again(self._grown(body, members))
             self.bodies[body.id] = body
             self._next_body = max(self._next_body, body.id + 1)
         membership.enter(known or body, tracks, members, sure=True)
@@ -234,6 +240,18 @@ class MovingObjectDetector:
             if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
                 return body
         return None
+
+    def _again(self, body: Body) -> Body:
+        """A new body, or in its place the one out of view that it is: that keeps its id, but not its points."""
+        tracks, known = self.tracks, None
+        assert tracks is not None
+        if body.id not in self.bodies:
+            known = membership.returned(self.bodies, body)
+        if known is None:
+            return body
+        tracks.give_up(np.flatnonzero(tracks.body == known.id))
+        self._forgotten.append(known.id)
+        return continued(body, known)
 
     def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
         """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
@@ -264,7 +282,8 @@ class MovingObjectDetector:
         for candidate in followed:
             if candidate.is_body(c.min_speed):
                 centre = tracks.position[candidate.members].mean(axis=0)
-                self._found(candidate.members, centre, np.concatenate([np.zeros(3), candidate.state[3:]]), times)
+                twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
+                self._found(candidate.members, centre, twist, uncertainty, times)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
@@ -355,64 +374,6 @@ class MovingObjectDetector:
                     self.bodies[body.id] = from_fit(body, body.T, dt, self.slot)
             self._forgotten.clear()
             return ()
-        known = {body.id for body in self.bodies.values() if body.estimate is not None}
-        gone = [id for id in self._forgotten if id in self._estimated]
-        if gone:
-            backend.remove_objects(gone)
-        self._forgotten.clear()
-        told = [body for body in self.bodies.values() if body.measured]
-        observations = [self._observations(body, features) for body in told]
-        fit_to_start = [o for o in observations if o.id in known or o.has_stereo.sum() >= 3]
-        estimates = backend.update_objects(fit_to_start)
-        strangers = [e.id for e in estimates if e.id not in self.bodies]  # of before `restart`
-        if strangers:
-            backend.remove_objects(strangers)
-            estimates = [e for e in estimates if e.id in self.bodies]
-        self._estimated = {e.id for e in estimates}
-        reported = []
-        for estimate in estimates:
-            body = self.bodies[estimate.id]
-            body = from_estimate(body, estimate, self.config.min_speed)
-            if not self._believed(body, estimate):
-                self._forgotten.append(body.id)
-                self.bodies[body.id] = replace(body, estimate=None, refused=0)
-                continue
-            self.bodies[body.id] = body
-            membership.reject(self.tracks, estimate.rejected)
-            if body.proved and self._worth_reporting(body, estimate):
-                self.bodies[body.id] = counted(body)
-                reported.append(self._report(body))
-        return tuple(reported)
-
-    def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
-        """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
-        return body.refused < _REFUSALS and self.models.known(estimate.covariance, estimate.velocity_covariance)
-
-    def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
-        """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
-        c = self.config
-        short = estimate.stamp - body.measured_at <= c.report_unmeasured
-        seldom = body.reported_unmeasured + 1 <= c.unmeasured_share * body.reported
-        return estimate.measured or (short and seldom and body.existence > _LIKELY)
-
-    def _observations(self, body: Body, features: StereoFeatures) -> ObjectObservations:
-        tracks = self.tracks
-        assert tracks is not None
-        mine = np.flatnonzero((tracks.body == body.id) & tracks.seen & (tracks.misfit == 0))
-        mine = mine[np.argsort(tracks.ids[mine])]
-        rows = tracks.row[mine]
-        guess = body.T @ body.T_body_estimate
-        return ObjectObservations(body.id, tracks.ids[mine], features.uv_left[rows], features.uv_right[rows], guess)
-
-    def _report(self, body: Body) -> MovingObject:
-        tracks, estimate = self.tracks, body.estimate
-        assert tracks is not None and estimate is not None
-        mine = tracks.body == body.id
-        rows = tracks.row[mine & tracks.seen]
-        T = estimate.T_world_object
-        points = transform(inverse(body.T_body_estimate), tracks.local[mine & tracks.sure])
-        extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
-        return MovingObject(
-            body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
-            extent, body.moving, body.found_at, body.measured_at, body.existence,
-        )  # fmt: skip
+        assert self.tracks is not None
+        forgotten, self._forgotten = self._forgotten, []
+        return self._estimates.update(self.bodies, self.tracks, backend, features, forgotten)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.bodies import Body
+from slam.objects.candidates import Candidate, region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far, match_near
 from slam.objects.pixel_kernels import pixel_deviations
@@ -26,6 +27,7 @@ _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to 
 def follow(
     tracks: Tracks,
     bodies: Mapping[int, Body],
+    candidates: Sequence[Candidate],
     T_world_left: Array,
     features: StereoFeatures,
     measured: Array,
@@ -40,7 +42,8 @@ def follow(
     afterwards: it is the body's pose that is wrong more often than the match.
 
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
-    is left, and was not known for long enough to have a velocity, is looked for as far as `max_speed` allows.
+    is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes
+    it on which it lies, and then as far as `max_speed` allows.
     `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     tracks.row[:] = -1
@@ -52,6 +55,7 @@ def follow(
         spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
         _near(tracks, alive, features, z, spread, config)
         _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+        _carried_along(tracks, bodies, candidates, T_world_left, features, dt, config, rig, sigma)
         _far(tracks, T_world_left, features, measured, dt, config, rig, sigma)
     seen = tracks.seen
     tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
@@ -95,14 +99,65 @@ def _check_right(
     tracks.row[rows[away > _RIGHT_SIGMAS * spread[seen] + allowance]] = -1  # NaN compares false
 
 
+def _carried_along(
+    tracks: Tracks, bodies: Mapping[int, Body], candidates: Sequence[Candidate], T_world_left: Array,
+    features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
+) -> None:  # fmt: skip
+    """Look for young tracks on what moves where it takes them."""
+    young = _young(tracks, config.min_frames - 1)
+    places = tracks.position[young]
+    for body in bodies.values():
+        size = config.margin * body.across
+        local = transform(inverse(body.T_before), places)
+        on = ((local > body.lower - size) & (local < body.upper + size)).all(axis=1)
+        R = body.T[:3, :3]
+        ahead = transform(body.T, local[on])
+        _look_at(tracks, young[on], ahead, R @ body.covariance[3:, 3:] @ R.T, T_world_left, features, dt, config, rig,
+                 sigma)  # fmt: skip
+    for candidate in candidates:
+        radius = region_radius(np.linalg.norm(candidate.state[:3] - T_world_left[:3, 3]), config.size)
+        on = np.linalg.norm(places - candidate.state[:3], axis=1) < radius
+        ahead = places[on] + dt * candidate.state[3:]
+        _look_at(tracks, young[on], ahead, dt**2 * candidate.covariance[3:, 3:], T_world_left, features, dt, config,
+                 rig, sigma)  # fmt: skip
+
+
+def _look_at(
+    tracks: Tracks, rows: NDArray[np.intp], ahead: Array, covariance: Array, T_world_left: Array,
+    features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
+) -> None:  # fmt: skip
+    """Look for unseen tracks (M,) about places (M, 3) that have a covariance (3, 3), in features not taken yet."""
+    unseen = tracks.row[rows] < 0
+    rows, ahead = rows[unseen], ahead[unseen]
+    if not len(rows):
+        return
+    taken = np.zeros(len(features), bool)
+    taken[tracks.row[tracks.seen]] = True
+    local = (ahead - T_world_left[:3, 3]) @ T_world_left[:3, :3]
+    z, J = rig.project_stereo(local)
+    spread = pixel_deviations(J, T_world_left, tracks.covariance[rows] + covariance, np.arange(len(rows)), sigma)
+    size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
+    radius = np.fmin(np.fmax(size, config.search_radius), config.search_limit)
+    mine, columns = match_near(
+        z[:, :2], radius, tracks.descriptors[rows], tracks.laplacian[rows], features, config.d_match, config.ratio
+    )
+    free = ~taken[columns]
+    tracks.row[rows[mine[free]]] = columns[free]
+    _check_right(tracks, rows, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+
+
+def _young(tracks: Tracks, most: int) -> NDArray[np.intp]:
+    """Free tracks that were seen in the last frame, not in this, with no more measurements than `most`."""
+    lost = np.flatnonzero((tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0))
+    return np.asarray(lost[tracks.count(lost) <= most])
+
+
 def _far(
     tracks: Tracks, T_world_left: Array, features: StereoFeatures, measured: Array, dt: float, config: ObjectsConfig,
     rig: StereoRig, sigma: float,
 ) -> None:  # fmt: skip
     """Look for tracks without a velocity yet anywhere that `max_speed` allows."""
-    lost = (tracks.ids >= 0) & (tracks.row < 0) & (tracks.body < 0) & (tracks.missed == 0)
-    left = np.flatnonzero(lost)
-    left = left[tracks.count(left) <= config.min_frames]
+    left = _young(tracks, config.min_frames)
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen]] = True
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))

@@ -46,6 +46,8 @@ _BETTER_INSIDE = -4.0  # where it lies inside
 _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
+_RETURNED = 16.8  # χ²(6) at 99 %: place and velocity of a body that is seen again
+_WEAK = 1e-8  # variance that is added to a known pose's [m²]
 _YOUNG = 12  # frames in which a body's motion is not well enough known to tell it from another
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
 
@@ -237,10 +239,49 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         fixed = float(_squares(points, A).sum())
         still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
         by_chance = float(chi_square_limits(np.array([6 * int(known.any(axis=0).sum())]), 0.99)[0])
-        apart = body.seen > _YOUNG and fixed - alone > _APART * by_chance and fixed > 2 * _APART * alone
+        certain = _squares_with_pose_error(points, A, body)
+        apart = body.seen > _YOUNG and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
         if fixed < 2 * _EXPLAINED * still and not apart:
             return body
     return None
+
+
+def _squares_with_pose_error(points: Array, A: Array, body: Body) -> float:
+    """χ² of fixed points, in body coordinates by slot (N, W, 3) with information (N, W, 3, 3), if the pose may be off.
+
+    In every frame the points share the displacement by the error of the body's pose, of known covariance.
+    """
+    y = _means(points, A)
+    shared = np.linalg.inv(_spread_of_place(body, y.mean(axis=0)))
+    pull = times_vectors(A, points - y[:, None]).sum(axis=0)
+    explained = (pull * np.linalg.solve(A.sum(axis=0) + shared, pull[..., None])[..., 0]).sum()
+    return float(_squares(points, A).sum() - explained)
+
+
+def _spread_of_place(body: Body, y: Array) -> Array:
+    """Covariance (3, 3), in body axes, of where the body's point y (3,) is, given that of its pose."""
+    J = -points_by_pose(y[None])[0]
+    return np.asarray(J @ body.covariance @ J.T + _WEAK * np.eye(3))
+
+
+def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
+    """The body out of view that a new one is by its place and its velocity, perhaps seen from another side; else None.
+
+    Where the middle of what is seen lies in the body is known to within the body's half.
+    """
+    best, least = None, _RETURNED
+    for body in bodies.values():
+        if body.measured or not body.proved:
+            continue
+        y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
+        place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
+        gap = new.middle - body.middle
+        change = new.velocity[3:] - body.velocity[3:]
+        velocity = (new.velocity_covariance + body.velocity_covariance)[3:, 3:]
+        off = float(gap @ np.linalg.solve(place, gap) + change @ np.linalg.solve(velocity, change))
+        if off < least:
+            best, least = body, off
+    return best
 
 
 def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:

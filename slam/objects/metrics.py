@@ -107,8 +107,7 @@ class _Life:
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
-    found_at: float = float("nan")
-    T_found: Array = field(default_factory=lambda: np.eye(4))
+    found: list[tuple[float, Array]] = field(default_factory=list)  # when its estimate began, and its pose then
     votes: dict[int, int] = field(default_factory=dict)
 
     @property
@@ -170,10 +169,7 @@ class ObjectScore:
             for label in labels[thing.features]:
                 if label >= 0:
                     life.votes[int(label)] = life.votes.get(int(label), 0) + 1
-            life.found_at, life.T_found = (
-                thing.found_at,
-                inverse(thing.motion_since_found) @ thing.estimate.T_world_object,
-            )
+            life.found.append((thing.found_at, inverse(thing.motion_since_found) @ thing.estimate.T_world_object))
             life.frames.append(frame)
             life.poses.append(thing.estimate.T_world_object)
             life.covariances.append(thing.estimate.covariance)
@@ -251,17 +247,25 @@ class ObjectScore:
         return frames, np.array(life.poses)[life.measured], self._world @ self.bodies[body - 1][frames]
 
     def _nees(self, body: int, life: _Life, rows: NDArray[np.intp]) -> Array:
-        """NEES of an object's motion since it was found, which may have been before it was first reported."""
+        """NEES of an object's motion since its estimate began, which may have been before it was first reported.
+
+        Where an estimate began anew, it is that of the motion since.
+        """
         assert self._world is not None
-        found = (
-            int(np.searchsorted(self.stamps, life.found_at - 1e-6)) if np.isfinite(life.found_at) else life.frames[0]
-        )
-        first = life.T_found if np.isfinite(life.found_at) else life.poses[0]
-        frames = np.array([found, *np.array(life.frames)[rows]])
-        own = np.stack([first, *np.array(life.poses)[rows]])
-        covariances = np.concatenate([np.zeros((1, 6, 6)), np.array(life.covariances)[rows]])
-        later = np.concatenate([[True], frames[1:] > found])
-        return object_nees(own[later], covariances[later], (self._world @ self.bodies[body - 1][frames])[later])
+        begun = np.array([at for at, _ in life.found])
+        values: list[Array] = [np.zeros(0)]
+        for at in np.unique(begun[rows]):
+            mine = rows[begun[rows] == at] if np.isfinite(at) else rows
+            first = life.found[mine[0]][1] if np.isfinite(at) else life.poses[0]
+            found = int(np.searchsorted(self.stamps, at - 1e-6)) if np.isfinite(at) else life.frames[0]
+            frames = np.array([found, *np.array(life.frames)[mine]])
+            own = np.stack([first, *np.array(life.poses)[mine]])
+            covariances = np.concatenate([np.zeros((1, 6, 6)), np.array(life.covariances)[mine]])
+            later = np.concatenate([[True], frames[1:] > found])
+            true = self._world @ self.bodies[body - 1][frames]
+            if later[1:].any():
+                values.append(object_nees(own[later], covariances[later], true[later]))
+        return np.concatenate(values)
 
 
 def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

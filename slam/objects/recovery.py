@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.tracks import Tracks
+from slam.objects.tracks import Tracks, times_vectors
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # poses tried for a body that is found again
-_LEAST = 3  # points that fix a pose
+_LEAST = 4  # points that fix a pose: three agree with it whatever they are
 _LEAST_ANEW = 4  # points that must agree where a body is found again
-_LEAST_SHIFTED = 2  # points that must agree where only the place is looked for
+_LEAST_PREDICTED = 2  # points that must agree with the predicted motion
 _FITS = 11.3  # χ²(3) at 99 %
 _WEAK = 1e-6  # information on a member's point that has none yet [1/m²]
 _DEPTHS = 0.2  # share of the depth by which stereo may be off
@@ -38,15 +38,15 @@ def locate(
     members = np.flatnonzero(tracks.body == body.id)
     mine = members[tracks.seen[members]]
     rows = tracks.row[mine]
-    found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
+    found = _predicted(body, tracks, mine, rows, measured, T_world_left, rig, sigma)
+    if found is None:
+        found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
     if found is None or 2 * found[1].sum() < len(mine):
         wide, wide_rows = _by_looks(body, tracks, members, features, measured, T_world_left, config)
         again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
         if again is not None and (found is None or again[1].sum() > found[1].sum()):
             found, mine, rows = again, wide, wide_rows
     tracks.row[members] = -1
-    if found is None:
-        found = _shifted(body, tracks, mine, rows, measured, T_world_left, rig, sigma)
     if found is None:
         return None
     T_body_left, agrees = found
@@ -75,39 +75,44 @@ def _fit(
     return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
 
 
-def _shifted(
+def _predicted(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], measured: Array, T_world_left: Array,
     rig: StereoRig, sigma: float,
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
-    """The same with the orientation that is predicted, for bodies of which too few points are seen to turn them.
+    """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
-    At least two points must agree on a shift.
+    A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
+    the other. At least two points must agree.
     """
     local = measured[rows]
-    deep = np.isfinite(local).all(axis=1)
-    if deep.sum() < _LEAST_SHIFTED:
+    deep = np.flatnonzero(np.isfinite(local).all(axis=1))
+    if len(deep) < _LEAST_PREDICTED:
         return None
-    R, camera = body.T[:3, :3], T_world_left[:3, :3]
-    gaps = transform(T_world_left, local[deep]) - transform(body.T, tracks.local[mine[deep]])
-    noise = camera @ rig.triangulation_covariance(local[deep], sigma) @ camera.T
-    noise += R @ np.linalg.inv(tracks.local_information[mine[deep]] + _WEAK * np.eye(3)) @ R.T
-    information = np.linalg.inv(noise)
-    agrees = np.ones(len(gaps), bool)
-    for _ in range(len(gaps)):
-        A = information[agrees]
-        shift = np.linalg.solve(A.sum(axis=0), (A @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
-        off = ((gaps - shift)[:, None] @ information @ (gaps - shift)[:, :, None])[:, 0, 0]
-        worst = int(np.argmax(np.where(agrees, off, -1.0)))
+    y, R = tracks.local[mine[deep]], body.T[:3, :3]
+    axes = R.T @ T_world_left[:3, :3]
+    gaps = transform(inverse(body.T) @ T_world_left, local[deep]) - y
+    noise = axes @ rig.triangulation_covariance(local[deep], sigma) @ axes.T
+    noise += np.linalg.inv(tracks.local_information[mine[deep]] + _WEAK * np.eye(3))
+    information, J = np.linalg.inv(noise), -points_by_pose(y)
+    spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
+    agrees = _squares(gaps, np.linalg.inv(spread)) < _FITS
+    known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
+    while agrees.sum() >= _LEAST_PREDICTED:
+        normal = known + (JA[agrees] @ J[agrees]).sum(axis=0)
+        change = np.linalg.solve(normal, (JA[agrees] @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
+        off = np.where(agrees, _squares(gaps - J @ change, information), 0.0)
+        worst = int(np.argmax(off))
         if off[worst] < _FITS:
-            break
+            which = np.zeros(len(rows), bool)
+            which[deep[agrees]] = True
+            return inverse(body.T @ exp(change)) @ T_world_left, which
         agrees[worst] = False
-        if agrees.sum() < _LEAST_SHIFTED:
-            return None
-    T = body.T.copy()
-    T[:3, 3] += shift
-    which = np.zeros(len(rows), bool)
-    which[np.flatnonzero(deep)[agrees]] = True
-    return inverse(T) @ T_world_left, which
+    return None
+
+
+def _squares(gaps: Array, information: Array) -> Array:
+    """χ² (N,) of gaps (N, 3) with information (N, 3, 3)."""
+    return np.asarray((gaps * times_vectors(information, gaps)).sum(axis=1))
 
 
 def _by_looks(

@@ -24,7 +24,7 @@ from slam.worlds.world import World
 
 __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world", "options"]
 
-_NAMES = ("aisle", "box", "boxes", "desk", "drive", "field", "startup", "street", "town")
+_NAMES = ("aisle", "box", "boxes", "desk", "drive", "field", "people", "startup", "street", "town")
 
 #: Options that change the world itself; the others only change how it is recorded.
 _RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {"seed", *miscalibration.NAMES}

@@ -216,7 +216,8 @@ def test_a_guess_changes_next_to_nothing(name):
     plain = outcome(name, scene)
     origin = plain.estimates[0].T_world_object
     bad = se3.exp(np.array([0.1, -0.1, 0.05, 0.05, -0.05, 0.1]))
-    helped = outcome(name, scene, rule=lambda k, o: replace(o, T_world_object=scene.body[k] @ origin @ bad))
+    guess = lambda k: origin if k == 0 else scene.body[k] @ origin @ bad  # noqa: E731 (the first is the frame itself)
+    helped = outcome(name, scene, rule=lambda k, o: replace(o, T_world_object=guess(k)))
     for a, b in zip(plain.estimates[1:], helped.estimates[1:]):
         off = se3.log(se3.inverse(a.T_world_object) @ b.T_world_object)
         assert (np.abs(off) < 0.2 * np.sqrt(np.diag(a.covariance))).all()
@@ -242,6 +243,22 @@ def test_two_bodies_and_their_removal(name):
     backend.remove_objects(np.array([3]))
     backend.predict(2.0)
     assert backend.update_objects([]) == []
+
+
+@BOTH
+def test_a_new_body_s_velocity_is_what_was_known_of_it(name):
+    scene, rng = box_scene(frames=2), np.random.default_rng(0)
+    velocity, sigma = np.array([0, 0.1, 0, 0.3, -0.2, 0.1]), np.full(6, 0.02)
+    backend, seen = create(name, scene), scene.observations(0, rng)
+    backend.predict(0.0)
+    (e,) = backend.update_objects([replace(seen, velocity=velocity, velocity_sigma=sigma)])
+    assert e.velocity == pytest.approx(velocity)
+    assert np.sqrt(e.velocity_covariance.diagonal()) == pytest.approx(sigma)
+    backend.predict(scene.dt)
+    (e,) = backend.update_objects([])
+    assert np.linalg.norm(e.velocity - velocity) < 1e-6, "and it goes on so"
+    with pytest.raises(MeasurementError, match="belong together"):
+        replace(seen, velocity=velocity)
 
 
 @BOTH

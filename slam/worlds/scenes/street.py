@@ -40,11 +40,16 @@ def build(values: Mapping[str, Any]) -> World:
     xy, yaw = path(driven(t) + 0.3 * sway(t, rng, 0.03, 0.15))
     positions = np.column_stack([xy, EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
     poses = camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
-    rectangles = _houses(layout) + _ground(layout) + _parked_cars(layout)
+    rectangles = surroundings(layout)
     for body in range(1, values["cars"] + 1):
         rectangles += car(np.eye(4), 5000 + 20 * layout + body, body)
     objects = np.array([_drive(t, body) for body in range(1, values["cars"] + 1)]).reshape(-1, len(t), 4, 4)
     return assemble("street", "driving", values, rig, stamps, poses, rectangles, (4.0, 60.0), 64.0, objects)
+
+
+def surroundings(layout: int) -> list[Rectangle]:
+    """What stands still: houses, the ground, parked cars."""
+    return _houses(layout) + _ground(layout) + _parked_cars(layout)
 
 
 def driven(t: Array) -> Array:

@@ -49,6 +49,18 @@ def test_short_tracks_on_a_moving_region_make_a_body_once_it_has_moved_by_its_si
     assert len(steps[-1][0].supporters) == 15
 
 
+def test_what_moves_in_any_case_does_not_contradict_a_region():
+    """Depths of a track may jump; it says little against the region's motion that explains far more than stillness."""
+    rng, place = np.random.default_rng(3), np.array([5.0, 0, 20])
+    candidates = list(run(1, lambda k: place, VELOCITY, rng))[-1]
+    for test, contradicts in ((1000.0, 0), (20.0, 1)):
+        points = place + DT * VELOCITY + np.zeros((4, 3))
+        motion = tracks_of(points, np.array([*[VELOCITY] * 3, 2 * VELOCITY]), [0, 1, 2, 9], rng)
+        motion.motion.test[3] = test
+        (after, *_) = follow_candidates(candidates, motion, DT, 2.0)
+        assert after.contradicting == contradicts
+
+
 def test_false_velocities_of_what_stands_still_make_none():
     rng, start = np.random.default_rng(1), np.array([5.0, 0, 20])
     for candidates in run(30, lambda k: start, VELOCITY, rng):

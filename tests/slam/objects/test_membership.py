@@ -10,7 +10,7 @@ import pytest
 from slam.data import StereoFeatures
 from slam.geometry.se3 import Array, exp, transform
 from slam.objects import membership
-from slam.objects.bodies import Body, new_body, with_extent
+from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
 from slam.objects.tracks import Tracks, fit_positions, record
 
@@ -98,6 +98,40 @@ def test_a_group_is_part_of_a_body_only_where_it_has_no_motion_of_its_own(veloci
     own = new_body(2, path(velocity)[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
     own = membership.fitted(replace(own, history=path(velocity)), tracks, group, SLOT)
     assert (membership.overlapped({1: whole}, tracks, group, own) is whole) == same
+
+
+def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own() -> None:
+    """An error of the pose that all frames bring anew is taken for the part's motion only where the pose is certain."""
+    local = corners(16, 9)
+    true = path(MOVING)
+    off = true.copy()
+    off[:, :3, 3] += 0.01 * np.random.default_rng(10).standard_normal((WINDOW, 3))
+    tracks = table(seen_from(true, local, 11))
+    group = np.arange(10, 16)
+    own = new_body(2, true[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
+    own = membership.fitted(replace(own, history=true), tracks, group, SLOT)
+    whole = body_along(off, np.arange(10), tracks)
+    for sigma, same in ((1e-4, False), (0.01, True)):
+        known = replace(whole, covariance=sigma**2 * np.eye(6))
+        assert (membership.overlapped({1: known}, tracks, group, own) is known) == same
+
+
+def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
+    tracks = table(seen_from(path(MOVING), corners(8, 12), 13))
+    body = body_along(path(MOVING), np.arange(8), tracks)
+    body = replace(
+        body, measured=False, velocity=MOVING, covariance=0.01 * np.eye(6), velocity_covariance=0.01 * np.eye(6)
+    )
+    for shift, velocity, same in ((0.1, 0.3, True), (1.0, 0.3, False), (0.1, 1.5, False)):
+        new = new_body(
+            2, body.middle + shift * np.array([1.0, 0, 0]), np.array([0, 0, 0, velocity, 0, 0]), TIMES, 0.0, 0.1
+        )
+        assert (membership.returned({1: body}, new) is body) == same
+        assert membership.returned({1: replace(body, measured=True)}, new) is None
+    again = continued(new_body(2, body.middle, MOVING, TIMES, 0.0, 0.1), body)
+    assert again.id == 1
+    frame = again.T @ again.T_body_estimate
+    assert np.allclose(frame, body.T @ body.T_body_estimate), "the back end's frame goes on"
 
 
 def test_poses_fitted_to_still_points_prove_nothing() -> None:

@@ -84,7 +84,9 @@ def test_corners_are_drawn_where_they_project_in_both_images(board_world, rig, s
     assert distance.max() < 0.05
 
 
-@pytest.mark.parametrize("query", ["aisle?box=1", "box", "boxes", "desk", "field", "startup", "street?cars=3"])
+@pytest.mark.parametrize(
+    "query", ["aisle?box=1", "box", "boxes", "desk", "field", "people", "startup", "street?cars=3"]
+)
 def test_surfaces_in_order_and_a_depth_buffer_show_the_same(query):
     sequence = open_world(query)
     world = sequence.world

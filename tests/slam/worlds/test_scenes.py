@@ -6,7 +6,7 @@ import pytest
 from slam.geometry.se3 import inverse, rotation_angle, transform
 from slam.sequences import Sequence, open_sequence
 from slam.worlds import names, open_world
-from slam.worlds.scenes import aisle, box, boxes, startup, street
+from slam.worlds.scenes import aisle, box, boxes, people, startup, street
 
 WITHOUT_A_FILE = [name for name in names() if name != "drive"]
 
@@ -144,6 +144,19 @@ def test_street_is_driven_at_kitti_s_scale():
     assert heading[0, 1] > 0.99 and heading[-1, 0] < -0.99, "it turns to the left"
     assert len(sequence.objects(0).ids) == 3
     assert len(open_world("street?cars=0").objects(0).ids) == 0
+
+
+def test_the_legs_of_people_swing_about_their_hips():
+    sequence = open_world("people")
+    poses = np.array([sequence.objects(k).T_world_object for k in range(len(sequence))])
+    assert poses.shape[1] == people.PARTS * len(people.PEOPLE)
+    trunk, left, right = poses[:, 3], poses[:, 4], poses[:, 5]  # of the first walker
+    hips = inverse(trunk) @ left
+    assert np.allclose(hips[:, :3, 3], (0, 0, people.HIP), atol=1e-12)
+    assert 0.4 < rotation_angle(hips[:, :3, :3]).max() < 0.5
+    assert np.allclose((inverse(trunk) @ right)[:, :3, :3], np.swapaxes(hips[:, :3, :3], 1, 2)), "legs alternate"
+    assert np.linalg.norm(trunk[-1, :3, 3] - trunk[0, :3, 3]) == pytest.approx(1.4 * 13.9, rel=0.01)
+    assert len(open_world("people?people=0").objects(0).ids) == 0
 
 
 def test_another_layout_is_another_world_and_the_same_layout_is_the_same():

@@ -1,0 +1,60 @@
+"""A body's pose by its predicted motion and the few points that are seen of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.data import StereoFeatures
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import exp, transform
+from slam.objects import membership
+from slam.objects.bodies import new_body, with_extent
+from slam.objects.config import ObjectsConfig
+from slam.objects.recovery import locate
+from slam.objects.tracks import Tracks
+
+RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
+SIGMA, WINDOW = 0.7, 12
+POINTS = np.array([[0.3, 0.0, 0.0], [-0.3, 0.4, 0.1], [0.0, -0.6, 0.2], [0.2, 0.5, -0.1]])
+
+
+def scene(seen, off, rng):
+    """A body at 15 m, predicted wrongly by `off` (6,), of which so many points are seen; and where they are."""
+    T = np.eye(4)
+    T[:3, 3] = 4.0, 0.0, 15.0
+    truth = T @ exp(off)
+    uv, uv_right = RIG.project(transform(truth, POINTS[:seen]))
+    noise = 0.3 * rng.standard_normal((seen, 3))
+    features = StereoFeatures(
+        0.0, uv + noise[:, :2], uv_right + noise[:, [2, 1]], np.ones(seen), np.zeros(seen), np.ones(seen),
+        np.ones(seen, np.int8), np.eye(seen, 64, dtype=np.float32),
+    )  # fmt: skip
+    tracks = Tracks.empty(64, WINDOW)
+    rows = tracks.begin(np.arange(seen), features, np.arange(seen), transform(T, POINTS[:seen]))
+    body = new_body(1, T[:3, 3], np.zeros(6), np.zeros(WINDOW), 0.0, 2.0)
+    body = with_extent(replace(body, covariance=np.diag([0.05**2] * 3 + [0.5**2] * 3)), POINTS)
+    membership.enter(body, tracks, rows)
+    tracks.local[rows], tracks.local_information[rows] = POINTS[:seen], 1e4 * np.eye(3)
+    return body, tracks, features, truth
+
+
+@pytest.mark.parametrize("seen", [2, 3])
+def test_few_points_move_a_body_but_do_not_turn_it_wildly(seen):
+    off = np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.4])
+    body, tracks, features, truth = scene(seen, off, np.random.default_rng(seen))
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    T = locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=25.0), 0)
+    assert T is not None
+    assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.25
+    assert np.degrees(np.arccos((np.trace(T[:3, :3]) - 1) / 2)) < 3.0
+
+
+def test_points_that_do_not_agree_with_the_motion_say_nothing():
+    body, tracks, features, _ = scene(3, np.zeros(6), np.random.default_rng(5))
+    features.uv_left[0] += 40.0
+    features.uv_left[1] -= 40.0
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    assert locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=25.0), 0) is None
