@@ -373,7 +373,9 @@ class StereoSlam:
         As all its measurements are then weighed anew, that waits for a change that is significant.
         """
         revising = isinstance(self.backend, RevisingBackend)
-        self.calibration.apply(_REVISION if revising else 0.0)
+        change = self.calibration.apply(_REVISION if revising else 0.0)
+        if change is not None:
+            self.objects.revise(change.rows)
         applied = self.calibration.applied
         if not (isinstance(self.backend, RevisingBackend) and self.backend.revises_path):
             step = applied.parameters - self._accounted.parameters

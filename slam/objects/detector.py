@@ -35,6 +35,7 @@ from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
 from slam.objects.regions import judge_scene, limit
+from slam.objects.revision import Mend, revise_tracks
 from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
 
@@ -62,6 +63,7 @@ class MovingObjectDetector:
         self.bodies: dict[int, Body] = {}
         self.tracks: Tracks | None = None
         self._stamps = np.full(config.window, np.nan)
+        self._poses = np.tile(np.eye(4), (config.window, 1, 1))  # of the left camera in the window's frames
         self._frame = -1
         self._next_track = 0
         self._next_body = 1
@@ -78,6 +80,11 @@ class MovingObjectDetector:
         self._forgotten, self._candidates = [], []
         self._estimates = BodyEstimates(self.config, self.models)
 
+    def revise(self, mend: Mend) -> None:
+        """See `slam.objects.modes.ObjectDetector`."""
+        if self.tracks is not None:
+            revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, mend)
+
     # ------------------------------------------------------------------------------------------- a step, first part
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
@@ -85,7 +92,7 @@ class MovingObjectDetector:
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
-        self._camera = T_world_left[:3, 3]
+        self._camera, self._poses[self.slot] = T_world_left[:3, 3], T_world_left
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None

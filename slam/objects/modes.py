@@ -12,6 +12,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects.config import ObjectsConfig
+from slam.objects.revision import Mend
 
 
 class ObjectDetector(Protocol):
@@ -24,6 +25,14 @@ class ObjectDetector(Protocol):
 
     def restart(self) -> None:
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
+        ...
+
+    def revise(self, mend: Mend) -> None:
+        """Take note that the rig's correction changes before the next frame.
+
+        Args:
+            mend: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
+        """
         ...
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
@@ -48,6 +57,9 @@ class NoDetector:
 
     def restart(self) -> None:
         """There is nothing to forget."""
+
+    def revise(self, mend: Mend) -> None:
+        """There is nothing to revise."""
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Nothing moves, nothing is undecided."""

@@ -26,6 +26,7 @@ from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
+from slam.objects.revision import Mend
 
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # of its numbers
@@ -257,6 +258,9 @@ class Procedure1Detector:
     def restart(self) -> None:
         """The database goes on; the last pose does not."""
         self._last = None
+
+    def revise(self, mend: Mend) -> None:
+        """Nothing measured is kept."""
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
         """Recognise the object's features and find its motion; no other feature is judged."""

@@ -1,0 +1,57 @@
+"""What tracks measured before a change of the rig's correction, corrected as what is measured from then on.
+
+Without it a change of all disparities looks as if all that is far away had moved along the line of sight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.objects.bodies import Body
+from slam.objects.tracks import Tracks, times_vectors
+
+Mend = Callable[[Array], Array]
+
+
+def revise_tracks(
+    tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig, mend: Mend
+) -> None:
+    """Move the points of all tracks to where their pixels say that they are, corrected anew; in place.
+
+    Args:
+        tracks: the tracks.
+        bodies: the bodies by id; their members' points move in them.
+        poses: T_world_left (W, 4, 4) in the frames of the window's slots.
+        slot: of the newest frame.
+        rig: the cameras.
+        mend: corrects rectified rows (uL, vL, uR) (N, 3) [px] anew, as of `slam.calibration.correction.Revision`.
+    """
+    rows, slots = np.nonzero(tracks.dof)
+    points = tracks.anchor[rows] + tracks.p[rows, slots]
+    tracks.p[rows, slots] += _shifts(points, poses[slots], rig, mend)
+    alive = np.flatnonzero(tracks.ids >= 0)
+    shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, mend)
+    tracks.position[alive] += shift
+    tracks.older_b[alive] += times_vectors(tracks.older_A[alive], shift)
+    for body in bodies.values():
+        mine = tracks.body[alive] == body.id
+        tracks.local[alive[mine]] += shift[mine] @ body.T[:3, :3]
+
+
+def _shifts(points: Array, T_world_left: Array, rig: StereoRig, mend: Mend) -> Array:
+    """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
+    rectified = rig.rectified
+    T = T_world_left @ rectified.T_left_rectified
+    R = T[:, :3, :3]
+    z, J = rectified.rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T[:, :3, 3]))
+    shifts = np.zeros_like(points)
+    good = np.flatnonzero(np.isfinite(z).all(axis=1) & rectified.rig.left.in_image(z[:, :2]))
+    change = mend(z[good]) - z[good]
+    finite = np.isfinite(change).all(axis=1)
+    good, change = good[finite], change[finite]
+    shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])
+    return shifts
