@@ -129,13 +129,20 @@ class Candidate:
         P[3:, 3:] = self.covariance[3:, 3:]
         return np.concatenate([np.zeros(3), self.state[3:]]), P
 
-    def is_body(self, min_speed: float) -> bool:
-        """Whether the region has moved for certain, and is seen well enough in this frame to found a body."""
+    def is_body(self, min_speed: float, camera: Array) -> bool:
+        """Whether the region has moved for certain, and is seen well enough in this frame to found a body.
+
+        Args:
+            min_speed: of bodies [m/s].
+            camera: covariance (3, 3) of where the region is, given that of the camera's pose: all that is seen shares
+                its error, so it does not fall with the number of tracks.
+        """
         moved = self.state[:3] - self.start
         length = float(np.linalg.norm(moved))
         if length <= max(2.0 * self.radius, 1e-9) or np.linalg.norm(self.state[3:]) <= min_speed:
             return False
-        deviation = np.sqrt(moved @ (self.covariance[:3, :3] + self.start_covariance) @ moved) / length
+        covariance = self.covariance[:3, :3] + self.start_covariance + 2.0 * camera
+        deviation = np.sqrt(moved @ covariance @ moved) / length
         enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
         agree = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
         return bool(enough and agree and length > 3.0 * deviation)
@@ -204,6 +211,7 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
     P = np.linalg.inv(information)
     after = replace(candidate, state=P @ vector, covariance=P)
     inside, left = _near(after, tracks, tracks.spread), _unexplained(after, tracks)
+    rows = rows[inside[rows]]  # where the region's place was hardly known, they may come from everywhere
     agrees = left <= _AGREES
     contradicts = ~agrees & (left > _EXPLAINED * m.test)
     return replace(
@@ -214,7 +222,7 @@ def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> C
         contradicting=candidate.contradicting + int((inside & contradicts).sum()),
         unseen=0,
         members=tracks.rows[rows],
-        radius=float(tracks.radius[rows].mean()),
+        radius=float(tracks.radius[mine].mean()),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, inverse, transform
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend, ObjectBackend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
@@ -39,6 +39,7 @@ from slam.objects.revision import Mend, revise_tracks
 from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
 
+_ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _SETTLED = 30  # frames from which a body is remembered in any case
@@ -71,6 +72,7 @@ class MovingObjectDetector:
         self._estimates = BodyEstimates(config, self.models)
         self._candidates: list[Candidate] = []
         self._camera: Array = np.zeros(3)
+        self._pose_covariance: Array = np.zeros((6, 6))
         self.suspects = np.zeros(0, np.int64)
 
     def restart(self) -> None:
@@ -93,6 +95,7 @@ class MovingObjectDetector:
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
         self._camera, self._poses[self.slot] = T_world_left[:3, 3], T_world_left
+        self._pose_covariance = estimate.covariance
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -214,14 +217,36 @@ class MovingObjectDetector:
         members = members[membership.compact(tracks.position[members])]
         if len(members) < c.min_support:
             return
-        motion = even_motion(tracks, members, times, c.max_speed)
+        for _ in range(_ROUNDS):
+            twist, uncertainty, centre = self._common_motion(members, times)
+            body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
+            body = membership.fitted(body, tracks, members, self.slot)
+            moves = membership.verdict(body, tracks, members).gain > 0
+            if moves.sum() < c.min_support:
+                return
+            if not self._is_resolved(centre):
+                return  # what stands still beside it could not be told from it
+            if moves.all():
+                break
+            members = members[moves]  # what lies among them and rather stands still slows them down
+        self._found(members, centre, twist, uncertainty, times)
+
+    def _is_resolved(self, centre: Array) -> bool:
+        """Whether the noise of a depth is less than the region that a body at this place may fill."""
+        depth = float(np.linalg.norm(centre - self._camera))
+        noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+        return bool(noise < region_radius(depth, self.config.size))
+
+    def _common_motion(self, members: NDArray[np.intp], times: Array) -> tuple[Array, Array, Array]:
+        """Twist (6,) that fits tracks best, its covariance (6, 6), and the middle (3,) that it is about."""
+        assert self.tracks is not None
+        motion = even_motion(self.tracks, members, times, self.config.max_speed)
         centre = motion.position.mean(axis=0)
         twist, uncertainty = fit_twist(
             motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre
         )
         linear, angular = self.models.velocity_variance(-float(times.min()) / 3.0)  # it is the mean over the window
-        uncertainty = uncertainty + np.diag([angular] * 3 + [linear] * 3)
-        self._found(members, centre, twist, uncertainty, times)
+        return twist, uncertainty + np.diag([angular] * 3 + [linear] * 3), centre
 
     def _found(
         self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array
@@ -285,12 +310,20 @@ class MovingObjectDetector:
         noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
         moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
         followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
-        self._candidates = [candidate for candidate in followed if not candidate.is_body(c.min_speed)]
+        self._candidates = []
         for candidate in followed:
-            if candidate.is_body(c.min_speed):
+            if not candidate.is_body(c.min_speed, self._shared_error(candidate.state[:3], T_world_left)):
+                self._candidates.append(candidate)
+            else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
                 self._found(candidate.members, centre, twist, uncertainty, times)
+
+    def _shared_error(self, place: Array, T_world_left: Array) -> Array:
+        """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""
+        J = points_by_pose(transform(inverse(T_world_left), place[None]))[0]
+        R = T_world_left[:3, :3]
+        return np.asarray(R @ J @ self._pose_covariance @ J.T @ R.T)
 
     def _change_members(self) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
@@ -314,13 +347,7 @@ class MovingObjectDetector:
 
     def _resolved(self) -> set[int]:
         """Ids of the bodies so near that the noise of a depth is less than what they measure across."""
-        near = set()
-        for body in self.bodies.values():
-            depth = float(np.linalg.norm(body.T[:3, 3] - self._camera))
-            noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
-            if noise < region_radius(depth, self.config.size):
-                near.add(body.id)
-        return near
+        return {body.id for body in self.bodies.values() if self._is_resolved(body.T[:3, 3])}
 
     def _merge(self) -> None:
         """A body whose members go with an older one is a part of that: at once while young, later only after a while.

@@ -49,7 +49,9 @@ def _shifts(points: Array, T_world_left: Array, rig: StereoRig, mend: Mend) -> A
     R = T[:, :3, :3]
     z, J = rectified.rig.project_stereo(times_vectors(np.swapaxes(R, 1, 2), points - T[:, :3, 3]))
     shifts = np.zeros_like(points)
-    good = np.flatnonzero(np.isfinite(z).all(axis=1) & rectified.rig.left.in_image(z[:, :2]))
+    left = rectified.rig.left
+    seen = np.isfinite(z).all(axis=1) & left.in_image(z[:, :2])
+    good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < left.width))
     change = mend(z[good]) - z[good]
     finite = np.isfinite(change).all(axis=1)
     good, change = good[finite], change[finite]

@@ -9,6 +9,7 @@ from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, 
 from slam.objects.tracks import ConstantVelocity
 
 DT, SIZE, SPEED = 0.1, 2.0, 1.0
+EXACT = np.zeros((3, 3))  # covariance by the camera's pose
 VELOCITY = np.array([0.5, 0.0, 5.0])
 
 
@@ -41,7 +42,7 @@ def test_short_tracks_on_a_moving_region_make_a_body_once_it_has_moved_by_its_si
     rng, start = np.random.default_rng(0), np.array([5.0, 0, 20])
     steps = list(run(10, lambda k: start + k * DT * VELOCITY, VELOCITY, rng))
     assert all(len(candidates) == 1 for candidates in steps)
-    bodies = [candidates[0].is_body(SPEED) for candidates in steps]
+    bodies = [candidates[0].is_body(SPEED, EXACT) for candidates in steps]
     moved = DT * np.linalg.norm(VELOCITY) * np.arange(10)
     assert not any(bodies[k] for k in range(10) if moved[k] < 1.5)
     assert bodies[-1]
@@ -64,13 +65,13 @@ def test_what_moves_in_any_case_does_not_contradict_a_region():
 def test_false_velocities_of_what_stands_still_make_none():
     rng, start = np.random.default_rng(1), np.array([5.0, 0, 20])
     for candidates in run(30, lambda k: start, VELOCITY, rng):
-        assert not any(candidate.is_body(SPEED) for candidate in candidates)
+        assert not any(candidate.is_body(SPEED, EXACT) for candidate in candidates)
 
 
 def test_a_region_with_as_many_still_points_inside_makes_none():
     rng, start = np.random.default_rng(2), np.array([5.0, 0, 20])
     for candidates in run(12, lambda k: start + k * DT * VELOCITY, VELOCITY, rng, around=4):
-        assert not any(candidate.is_body(SPEED) for candidate in candidates)
+        assert not any(candidate.is_body(SPEED, EXACT) for candidate in candidates)
 
 
 def test_where_depth_is_noisier_than_the_region_nothing_is_followed():
@@ -79,3 +80,19 @@ def test_where_depth_is_noisier_than_the_region_nothing_is_followed():
     far = MovingTracks.of(tracks.rows, tracks.ids, tracks.motion, np.full(5, 60.0), np.full(5, 6.5), SIZE, SPEED)
     assert len(tracks.rows) == 5 and not len(far.rows)
     assert region_radius(60.0, SIZE) == pytest.approx(3.0) and region_radius(5.0, SIZE) == 1.0
+
+
+def test_the_error_of_the_camera_is_no_motion():
+    rng, start = np.random.default_rng(0), np.array([5.0, 0, 20])
+    (region,) = list(run(10, lambda k: start + k * DT * VELOCITY, VELOCITY, rng))[-1]
+    assert region.is_body(SPEED, EXACT) and not region.is_body(SPEED, 4.0 * np.eye(3))
+
+
+def test_tracks_from_everywhere_are_no_region():
+    """After a long gap the region may be anywhere; what then agrees with its motion does not lie in it."""
+    rng, place = np.random.default_rng(4), np.array([5.0, 0, 20])
+    candidates = list(run(2, lambda k: place + k * DT * VELOCITY, VELOCITY, rng))[-1]
+    points = place + rng.uniform(-1, 1, (60, 3)) * np.array([15.0, 3.0, 15.0])
+    tracks = tracks_of(points, np.tile(VELOCITY, (60, 1)), np.arange(900, 960), rng)
+    (after, *_) = follow_candidates(candidates, tracks, 20.0, 2.0)
+    assert len(after.members) < 6
