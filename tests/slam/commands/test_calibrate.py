@@ -43,7 +43,7 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
+    assert all(word in printed for word in ("[thousandths]", "apart", "roll", "no uncertainty"))
     model = RigModel(slam.open_sequence(WORLD).rig)
     expected = corrected_rig(model, np.array([row["mean"] for row in tree["parameters"]])).rig
     for name in ("rig.yaml", "camchain.yaml"):
