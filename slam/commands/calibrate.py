@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from slam.commands.display import Progress
@@ -50,7 +51,7 @@ def _print(done: Calibrated) -> None:
     """The table, and what it says."""
     console, joint = Console(), done.kept.posterior
     shown = done.found if len(done.found) <= _COLUMNS else ()
-    table = Table(title="corrections [thousandths]: mean ± standard deviation", show_lines=False)
+    table = Table(title=escape("corrections [thousandths]: mean ± standard deviation"), show_lines=False)
     table.add_column("parameter")
     table.add_column("all", justify="right", no_wrap=True)
     for number in range(1, len(shown) + 1):

@@ -64,7 +64,7 @@ def main() -> None:
     except MemoryError:
         _end("slam: there is not enough memory for this", 2)
     except Stopped as stopped:
-        _end(f"slam: stopped by {stopped}; frames done so far are kept", 128 + stopped.number)
+        _end(f"slam: stopped by {stopped}; {stopped.leaves}", 128 + stopped.number)
 
 
 def _end(line: str, status: int) -> None:
@@ -310,7 +310,11 @@ def calibrate_command(
     from slam.run.calibrating import Targets
     from slam.run.runner import parse_frames
 
-    calibrate(sequences, Targets(out, opencv, kalibr), settings or [], parse_frames(frames), format, quiet)
+    try:
+        calibrate(sequences, Targets(out, opencv, kalibr), settings or [], parse_frames(frames), format, quiet)
+    except Stopped as stopped:
+        stopped.leaves = "nothing is written"
+        raise
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

@@ -24,9 +24,12 @@ def compiled_beside(backend: str) -> Iterator[None]:
     if _processors() < 2 or not _cold():
         yield
         return
-    command = [sys.executable, "-m", __name__, backend]
+    command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
+    modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    process = subprocess.Popen(
+        command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True, env={**os.environ, **modules}
+    )
     try:
         yield
     finally:

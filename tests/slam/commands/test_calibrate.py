@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from typer.testing import CliRunner
 import slam
 from slam.calibration import RigModel
 from slam.calibration.corrected import corrected_rig
+from slam.commands import cli
 from slam.commands.cli import app
+from slam.commands.signals import Stopped
 from slam.errors import SlamError
 from slam.run.repeat import load
 
@@ -43,7 +46,7 @@ def test_two_recordings_of_one_rig(made):
     assert all(abs(row["mean"] + 1e-3) < 3 * row["sigma"] for row in turn)
     assert any(abs(row["mean"]) > 1e-4 for row in turn)
     assert tree["agreement"].startswith("The recordings agree")
-    assert all(word in printed for word in ("apart", "roll", "no uncertainty"))
+    assert all(word in printed for word in ("[thousandths]", "apart", "roll", "no uncertainty"))
     model = RigModel(slam.open_sequence(WORLD).rig)
     expected = corrected_rig(model, np.array([row["mean"] for row in tree["parameters"]])).rig
     for name in ("rig.yaml", "camchain.yaml"):
@@ -85,3 +88,16 @@ def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):
     with pytest.raises(SlamError, match=message):
         command(*words, "-q")
     assert not list(tmp_path.glob("*.yaml"))
+
+
+def test_stopped_by_a_signal_it_says_that_nothing_is_written(monkeypatch, capsys):
+    def stop(*_):
+        raise Stopped(signal.SIGTERM)
+
+    monkeypatch.setattr("slam.commands.calibrate.calibrate", stop)
+    monkeypatch.setattr(cli, "catch_signals", lambda: None)
+    monkeypatch.setattr("sys.argv", ["slam", "calibrate", WORLD])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "slam: stopped by SIGTERM; nothing is written\n"
