@@ -105,7 +105,7 @@ EXPERIMENTS = (
 
 
 #: Those whose pictures are among the documentation's.
-WORLDS = ("aisle", "box", "boxes", "desk", "field", "startup", "street")
+WORLDS = ("aisle", "box", "boxes", "desk", "field", "people", "startup", "street")
 
 
 def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:

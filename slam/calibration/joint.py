@@ -23,8 +23,8 @@ _DIFFERS = 3.0  # and do not where by more than so many; between the two, chance
 def joint_calibration(model: RigModel, evidence: Sequence[Evidence], systematic: float) -> KeptCalibration:
     """What recordings say of the rig that they share.
 
-    Each recording has a systematic error of its own, that does not average out within it but does over recordings. A
-    recording with the share V of the information passes ``V F Vᵀ`` of its variance F on; one alone all of it.
+    Each recording has a systematic error of its own, that does not average out within it but does over recordings: what
+    it says is off by that. One alone has its error added in the end, as in its own run.
 
     Args:
         model: the parameters' meaning.
@@ -36,12 +36,10 @@ def joint_calibration(model: RigModel, evidence: Sequence[Evidence], systematic:
     """
     if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
-    solution = solve(as_delivered(model), residual_variance(), evidence)
-    of_prior = np.linalg.inv(solution.inner) - sum(part.S for part in evidence)
-    covariance = solution.covariance.copy()
-    for part in evidence:
-        share = solution.inner @ (part.S + of_prior / len(evidence))
-        covariance += (share * systematic_variance(model, systematic)) @ share.T
+    variance, alone = systematic_variance(model, systematic), len(evidence) == 1
+    known = None if alone else [part.with_error(variance) for part in evidence]
+    solution = solve(as_delivered(model), residual_variance(), evidence, known)
+    covariance = solution.covariance + (np.diag(variance) if alone else 0.0)
     posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
     return KeptCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
 

@@ -91,7 +91,9 @@ class Solution:
     residual: float
 
 
-def solve(prior: Prior, residual: float, evidence: Sequence[Evidence]) -> Solution:
+def solve(
+    prior: Prior, residual: float, evidence: Sequence[Evidence], known: Sequence[Evidence] | None = None
+) -> Solution:
     """Posterior, averaged over how large a calibration's errors are.
 
     The scales of the prior's errors are not known. Their probabilities follow from the evidence (the marginal
@@ -101,20 +103,29 @@ def solve(prior: Prior, residual: float, evidence: Sequence[Evidence]) -> Soluti
         prior: of the parameters.
         residual: variance of the residual fields' coefficients.
         evidence: of the data.
+        known: the same where parameters differ by recording; the scales follow from `evidence` all the same.
     """
-    whole = evidence[0]
-    for more in evidence[1:]:
-        whole += more
     information = np.linalg.inv(prior.covariances)  # (K, n, n)
-    total = information + whole.S
-    covariances = np.linalg.inv(total)
-    e = whole.e - whole.S @ prior.mean
-    steps = covariances @ e
-    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + steps @ e)
+    whole, covariances, steps, logs = _by_scale(prior, information, evidence)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
+    if known is not None:
+        whole, covariances, steps, _ = _by_scale(prior, information, known)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
     moved = np.tensordot(weights * prior.residual, covariances, axes=1) @ whole.cross
     return Solution(prior.mean + step, inner, inner + residual * moved @ moved.T, float(weights @ prior.residual))
+
+
+def _by_scale(prior: Prior, information: Array, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:
+    """All evidence together; by scale of the prior (K): covariances, changes of the mean, log marginal likelihoods."""
+    whole = evidence[0]
+    for more in evidence[1:]:
+        whole += more
+    total = information + whole.S
+    covariances = np.linalg.inv(total)
+    e = whole.e - whole.S @ prior.mean
+    steps = covariances @ e
+    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + steps @ e)
+    return whole, covariances, steps, logs

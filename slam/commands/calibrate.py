@@ -11,6 +11,7 @@ from rich.table import Table
 
 from slam.commands.display import Progress
 from slam.data import FrameResult
+from slam.errors import ConfigurationError
 from slam.run.calibrating import Calibrated, Targets
 from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
@@ -39,6 +40,9 @@ def calibrate(
         with Progress(count, f"…{sequence.name[-14:]}", quiet) as progress:
             yield progress.frame
 
+    twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
+    if twice is not None:
+        raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
     done = run([open_sequence(text, format=format) for text in texts], targets, show, settings, frames)
     if not quiet:
         _print(done)

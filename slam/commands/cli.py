@@ -303,6 +303,7 @@ def calibrate_command(
     settings: SetOption = None,
     frames: FramesOption = None,
     format: FormatOption = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
@@ -311,7 +312,9 @@ def calibrate_command(
     from slam.run.runner import parse_frames
 
     try:
-        calibrate(sequences, Targets(out, opencv, kalibr), settings or [], parse_frames(frames), format, quiet)
+        calibrate(
+            sequences, Targets(out, opencv, kalibr, overwrite), settings or [], parse_frames(frames), format, quiet
+        )
     except Stopped as stopped:
         stopped.leaves = "nothing is written"
         raise

@@ -40,11 +40,13 @@ class Targets:
         out: what has been found, with its covariance.
         opencv: the corrected calibration in OpenCV's form; None for none.
         kalibr: in Kalibr's.
+        overwrite: whether files that are there may be replaced.
     """
 
     out: Path
     opencv: Path | None = None
     kalibr: Path | None = None
+    overwrite: bool = False
 
     def require(self, rig: StereoRig) -> None:
         """Raise where a file could not be written, before hours of work are done for it."""
@@ -53,6 +55,8 @@ class Targets:
         files = [file for file in (self.out, self.opencv, self.kalibr) if file is not None]
         for file in files:
             require_target(file)
+            if file.exists() and not self.overwrite:
+                raise ConfigurationError(f"{file}: is there already; give another name, or --overwrite to replace it")
         if len(set(files)) < len(files):
             raise ConfigurationError(f"{files[-1]}: two files cannot have one name")
 

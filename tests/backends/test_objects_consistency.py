@@ -11,7 +11,7 @@ import backends
 from backends.ekf import EkfBackend
 from backends.ekf.objects_body import RIGID, CameraBelief, _learnt, advanced, found, referred
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
-from backends.smoother.objects_factors import System, add_measurements, add_motion, velocities
+from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
 from backends.smoother.stereo import RectifiedStereo
 from slam.evaluation.metrics import chi_square_band, nees
@@ -132,7 +132,8 @@ def test_a_turn_of_the_body_stays_what_it_is_while_it_turns_on():
     """The covariance of a pose after a step is that of poses perturbed before it."""
     xi, models = 1e-4 * np.arange(1.0, 7.0), ObjectModels()
     body = replace(
-        found(1, se3.pose(np.eye(3), [0.1, 0.2, 1.0]), models, 0), velocity=np.array([3.0, 5, -4, 0.2, 0, 1])
+        found(1, se3.pose(np.eye(3), [0.1, 0.2, 1.0]), *models.first_velocity(None), 0),
+        velocity=np.array([3.0, 5, -4, 0.2, 0, 1]),
     )
     P = np.zeros((RIGID, RIGID))
     P[:6, :6] = np.outer(xi, xi)
@@ -148,7 +149,7 @@ def test_the_filter_never_learns_where_in_a_body_its_frame_lies():
     """What only the frame is unsure of stays so after the points were changed, whatever their coordinates."""
     rng = np.random.default_rng(4)
     h = box_points(5, np.full(3, 0.3), np.array([0.05, 0, 1.2]), rng)
-    body = found(1, se3.pose(np.eye(3), [0, 0, 1.2]), ObjectModels(), 8)
+    body = found(1, se3.pose(np.eye(3), [0, 0, 1.2]), *ObjectModels().first_velocity(None), 8)
     points = BodyPoints.at(se3.inverse(body.T), h)
     frame = np.concatenate([np.eye(6), np.zeros((6, 6)), points.by_frame()])
     with_map = np.concatenate([np.zeros((6, 6)), np.ones((6, 2))], axis=1)  # and none with the camera
@@ -174,7 +175,9 @@ def test_the_smoothers_prior_never_learns_where_in_a_body_its_frame_lies():
     rng, stereo = np.random.default_rng(5), RectifiedStereo.of(HANDHELD)
     T, points = se3.pose(np.eye(3), [0, 0, 1.2]), box_points(4, np.full(3, 0.3), np.zeros(3), rng)
     z, _ = stereo.project(se3.transform(T, points))
-    window = with_frame(opened(0, 0.0, T, np.eye(4)), 1, 0.1, T, np.eye(4), 1.0)
+    window = with_frame(
+        opened(0, 0.0, T, np.eye(4), VelocityPrior(*ObjectModels().first_velocity(None))), 1, 0.1, T, np.eye(4), 1.0
+    )
     window = with_points(window, np.arange(4), points, Shape(T[:3, 3], np.eye(3)), z)
     X = np.tile(np.eye(4), (2, 1, 1))
     system = System.empty(24 + 12)
@@ -215,7 +218,7 @@ def test_normal_equations():
     stamps = np.array([0.0, 0.03, 0.07])
     system = System.empty(36 + 9)
     add_measurements(system, stereo, SIGMA, z, se3.inverse(X) @ T, points, 36)
-    add_motion(system, models, T, stamps, np.ones(3), False, range(2))
+    add_motion(system, models, T, stamps, np.ones(3), None, range(2))
 
     def at(d):
         f = d[:36].reshape(3, 2, 6)

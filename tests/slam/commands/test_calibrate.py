@@ -101,3 +101,11 @@ def test_stopped_by_a_signal_it_says_that_nothing_is_written(monkeypatch, capsys
         cli.main()
     assert ended.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err == "slam: stopped by SIGTERM; nothing is written\n"
+
+
+def test_what_is_there_is_not_overwritten_and_no_recording_counts_twice(made, tmp_path):
+    folder, _ = made
+    with pytest.raises(SlamError, match="is there already"):
+        command("calibrate", WORLD, "--out", folder / "rig.json")
+    with pytest.raises(SlamError, match="given twice"):
+        command("calibrate", WORLD, WORLD, "--out", tmp_path / "rig.json")

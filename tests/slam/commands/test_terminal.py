@@ -14,7 +14,7 @@ from slam.commands import completion
 from slam.commands.cli import _title, app
 from slam.commands.display import Progress, print_listing, print_summary
 
-COMMANDS = ["run", "replay", "plot", "settings", "compare", "render", "view", "list", "warm-up", "demo"]
+COMMANDS = ["run", "replay", "plot", "settings", "compare", "calibrate", "render", "view", "list", "warm-up", "demo"]
 
 
 def invoke(*words, **environment):
