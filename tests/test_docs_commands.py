@@ -32,6 +32,8 @@ NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchm
 #: What the page shows, and what is run in its place.
 STAND_INS = {
     "path/to/kitti_or_euroc_folder": "euroc",
+    "path/to/drive_1": "synthetic:street",
+    "path/to/drive_2": "synthetic:street?layout=1",
     "my_package.pose_fit:PoseFit": "pose_fit:PoseFit",
     "truth.txt": "results/trajectory.txt",
 }
