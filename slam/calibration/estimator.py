@@ -96,8 +96,8 @@ class SelfCalibration:
 
         Nothing is corrected before motion has taken half of the prior's variance from the disparities, unless there is
         a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Where
-        disparities would change by less than `least` standard deviations (root mean square over the image), features
-        are corrected as before.
+        that is no longer so, the calibration as delivered is taken again. Where disparities would change by less than
+        `least` standard deviations (root mean square over the image), features are corrected as before.
         """
         if not self.config.enabled:
             return None

@@ -103,7 +103,7 @@ def solve(
         prior: of the parameters.
         residual: variance of the residual fields' coefficients.
         evidence: of the data.
-        known: the same where parameters differ by recording; the scales follow from `evidence` all the same.
+        known: the same with each recording's own error in it; the prior's scales follow from `evidence` all the same.
     """
     information = np.linalg.inv(prior.covariances)  # (K, n, n)
     whole, covariances, steps, logs = _by_scale(prior, information, evidence)

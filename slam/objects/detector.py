@@ -7,6 +7,7 @@ a landmark; `update` gives the bodies' observations to the back end and reports 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,6 @@ class MovingObjectDetector:
         self._forgotten: list[int] = []
         self._estimates = BodyEstimates(config, self.models)
         self._candidates: list[Candidate] = []
-        self._camera: Array = np.zeros(3)
         self._pose_covariance: Array = np.zeros((6, 6))
         self.suspects = np.zeros(0, np.int64)
 
@@ -94,8 +94,7 @@ class MovingObjectDetector:
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
-        self._camera, self._poses[self.slot] = T_world_left[:3, 3], T_world_left
-        self._pose_covariance = estimate.covariance
+        self._poses[self.slot], self._pose_covariance = T_world_left, estimate.covariance
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -219,23 +218,28 @@ class MovingObjectDetector:
             return
         for _ in range(_ROUNDS):
             twist, uncertainty, centre = self._common_motion(members, times)
+            if not self._is_resolved(centre):
+                return  # what stands still beside it could not be told from it
             body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
             body = membership.fitted(body, tracks, members, self.slot)
             moves = membership.verdict(body, tracks, members).gain > 0
-            if moves.sum() < c.min_support:
-                return
-            if not self._is_resolved(centre):
-                return  # what stands still beside it could not be told from it
             if moves.all():
-                break
+                self._found(members, centre, twist, uncertainty, times)
+                return
             members = members[moves]  # what lies among them and rather stands still slows them down
+            if len(members) < c.min_support:
+                return
+        twist, uncertainty, centre = self._common_motion(members, times)
         self._found(members, centre, twist, uncertainty, times)
 
     def _is_resolved(self, centre: Array) -> bool:
         """Whether the noise of a depth is less than the region that a body at this place may fill."""
-        depth = float(np.linalg.norm(centre - self._camera))
-        noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
-        return bool(noise < region_radius(depth, self.config.size))
+        depth = float(np.linalg.norm(centre - self._poses[self.slot, :3, 3]))
+        return bool(self._depth_noise(depth) < region_radius(depth, self.config.size))
+
+    def _depth_noise(self, depth: Any) -> Any:
+        """Standard deviation [m] of one measured depth [m]."""
+        return depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
 
     def _common_motion(self, members: NDArray[np.intp], times: Array) -> tuple[Array, Array, Array]:
         """Twist (6,) that fits tracks best, its covariance (6, 6), and the middle (3,) that it is about."""
@@ -307,7 +311,7 @@ class MovingObjectDetector:
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
         motion = even_motion(tracks, rows, times, c.max_speed)
         depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
-        noise = depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
+        noise = self._depth_noise(depth)
         moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
         followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
         self._candidates = []

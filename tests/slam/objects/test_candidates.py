@@ -92,7 +92,9 @@ def test_tracks_from_everywhere_are_no_region():
     """After a long gap the region may be anywhere; what then agrees with its motion does not lie in it."""
     rng, place = np.random.default_rng(4), np.array([5.0, 0, 20])
     candidates = list(run(2, lambda k: place + k * DT * VELOCITY, VELOCITY, rng))[-1]
-    points = place + rng.uniform(-1, 1, (60, 3)) * np.array([15.0, 3.0, 15.0])
+    gap = 20.0  # [s]
+    points = place + gap * VELOCITY + rng.uniform(-1, 1, (60, 3)) * np.array([8.0, 3.0, 8.0])
     tracks = tracks_of(points, np.tile(VELOCITY, (60, 1)), np.arange(900, 960), rng)
-    (after, *_) = follow_candidates(candidates, tracks, 20.0, 2.0)
-    assert len(after.members) < 6
+    (after, *_) = follow_candidates(candidates, tracks, gap, 2.0)
+    away = np.linalg.norm(points - after.state[:3], axis=1)
+    assert len(after.members) < 6 and (away[after.members] < 2 * SIZE).all()
