@@ -48,6 +48,18 @@ class StereoFrame:
 
 
 @dataclass(frozen=True)
+class ImagePair:
+    """Rectified grey images of one stereo frame.
+
+    Attributes:
+        left, right: (H, W) float32; `right` is None where it is missing.
+    """
+
+    left: NDArray[np.float32]
+    right: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
 class StereoFeatures:
     """Features of one stereo frame, a row each.
 
@@ -61,6 +73,7 @@ class StereoFeatures:
         laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
         descriptors: unit vectors (N, D) float32.
         threshold: the detector's D_threshold in force (paper A, III.A); NaN where there is none.
+        images: that they are from, for landmarks to be followed in; None where there are none.
     """
 
     stamp: float
@@ -72,6 +85,7 @@ class StereoFeatures:
     laplacian: NDArray[np.int8]
     descriptors: NDArray[np.float32]
     threshold: float = float("nan")
+    images: ImagePair | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors"):

@@ -15,7 +15,7 @@ from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoF
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, Frontend, RevisingBackend
+from slam.interfaces import Backend, FollowingFrontend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import CommonError
@@ -30,6 +30,7 @@ from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.tracking.feature_check import usable
+from slam.tracking.following import Anchors, Followed, anchored, follow
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
@@ -50,17 +51,19 @@ class _Last:
         state: how localization has gone.
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
+        anchors: what landmarks look like that can be followed by their image.
     """
 
     index: int = -1
     state: TrackingState = field(default_factory=TrackingState)
     dimensions: int | None = None
     mapped: bool = False
+    anchors: Anchors = field(default_factory=Anchors.none)
 
-    def after(self, step: Step, change: MapChange) -> _Last:
+    def after(self, step: Step, change: MapChange, anchors: Anchors) -> _Last:
         """The same after one more step."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        return _Last(step.index, step.state, dimensions, self.mapped or len(change.added) > 0)
+        return _Last(step.index, step.state, dimensions, self.mapped or len(change.added) > 0, anchors)
 
 
 class StereoSlam:
@@ -238,6 +241,9 @@ class StereoSlam:
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
+            found = self._follow(raw, matches, landmarks)
+            raw, matches = replace(found.features, images=None), found.matches
+            features = self.calibration.correct(raw)
             held = self.objects.suspects
             held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
@@ -256,6 +262,7 @@ class StereoSlam:
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(index, features, prediction, matches, held, held_rows, spared, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
+            anchors = self._anchored(found, matches, change.added, estimate.T_world_left)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
@@ -264,9 +271,25 @@ class StereoSlam:
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
-            self._last.after(step, change), change.landmarks, atlas, Stages(),
+            self._last.after(step, change, anchors), change.landmarks, atlas, Stages(),
         )  # fmt: skip
         return result
+
+    def _follow(self, raw: StereoFeatures, matches: LandmarkMatches, landmarks: LandmarkRows) -> Followed:
+        """The frame after landmarks were followed into it by their image, where the front end can do that."""
+        if not self.config.association.follow or not isinstance(self.frontend, FollowingFrontend):
+            return Followed(raw, matches, Anchors.none())
+        positions, undone = self.backend.positions(landmarks.ids), self.calibration.applied.undone
+        return follow(self.frontend, self.rig, undone, self._last.anchors, raw, matches, landmarks, positions)
+
+    def _anchored(
+        self, found: Followed, matches: LandmarkMatches, added: LandmarkMatches, T_world_left: np.ndarray
+    ) -> Anchors:
+        """What landmarks look like that can be followed, with those of this frame."""
+        if not self.config.association.follow or not isinstance(self.frontend, FollowingFrontend):
+            return found.anchors
+        seen = LandmarkMatches(np.concatenate([matches.ids, added.ids]), np.concatenate([matches.rows, added.rows]))
+        return anchored(self.frontend, self.rig, found.anchors, found.features, seen, T_world_left)
 
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
         """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""

@@ -1,15 +1,16 @@
-"""Sub-pixel positions by image correlation: Gauss-Newton alignment of a right patch to the left one."""
+"""Sub-pixel positions by image correlation: Gauss-Newton alignment of an image's patch to another image's."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.runtime.compilation import kernel, vector_helper
+from slam.runtime.compilation import helper, kernel, vector_helper
 
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
 _ITERATIONS = 12  # of the alignment at most
 _CONVERGED = 0.01  # px
+_MARGIN = 18  # half width of a patch that is kept [px]: the large one and its gradients, one and a half times as wide
 
 
 def patch_windows(spread: float) -> NDArray[np.float32]:
@@ -142,24 +143,127 @@ def _refine(
         if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
             continue
         mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
-        det = xx * yy - xy * xy
-        if deviation < 1e-3 or det <= 1e-4 * (xx + yy) ** 2:
+        out[i, 0], out[i, 1] = _best_place(
+            right, shape, start[i, 0], start[i, 1], reach_x, reach_y, min_correlation, windows, k, half, rows, lanes,
+            mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
+        )  # fmt: skip
+
+
+@helper
+def _best_place(
+    image, shape, x0, y0, reach_x, reach_y, min_correlation, windows, k, half, rows, lanes,
+    mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
+):  # fmt: skip
+    """Where an image looks like the template whose sums these are, by steps from (x0, y0); NaN where nowhere."""
+    det = xx * yy - xy * xy
+    if deviation < 1e-3 or det <= 1e-4 * (xx + yy) ** 2:
+        return np.nan, np.nan
+    x, y = x0, y0
+    for _ in range(_ITERATIONS):
+        if not _sample(image, shape, x, y, half, rows, lanes, blend, patch):
+            break
+        mean2, deviation2, both, px, py = _compare(patch, windows, k, rows, lanes, weighted, gx, gy)
+        if deviation2 < 1e-3:
+            break
+        gain = deviation / deviation2
+        ex = (tx - mean * sx) - gain * (px - mean2 * sx)
+        ey = (ty - mean * sy) - gain * (py - mean2 * sy)
+        dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
+        x, y = x + dx, y + dy
+        if not (abs(x - x0) <= reach_x and abs(y - y0) <= reach_y):
+            break
+        if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
+            if (both - mean * mean2) / (deviation * deviation2) >= min_correlation:
+                return x, y
+            break
+    return np.nan, np.nan
+
+
+def cut_patches(image: NDArray[np.float32], uv: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The image (H, W) around pixels (N, 2).
+
+    Returns:
+        patches (N, S, S), NaN beyond the image, and the pixels in them (N, 2).
+    """
+    whole = np.floor(uv).astype(np.intp)
+    offsets = np.arange(-_MARGIN, _MARGIN + 1)
+    x, y = whole[:, 0, None] + offsets, whole[:, 1, None] + offsets
+    height, width = image.shape
+    patches = image[y.clip(0, height - 1)[:, :, None], x.clip(0, width - 1)[:, None, :]]
+    patches[(y < 0) | (y >= height)] = np.nan
+    patches.transpose(0, 2, 1)[(x < 0) | (x >= width)] = np.nan
+    return patches, _MARGIN + uv - whole
+
+
+def align(
+    image: NDArray[np.float32],
+    patches: NDArray[np.float32],
+    centres: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    size: NDArray[np.float64],
+    start: NDArray[np.float64],
+    min_correlation: float,
+    reach: float,
+    windows: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Pixels (N, 2) at which an image looks as the warped patches do, to sub-pixel accuracy; see `refine`.
+
+    Args:
+        image: grey (H, W).
+        patches: what is looked for (N, S, S), and
+        centres: the pixels in them (N, 2), see `cut_patches`.
+        warps: matrices (N, 2, 2) that take offsets in the image to offsets in the patch.
+        size: of the features (N,) [px]; large ones are compared in large patches.
+        start: first guess of the pixels (N, 2).
+        min_correlation: least normalised correlation.
+        reach: largest shift along and across the rows [px].
+        windows: see `patch_windows`.
+    """
+    out = np.full((len(start), 2), np.nan)
+    _align(
+        image.reshape(-1), image.shape, patches, centres, warps, size, start, min_correlation, reach, windows,
+        np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32),
+        np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros(32, np.float32), out,
+    )  # fmt: skip
+    return out
+
+
+@kernel
+def _align(
+    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, sampled, patch, weighted, gx,
+    gy, blend, out,
+):  # fmt: skip
+    """The same into `out`, on a flat image and with work space."""
+    for i in range(len(start)):
+        k = 0 if size[i] < 24.0 else 1
+        half = 7 if k == 0 else 11
+        rows, lanes = 2 * half + 1, 2 * half + 2
+        if not _sample_warped(patches[i], centres[i], warps[i], half + 1, rows + 2, lanes + 2, sampled):
             continue
-        x, y = start[i, 0], start[i, 1]
-        for _ in range(_ITERATIONS):
-            if not _sample(right, shape, x, y, half, rows, lanes, blend, patch):
-                break
-            mean2, deviation2, both, px, py = _compare(patch, windows, k, rows, lanes, weighted, gx, gy)
-            if deviation2 < 1e-3:
-                break
-            gain = deviation / deviation2
-            ex = (tx - mean * sx) - gain * (px - mean2 * sx)
-            ey = (ty - mean * sy) - gain * (py - mean2 * sy)
-            dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
-            x, y = x + dx, y + dy
-            if not (abs(x - start[i, 0]) <= reach_x and abs(y - start[i, 1]) <= reach_y):
-                break
-            if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
-                if (both - mean * mean2) / (deviation * deviation2) >= min_correlation:
-                    out[i, 0], out[i, 1] = x, y
-                break
+        mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
+        out[i, 0], out[i, 1] = _best_place(
+            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, rows, lanes,
+            mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
+        )  # fmt: skip
+
+
+@helper
+def _sample_warped(patch, centre, warp, half, rows, lanes, out):
+    """Bilinear samples (rows, lanes) of a patch, warped about its centre; False where the patch ends."""
+    size = len(patch)
+    for r in range(rows):
+        for c in range(lanes):
+            x = centre[0] + warp[0, 0] * (c - half) + warp[0, 1] * (r - half)
+            y = centre[1] + warp[1, 0] * (c - half) + warp[1, 1] * (r - half)
+            left, top = int(np.floor(x)), int(np.floor(y))
+            if c == lanes - 1:  # beyond the window, which is zero there
+                left, top = min(max(left, 0), size - 2), min(max(top, 0), size - 2)
+            if left < 0 or top < 0 or left + 1 >= size or top + 1 >= size:
+                return False
+            a, b = np.float32(y - top), np.float32(x - left)
+            first = patch[top, left] + a * (patch[top + 1, left] - patch[top, left])
+            second = patch[top, left + 1] + a * (patch[top + 1, left + 1] - patch[top, left + 1])
+            out[r, c] = first + b * (second - first)
+            if np.isnan(out[r, c]):
+                return False
+    return True

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
-from frontends.surf.correlation import patch_windows, refine
+from frontends.surf.correlation import align, cut_patches, patch_windows, refine
 from frontends.surf.epipolar import half_image, search_rows
 from frontends.surf.images import FULL_SCALE, grey
 from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
 from frontends.surf.surf import Surf
-from slam.data import StereoFeatures, StereoFrame
+from slam.data import ImagePair, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
+from slam.interfaces import Patches
 
 _SURPLUS = 1.35  # features detected for each one needed, to have a choice when spreading them
 _CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima
@@ -73,9 +74,25 @@ class SurfFrontend:
         left = images[0]
         keypoints, descriptors, threshold = self._describe(left)
         uv_right = np.full((len(keypoints), 2), np.nan)
+        pair = ImagePair(left.astype(np.float32), None if len(images) == 1 else images[1].astype(np.float32))
         if len(images) > 1:
-            uv_right = self._match(left, images[1], keypoints)
-        return self._features(frame.stamp, keypoints, uv_right, descriptors, threshold)
+            uv_right = self._match(left, images[1], pair, keypoints)
+        return self._features(frame.stamp, keypoints, uv_right, descriptors, threshold, pair)
+
+    def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
+        """The left image around pixels, see `slam.interfaces.FollowingFrontend`."""
+        return Patches(*cut_patches(images.left, uv_left), size)
+
+    def follow(
+        self, images: ImagePair, patches: Patches, warps: NDArray, uv_left: NDArray, uv_right: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Where patches are in a later pair of images, see `slam.interfaces.FollowingFrontend`."""
+        least, size = self.config.min_correlation, patches.size
+        left = align(images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._wide)
+        if images.right is None:
+            return left, np.full_like(left, np.nan)
+        start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])
+        return left, self._refine(images, left, size, start)
 
     def _image(self, frame: StereoFrame, image: NDArray, side: int) -> NDArray:
         """Grey, rectified image of the left (0) or right (1) camera."""
@@ -134,30 +151,35 @@ class SurfFrontend:
         """At most `limit` features, spread over the image."""
         return keypoints.select(spread(keypoints.uv, limit, self.config.grid, self.rig.width, self.rig.height))
 
-    def _match(self, left: NDArray, right: NDArray, keypoints: Keypoints) -> NDArray[np.float64]:
+    def _match(self, left: NDArray, right: NDArray, pair: ImagePair, keypoints: Keypoints) -> NDArray[np.float64]:
         """Right pixels (N, 2) of the left features in the rectified images, NaN where unmatched."""
         c = self.config
         low, high = self._disparities()
         scale = FULL_SCALE[left.dtype], FULL_SCALE[right.dtype]
         a, b = self._surf.workers.run([partial(half_image, left, scale[0]), partial(half_image, right, scale[1])])
-        left, right = left.astype(np.float32), right.astype(np.float32)
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
 
         def locate(first: int, last: int) -> NDArray[np.float64]:
             """Right pixels of some of the features."""
             uv, size = keypoints.uv[first:last], keypoints.size[first:last]
             start = search_rows(a, b, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
-            wide = refine(left, right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._wide)
-            # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-            reach = (_FINE_REACH, _FINE_REACH)
-            narrow = refine(left, right, uv, size, wide, c.min_correlation, reach, self._narrow)
-            return np.where(np.isfinite(narrow), narrow, wide)
+            return self._refine(pair, uv, size, start)
 
         found = np.concatenate(self._surf.workers.over(len(keypoints), locate))
         disparity = keypoints.uv[:, 0] - found[:, 0]
         off_line = np.abs(found[:, 1] - keypoints.uv[:, 1]) > c.epipolar
         found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan
         return found
+
+    def _refine(self, images: ImagePair, uv: NDArray, size: NDArray, start: NDArray) -> NDArray[np.float64]:
+        """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
+        c = self.config
+        assert images.right is not None
+        wide = refine(images.left, images.right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._wide)
+        # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
+        reach = (_FINE_REACH, _FINE_REACH)
+        narrow = refine(images.left, images.right, uv, size, wide, c.min_correlation, reach, self._narrow)
+        return np.where(np.isfinite(narrow), narrow, wide)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""
@@ -173,6 +195,7 @@ class SurfFrontend:
         uv_right: NDArray,
         descriptors: NDArray[np.float32],
         threshold: float,
+        images: ImagePair,
     ) -> StereoFeatures:
         """The features in pixels of the rig's own images."""
         uv_left: NDArray = keypoints.uv
@@ -182,5 +205,5 @@ class SurfFrontend:
         angle = np.zeros(len(keypoints)) if self.config.upright else keypoints.angle
         return StereoFeatures(
             stamp, uv_left, uv_right, keypoints.size, angle, keypoints.response, keypoints.laplacian, descriptors,
-            threshold,
+            threshold, images,
         )  # fmt: skip

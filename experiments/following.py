@@ -1,0 +1,95 @@
+"""What it is worth to follow landmarks by their image, beside finding them by their descriptors alone as the papers do.
+
+    [SLAM_DATA=/path/to/data] python experiments/following.py [--quick] [--trials 3] [--out DIR]
+
+Two worlds and, where SLAM_DATA is set, the real drives, with and without ``association.follow``; each several times,
+begun a few frames later. Prints a Markdown table: measurements of a frame, frames for which a landmark lives, error of
+the online path after alignment, CPU time of a frame; medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.tables import markdown, write_json
+from slam.compare.collect import Lifetimes
+from slam.config import SystemConfig
+from slam.evaluation.metrics import absolute_errors, associate
+from slam.geometry.trajectory import Trajectory
+from slam.sequences import Sequence, open_sequence
+from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "smoother")
+WORLDS = ("synthetic:aisle?frames=150", "synthetic:desk?frames=150")
+DRIVES = (
+    "kitti_odometry/sequences/06",
+    "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync",
+    "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
+)
+HEADER = ("sequence", "back end", "landmarks found by", "measured a frame", "lifetime [frames]", "ATE online [m]",
+          "CPU [ms]")  # fmt: skip
+_LATER = 3  # frames by which a trial begins later than the one before
+
+
+def sequences(quick: bool) -> Iterator[Sequence]:
+    """Worlds, and the drives that are there."""
+    data = Path(os.environ.get("SLAM_DATA") or "/nowhere")
+    for source in WORLDS[: 1 if quick else None]:
+        yield open_sequence(source)
+    for folder in DRIVES[: 0 if quick else None]:
+        if (data / folder).is_dir():
+            yield open_sequence(data / folder)
+
+
+def run(sequence: Sequence, backend: str, follow: bool, first: int, frames: int | None) -> list[float]:
+    """The figures of one row."""
+    config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+    config = replace(config, association=replace(config.association, follow=follow))
+    system, lifetimes = StereoSlam(sequence.rig, "surf", backend, config=config), Lifetimes()
+    stamps, poses, used, times = [], [], [], []
+    for frame in islice(sequence, first, None if frames is None else first + frames):
+        start = time.process_time()
+        result = system.process(frame)
+        times.append(1e3 * (time.process_time() - start))
+        lifetimes.add(result)
+        stamps.append(frame.stamp)
+        poses.append(result.estimate.T_world_left)
+        used.append(len(result.report.used))
+    pairs = associate(Trajectory(np.array(stamps), np.array(poses)), sequence.ground_truth, 0.02, interpolated=True)
+    error = absolute_errors(*pairs).translation_statistics.rmse
+    return [float(np.median(used)), lifetimes.figures()["lifetime_mean_frames"], error, float(np.median(times))]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="ten frames of one world")
+    parser.add_argument("--trials", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("results/following"))
+    arguments = parser.parse_args()
+    frames, trials = (10, 1) if arguments.quick else (None, arguments.trials)
+    rows = []
+    for sequence in sequences(arguments.quick):
+        for backend in BACKENDS:
+            for follow in (False, True):
+                figures = [run(sequence, backend, follow, _LATER * k, frames) for k in range(trials)]
+                how = "descriptor, then image" if follow else "descriptor"
+                rows.append([sequence.name, backend, how, *np.median(figures, axis=0).tolist()])
+                print(rows[-1], file=sys.stderr, flush=True)
+    print(markdown(HEADER, rows, 3))
+    write_json(arguments.out / "table.json", HEADER, rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
