@@ -92,7 +92,7 @@ EXPERIMENTS = (
     ),
     Experiment("faults", "Blackout, dropped frames, a kidnapped camera"),
     Experiment("frame_rate", "What a frame rate costs in accuracy"),
-    Experiment("following", "Landmarks followed by their image"),
+    Experiment("alignment", "Features aligned to their first sight"),
     Experiment("informative", "How many measurements a frame needs", "", ("informative.png",)),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
     Experiment("loops", "Long drives that come back: loops closed"),

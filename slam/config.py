@@ -26,7 +26,7 @@ MAPS = {
 #: Association by kind of motion: the looks of what a car comes nearer to are renewed: it may be seen from anywhere.
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
-    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),
+    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),
 }
 
 #: Moving objects by kind of motion: what moves on a street is faster than what a hand or a robot moves.

@@ -73,7 +73,7 @@ class StereoFeatures:
         laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
         descriptors: unit vectors (N, D) float32.
         threshold: the detector's D_threshold in force (paper A, III.A); NaN where there is none.
-        images: that they are from, for landmarks to be followed in; None where there are none.
+        images: that they are from, for features to be aligned in; None where there are none.
     """
 
     stamp: float

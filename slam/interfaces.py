@@ -66,8 +66,8 @@ class Patches:
 
 
 @runtime_checkable
-class FollowingFrontend(Protocol):
-    """What a front end offers besides, where it can follow landmarks by their image.
+class AligningFrontend(Protocol):
+    """What a front end offers besides, where it can align a feature to the image of an earlier one.
 
     Its features carry the images that they are from. All pixels are those of the rectified pair.
     """
@@ -76,10 +76,10 @@ class FollowingFrontend(Protocol):
         """The left image around pixels (N, 2) of features of some size (N,) [px]."""
         ...
 
-    def follow(
+    def align(
         self, images: ImagePair, patches: Patches, warps: Array, uv_left: Array, uv_right: Array
     ) -> tuple[Array, Array]:
-        """Where patches (N) are in a later pair of images: left and right pixels (N, 2), NaN where they are not found.
+        """Where patches (N) are in a later pair of images: left and right pixels (N, 2), NaN where they are not.
 
         `warps` (N, 2, 2) take pixel offsets in the later image to offsets in the patch; the search starts at `uv_left`
         and `uv_right` (N, 2) [px]. Called beside `Frontend.extract` of another frame.

@@ -15,7 +15,7 @@ from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoF
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, FollowingFrontend, Frontend, RevisingBackend
+from slam.interfaces import AligningFrontend, Backend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import CommonError
@@ -29,8 +29,8 @@ from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
+from slam.tracking.alignment import Aligned, Anchors, align, anchored
 from slam.tracking.feature_check import usable
-from slam.tracking.following import Anchors, Followed, anchored, follow
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
@@ -51,7 +51,7 @@ class _Last:
         state: how localization has gone.
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
-        anchors: what landmarks look like that can be followed by their image.
+        anchors: what landmarks looked like at first sight.
     """
 
     index: int = -1
@@ -241,8 +241,8 @@ class StereoSlam:
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
-            found = self._follow(raw, matches, landmarks)
-            raw, matches = replace(found.features, images=None), found.matches
+            aligned = self._align(raw, matches, landmarks)
+            raw = replace(aligned.features, images=None)
             features = self.calibration.correct(raw)
             held = self.objects.suspects
             held_rows = matches.rows[np.isin(matches.ids, held)]
@@ -262,7 +262,7 @@ class StereoSlam:
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(index, features, prediction, matches, held, held_rows, spared, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
-            anchors = self._anchored(found, matches, change.added, estimate.T_world_left)
+            anchors = self._anchored(aligned, matches, change.added, estimate.T_world_left)
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
@@ -275,21 +275,21 @@ class StereoSlam:
         )  # fmt: skip
         return result
 
-    def _follow(self, raw: StereoFeatures, matches: LandmarkMatches, landmarks: LandmarkRows) -> Followed:
-        """The frame after landmarks were followed into it by their image, where the front end can do that."""
-        if not self.config.association.follow or not isinstance(self.frontend, FollowingFrontend):
-            return Followed(raw, matches, Anchors.none())
-        positions, undone = self.backend.positions(landmarks.ids), self.calibration.applied.undone
-        return follow(self.frontend, self.rig, undone, self._last.anchors, raw, matches, landmarks, positions)
+    def _align(self, raw: StereoFeatures, matches: LandmarkMatches, landmarks: LandmarkRows) -> Aligned:
+        """Features as measured, those of landmarks where these were seen first, if the front end can do that."""
+        if not self.config.association.align or not isinstance(self.frontend, AligningFrontend):
+            return Aligned(raw, Anchors.none())
+        positions = self.backend.positions(landmarks.ids)
+        return align(self.frontend, self.rig, self._last.anchors, raw, matches, landmarks, positions)
 
     def _anchored(
-        self, found: Followed, matches: LandmarkMatches, added: LandmarkMatches, T_world_left: np.ndarray
+        self, aligned: Aligned, matches: LandmarkMatches, added: LandmarkMatches, T_world_left: np.ndarray
     ) -> Anchors:
-        """What landmarks look like that can be followed, with those of this frame."""
-        if not self.config.association.follow or not isinstance(self.frontend, FollowingFrontend):
-            return found.anchors
+        """What landmarks looked like at first sight, with those of this frame."""
+        if not self.config.association.align or not isinstance(self.frontend, AligningFrontend):
+            return aligned.anchors
         seen = LandmarkMatches(np.concatenate([matches.ids, added.ids]), np.concatenate([matches.rows, added.rows]))
-        return anchored(self.frontend, self.rig, found.anchors, found.features, seen, T_world_left)
+        return anchored(self.frontend, self.rig, aligned.anchors, aligned.features, seen, T_world_left)
 
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
         """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""

@@ -195,13 +195,13 @@ def cut_patches(image: NDArray[np.float32], uv: NDArray[np.float64]) -> tuple[ND
     return patches, _MARGIN + uv - whole
 
 
-def align(
+def align_patches(
     image: NDArray[np.float32],
     patches: NDArray[np.float32],
-    centres: NDArray[np.float64],
-    warps: NDArray[np.float64],
-    size: NDArray[np.float64],
-    start: NDArray[np.float64],
+    centres: NDArray[np.floating],
+    warps: NDArray[np.floating],
+    size: NDArray[np.floating],
+    start: NDArray[np.floating],
     min_correlation: float,
     reach: float,
     windows: NDArray[np.float32],
@@ -220,7 +220,7 @@ def align(
         windows: see `patch_windows`.
     """
     out = np.full((len(start), 2), np.nan)
-    _align(
+    _align_patches(
         image.reshape(-1), image.shape, patches, centres, warps, size, start, min_correlation, reach, windows,
         np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32),
         np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros(32, np.float32), out,
@@ -229,7 +229,7 @@ def align(
 
 
 @kernel
-def _align(
+def _align_patches(
     image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, sampled, patch, weighted, gx,
     gy, blend, out,
 ):  # fmt: skip

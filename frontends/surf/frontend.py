@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
-from frontends.surf.correlation import align, cut_patches, patch_windows, refine
+from frontends.surf.correlation import align_patches, cut_patches, patch_windows, refine
 from frontends.surf.epipolar import half_image, search_rows
 from frontends.surf.images import FULL_SCALE, grey
 from frontends.surf.integral import integral_image
@@ -69,8 +69,8 @@ class SurfFrontend:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
         if not isinstance(frame, StereoFrame):
             raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
-        pair = [frame.left] if frame.right is None else [frame.left, frame.right]
-        images = self._surf.workers.run([partial(self._image, frame, image, k) for k, image in enumerate(pair)])
+        given = [frame.left] if frame.right is None else [frame.left, frame.right]
+        images = self._surf.workers.run([partial(self._image, frame, image, k) for k, image in enumerate(given)])
         left = images[0]
         keypoints, descriptors, threshold = self._describe(left)
         uv_right = np.full((len(keypoints), 2), np.nan)
@@ -80,15 +80,17 @@ class SurfFrontend:
         return self._features(frame.stamp, keypoints, uv_right, descriptors, threshold, pair)
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
-        """The left image around pixels, see `slam.interfaces.FollowingFrontend`."""
+        """The left image around pixels, see `slam.interfaces.AligningFrontend`."""
         return Patches(*cut_patches(images.left, uv_left), size)
 
-    def follow(
+    def align(
         self, images: ImagePair, patches: Patches, warps: NDArray, uv_left: NDArray, uv_right: NDArray
     ) -> tuple[NDArray, NDArray]:
-        """Where patches are in a later pair of images, see `slam.interfaces.FollowingFrontend`."""
+        """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
         least, size = self.config.min_correlation, patches.size
-        left = align(images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._wide)
+        left = align_patches(
+            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._wide
+        )
         if images.right is None:
             return left, np.full_like(left, np.nan)
         start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])

@@ -67,8 +67,8 @@ class AssociationConfig:
         rematch_after: landmarks that were outside of the image for so many frames are looked for from any view angle
             and ratio: what they tell about the drift meanwhile is worth more than what the point may have slid. Found,
             they count as first seen from there.
-        follow: landmarks that were found by their descriptors, and those in view that were not, are looked for by the
-            image around them (see `slam.tracking.following`), where the front end can do that.
+        align: features of landmarks are moved to where the image around them is as at the landmark's first sight (see
+            `slam.tracking.alignment`), where the front end can do that.
         measured: matches that a back end gets in a frame at most, those that tell most of the camera's motion (see
             `slam.tracking.informative`); 0 for all.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
@@ -95,7 +95,7 @@ class AssociationConfig:
     view_angle: float = 20.0
     view_ratio: float = 1.4
     rematch_after: int = 10
-    follow: bool = True
+    align: bool = True
     measured: int = 0
     refined_window: float = 3.0
 

@@ -9,7 +9,7 @@ import pytest
 from frontends.surf import SurfFrontend
 from slam.data import ImagePair, StereoFrame
 from slam.geometry.rig import StereoRig
-from slam.interfaces import FollowingFrontend
+from slam.interfaces import AligningFrontend
 from tests.frontends.scenes import stereo_pair
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
@@ -31,7 +31,7 @@ def seen_later(zoom: float, degrees: float, shift: tuple[float, float]) -> tuple
 def test_a_patch_is_found_where_the_view_took_it(zoom, degrees):
     left, right = stereo_pair(DISPARITY)
     frontend = SurfFrontend(RIG, features=200)
-    assert isinstance(frontend, FollowingFrontend)
+    assert isinstance(frontend, AligningFrontend)
     features = frontend.extract(StereoFrame(0, 0.0, left, right))
     assert features.images is not None
     later, A = seen_later(zoom, degrees, (3.3, -2.6))
@@ -41,7 +41,7 @@ def test_a_patch_is_found_where_the_view_took_it(zoom, degrees):
     patches = frontend.patches(features.images, features.uv_left[inside], features.scale[inside])
     warps = np.tile(np.linalg.inv(A[:, :2]), (len(truth), 1, 1))
     start = truth + np.random.default_rng(1).uniform(-1.2, 1.2, truth.shape)
-    found, found_right = frontend.follow(later, patches, warps, start, start - (DISPARITY, 0.0))
+    found, found_right = frontend.align(later, patches, warps, start, start - (DISPARITY, 0.0))
     assert np.isfinite(found[:, 0]).mean() > 0.85
     errors = np.linalg.norm(found - truth, axis=1)
     assert np.nanmedian(errors) < 0.05
@@ -57,16 +57,16 @@ def test_what_is_not_there_is_not_found():
     other = np.roll(features.images.left, (60, 90), axis=(0, 1))
     warps = np.tile(np.eye(2), (len(features), 1, 1))
     for image in (other, np.full_like(other, 128.0)):
-        found, found_right = frontend.follow(ImagePair(image, None), patches, warps, features.uv_left, features.uv_left)
+        found, found_right = frontend.align(ImagePair(image, None), patches, warps, features.uv_left, features.uv_left)
         assert np.isfinite(found[:, 0]).mean() < 0.1
         assert not np.isfinite(found_right).any()
 
 
-def test_patches_at_the_border_are_not_followed_beyond_it():
+def test_patches_at_the_border_are_not_found():
     frontend = SurfFrontend(RIG)
     left, right = (image.astype(np.float32) for image in stereo_pair(DISPARITY))
     uv = np.array([[0.0, 0.0], [319.0, 239.0], [160.0, 120.0], [6.0, 120.0]])
     patches = frontend.patches(ImagePair(left, right), uv, np.full(4, 15.0))
-    found, _ = frontend.follow(ImagePair(left, right), patches, np.tile(np.eye(2), (4, 1, 1)), uv, uv)
+    found, _ = frontend.align(ImagePair(left, right), patches, np.tile(np.eye(2), (4, 1, 1)), uv, uv)
     assert np.isfinite(found[:, 0]).tolist() == [False, False, True, False]
     assert found[2] == pytest.approx(uv[2], abs=0.01)

@@ -1,8 +1,8 @@
-"""What it is worth to follow landmarks by their image, beside finding them by their descriptors alone as the papers do.
+"""What it is worth to align features to the image of the landmark's first sight, which the papers do not.
 
-    [SLAM_DATA=/path/to/data] python experiments/following.py [--quick] [--trials 3] [--out DIR]
+    [SLAM_DATA=/path/to/data] python experiments/alignment.py [--quick] [--trials 3] [--out DIR]
 
-Two worlds and, where SLAM_DATA is set, the real drives, with and without ``association.follow``; each several times,
+Two worlds and, where SLAM_DATA is set, the real drives, with and without ``association.align``; each several times,
 begun a few frames later. Prints a Markdown table: measurements of a frame, frames for which a landmark lives, error of
 the online path after alignment, CPU time of a frame; medians.
 """
@@ -37,7 +37,7 @@ DRIVES = (
     "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync",
     "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
 )
-HEADER = ("sequence", "back end", "landmarks found by", "measured a frame", "lifetime [frames]", "ATE online [m]",
+HEADER = ("sequence", "back end", "places of features", "measured a frame", "lifetime [frames]", "ATE online [m]",
           "CPU [ms]")  # fmt: skip
 _LATER = 3  # frames by which a trial begins later than the one before
 
@@ -52,10 +52,10 @@ def sequences(quick: bool) -> Iterator[Sequence]:
             yield open_sequence(data / folder)
 
 
-def run(sequence: Sequence, backend: str, follow: bool, first: int, frames: int | None) -> list[float]:
+def run(sequence: Sequence, backend: str, align: bool, first: int, frames: int | None) -> list[float]:
     """The figures of one row."""
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-    config = replace(config, association=replace(config.association, follow=follow))
+    config = replace(config, association=replace(config.association, align=align))
     system, lifetimes = StereoSlam(sequence.rig, "surf", backend, config=config), Lifetimes()
     stamps, poses, used, times = [], [], [], []
     for frame in islice(sequence, first, None if frames is None else first + frames):
@@ -75,15 +75,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="ten frames of one world")
     parser.add_argument("--trials", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("results/following"))
+    parser.add_argument("--out", type=Path, default=Path("results/alignment"))
     arguments = parser.parse_args()
     frames, trials = (10, 1) if arguments.quick else (None, arguments.trials)
     rows = []
     for sequence in sequences(arguments.quick):
         for backend in BACKENDS:
-            for follow in (False, True):
-                figures = [run(sequence, backend, follow, _LATER * k, frames) for k in range(trials)]
-                how = "descriptor, then image" if follow else "descriptor"
+            for align in (False, True):
+                figures = [run(sequence, backend, align, _LATER * k, frames) for k in range(trials)]
+                how = "aligned" if align else "detected"
                 rows.append([sequence.name, backend, how, *np.median(figures, axis=0).tolist()])
                 print(rows[-1], file=sys.stderr, flush=True)
     print(markdown(HEADER, rows, 3))
