@@ -28,6 +28,7 @@ _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
 _MOST_ROWS = 250  # of a frame: more say little more
 _MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
+_FAR_LIKELIER = 3.0  # logarithm of how much, twenty times; drives with an error of half a pixel show some hundred
 _CONFIGURED = 4  # pairs that the configured noise counts for
 _RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
 _TURN = 0.05  # but never rarer than once in this turn [rad]: turns are rare, and they alone show the focal length
@@ -95,20 +96,27 @@ class SelfCalibration:
         """Correct features by what is known now; returns the change, None where there is none.
 
         Nothing is corrected before motion has taken half of the prior's variance from the disparities, unless there is
-        a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Where
-        that is no longer so, the calibration as delivered is taken again. Where disparities would change by less than
+        a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Nor
+        where the calibration as delivered explains the motion nearly as well: rows have errors of their own, by wrong
+        matches for instance. Where that is no longer so, the calibration as
+        delivered is taken again. Where disparities would change by less than
         `least` standard deviations (root mean square over the image), features are corrected as before.
         """
         if not self.config.enabled:
             return None
         variance = _mean_variance(self._far, self._solution.inner)
-        known = self._kept or variance <= _KNOWN * self._unknown
+        known = self._kept or (variance <= _KNOWN * self._unknown and self._motion_agrees())
         mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
         step = mean - self.applied.parameters
         if not step.any() or np.square(self._far @ step).mean() <= least**2 * variance:
             return None
         before, self.applied = self.applied, RigCorrection(self.model, mean.copy())
         return Revision(before, self.applied)
+
+    def _motion_agrees(self) -> bool:
+        """Whether what was seen in motion is far likelier with the mean than with the calibration as delivered."""
+        parts, mean = self._parts()[1:], self._solution.mean
+        return sum(float(part.e @ mean - 0.5 * mean @ part.S @ mean) for part in parts) > _FAR_LIKELIER
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""
