@@ -4,7 +4,7 @@ With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i
 ``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
 what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``. Errors of the rig are the same in all
 frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
-old place is measured again the sum may not be positive definite; such stretches are left out.
+old place is measured again the former may not be positive definite; such stretches are left out.
 
 Truth has errors of its own. `TruthNoise` gives each true pose an independent one, the first included: the turn of a
 recording's first true pose would otherwise count as an error of the whole path. What is the same in all poses, a turn
@@ -103,15 +103,16 @@ def stretch_nees(
     estimated = inverse(own.poses[first]) @ own.poses[last]
     residuals = pose_residuals(estimated, inverse(true.poses[first]) @ true.poses[last])
     A = np.array([adjoint(inverse(T)) for T in estimated]).reshape(-1, _DOF, _DOF)
-    P = covariances[last] - A @ covariances[first] @ np.swapaxes(A, 1, 2)
-    if common is not None:
-        P = P + np.array([_shared(a, common[i], common[j]) for a, i, j in zip(A, first, last)]).reshape(P.shape)
+    noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
     Q = _truth_covariances(true, noise)
-    P = P + Q[last] + A @ Q[first] @ np.swapaxes(A, 1, 2)
-    P = 0.5 * (P + np.swapaxes(P, 1, 2))
-    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
+    N = noises[last] + Q[last] - A @ (noises[first] - Q[first]) @ np.swapaxes(A, 1, 2)
+    N = 0.5 * (N + np.swapaxes(N, 1, 2))
+    finite = np.isfinite(N).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
     usable = np.flatnonzero(finite & ~doubtful(true, noise, first, last))
-    usable = usable[np.linalg.eigvalsh(P[usable])[:, 0] > _SMALLEST]
+    usable = usable[np.linalg.eigvalsh(N[usable])[:, 0] > _SMALLEST]
+    P = N
+    if common is not None:
+        P = N + np.array([_shared(a, common[i], common[j]) for a, i, j in zip(A, first, last)]).reshape(N.shape)
     values = np.full(len(first), np.nan)
     if len(usable):
         r = _remounted(residuals[usable], A[usable], P[usable], noise.mounting)
@@ -149,11 +150,11 @@ def _remounted(residuals: Array, A: Array, P: Array, mounting: float) -> Array:
 
 
 def _shared(A: Array, first: CommonError, last: CommonError) -> Array:
-    """What the covariance of a relative pose (6, 6) has to be changed by, as the poses at its ends share errors."""
-    if not first.shares.shape[1] == last.shares.shape[1] > 0:
-        return np.zeros((_DOF, _DOF))
-    relative = (last.shares - A @ first.shares) @ last.scale
-    return np.asarray(relative @ relative.T - last.covariance + A @ first.covariance @ A.T)
+    """What errors that the poses at its ends share add to the covariance of a relative pose (6, 6)."""
+    if first.shares.shape == last.shares.shape:
+        relative = (last.shares - A @ first.shares) @ last.scale
+        return np.asarray(relative @ relative.T)
+    return np.asarray(last.covariance - A @ first.covariance @ A.T)  # one is after a loop, where nothing is apart
 
 
 def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:
