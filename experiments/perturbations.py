@@ -1,11 +1,13 @@
-"""Spoilt recordings: unequal exposure, noise, flicker, half the frame rate, a vertical error of the right camera.
+"""Real drives many times over, each time a little different; and with images that are spoilt.
 
-    SLAM_DATA=/path/to/data python experiments/perturbations.py [--quick] [--trials N] [--out DIR]
+    SLAM_DATA=/path/to/data python experiments/perturbations.py [--quick] [--trials N] [--frames N] [--out DIR]
 
-Each fault is put into the images of two real drives. As single figures of SLAM say little, each is run several times,
-with another first frame, pixel noise of half a grey level, and up to 20 % more or fewer features. Prints a Markdown
-table: medians of the online ATE, and frames without a measured pose, all runs together. A run of all faults takes some
-six minutes of processor time.
+As single figures of SLAM say little, each drive is run several times, with another first frame, pixel noise of half a
+grey level, and up to 20 % more or fewer features; both back ends get the same features. Two of the drives are run with
+spoilt images as well: unequal exposure, noise, flicker, half the frame rate, a vertical error of the right camera.
+Prints two Markdown tables: medians and quartiles of the online ATE of the first frames of a drive, and frames without a
+measured pose, all trials together. The rows are written as they come. A trial of everything takes some four minutes of
+processor time, of which half is the front end's.
 """
 
 from __future__ import annotations
@@ -31,12 +33,15 @@ from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
+_DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
 DRIVES = {
-    "KITTI 06": ("kitti_odometry/sequences/06", 51),
-    "raw 0001": ("kitti_raw/2011_09_26/2011_09_26_drive_0001_sync", 108),
+    "KITTI 06": "kitti_odometry/sequences/06",
+    "raw 0001": f"{_DAY}0001_sync",
+    "raw 0013": f"{_DAY}0013_sync",
 }
+SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
 BACKENDS = ("ekf", "smoother")
-HEADER = ("fault", "drive", "ATE ekf [m]", "ATE smoother [m]", "frames", "lost ekf", "lost smoother")
+FIGURES = ("ATE ekf [m]", "ATE smoother [m]", "frames", "lost ekf", "lost smoother")
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
@@ -97,8 +102,8 @@ class Fault:
     every: int = 1
 
 
+NONE = Fault("none", unspoilt)
 FAULTS = (
-    Fault("none", unspoilt),
     Fault("right image 1.3 times as bright", exposed),
     Fault("noise of 5 grey levels", noisy(5.0)),
     Fault("noise of 10 grey levels", noisy(10.0)),
@@ -124,7 +129,7 @@ class Outcome:
     lost: int
 
 
-def spoilt(sequence: Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
+def frames_of(sequence: Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
     """The frames of one trial; no frame depends on which others are taken."""
     first = np.random.default_rng(trial).integers(_FIRST)
     for frame in sequence.frames(int(first), last):
@@ -142,7 +147,7 @@ def extracted(sequence: Sequence, fault: Fault, last: int, trial: int) -> list[S
     plain = create("surf", sequence.rig, **options)
     more = np.random.default_rng([trial, 1]).uniform(1 - _FEATURES, 1 + _FEATURES)
     frontend = create("surf", sequence.rig, **{**options, "features": round(more * plain.config.features)})
-    return [frontend.extract(frame) for frame in spoilt(sequence, fault, last, trial)]
+    return [frontend.extract(frame) for frame in frames_of(sequence, fault, last, trial)]
 
 
 def run(sequence: Sequence, features: list[StereoFeatures], backend: str) -> Outcome:
@@ -155,42 +160,60 @@ def run(sequence: Sequence, features: list[StereoFeatures], backend: str) -> Out
     return Outcome(float("nan") if ate is None else float(ate), len(results), len(results) - len(measured))
 
 
-def row(fault: Fault, name: str, sequence: Sequence, last: int, trials: int) -> list[object]:
-    """A row of the table."""
+def figures(fault: Fault, sequence: Sequence, last: int, trials: int) -> list[object]:
+    """The figures of a row, in the order of `FIGURES`."""
     outcomes: dict[str, list[Outcome]] = {backend: [] for backend in BACKENDS}
     for trial in range(trials):
         features = extracted(sequence, fault, last, trial)
         for backend in BACKENDS:
             outcomes[backend].append(run(sequence, features, backend))
-    ates = [f"{np.median([o.ate for o in outcomes[backend]]):.3f}" for backend in BACKENDS]
+    ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in BACKENDS]
     lost = [sum(o.lost for o in outcomes[backend]) for backend in BACKENDS]
-    return [fault.name, name, *ates, sum(o.frames for o in outcomes[BACKENDS[0]]), *lost]
+    return [*ates, sum(o.frames for o in outcomes[BACKENDS[0]]), *lost]
+
+
+def quartiles(values: list[float]) -> str:
+    """The median and, of several values, the quartiles; those without a figure are left out, and said."""
+    known = [value for value in values if np.isfinite(value)]
+    if not known:
+        return "–"
+    low, middle, high = np.percentile(known, [25, 50, 75])
+    missing = f", {len(values) - len(known)} without" if len(known) < len(values) else ""
+    return f"{middle:.3f}{missing}" if len(values) == 1 else f"{middle:.3f} ({low:.3f}–{high:.3f}){missing}"
+
+
+def table(faults: tuple[Fault, ...], places: dict[str, Path], last: int, trials: int, out: Path) -> str:
+    """Run all faults on all drives; the table, which is written to `out` row by row."""
+    header, rows = ("images", "drive", *FIGURES), []
+    for fault in faults:
+        for name, folder in places.items():
+            rows.append([fault.name, name, *figures(fault, open_sequence(folder), last, trials)])
+            print(rows[-1], file=sys.stderr, flush=True)
+            write_json(out, header, rows)
+    return markdown(header, rows, 2)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two faults, one trial, ten frames of one drive")
-    parser.add_argument("--trials", type=int, default=5, help="runs of each fault")
+    parser.add_argument("--trials", type=int, default=10, help="runs of each row")
+    parser.add_argument("--frames", type=int, default=60, help="of each drive, at most")
     parser.add_argument("--out", type=Path, default=Path("results/perturbations"))
     arguments = parser.parse_args()
     data = os.environ.get("SLAM_DATA")
     if not data:
         print("perturbations: set SLAM_DATA to the folder that holds the drives; nothing was run")
         return 0
-    found = {name: (Path(data) / folder, last) for name, (folder, last) in DRIVES.items()}
-    found = {name: place for name, place in found.items() if place[0].is_dir()}
-    faults, trials = FAULTS, arguments.trials
+    found = {name: Path(data) / folder for name, folder in DRIVES.items() if (Path(data) / folder).is_dir()}
+    faults, trials, frames = FAULTS, arguments.trials, arguments.frames
     if arguments.quick:
-        faults, trials = (FAULTS[1], FAULTS[5]), 1
-        found = {name: (folder, 15) for name, (folder, _) in list(found.items())[:1]}
-    rows = []
-    for fault in faults:
-        for name, (folder, last) in found.items():
-            rows.append(row(fault, name, open_sequence(folder), last, trials))
-            print(rows[-1], file=sys.stderr, flush=True)
-    print(f"Medians of {trials} runs.\n")
-    print(markdown(HEADER, rows, 2))
-    write_json(arguments.out / "table.json", HEADER, rows)
+        faults, trials, frames = (FAULTS[0], FAULTS[4]), 1, 15
+        found = dict(list(found.items())[:1])
+    print(f"Medians and quartiles of {trials} runs of the first {frames} frames, the images as they are:\n")
+    print(table((NONE,), found, frames, trials, arguments.out / "drives.json"))
+    spoilt_drives = {name: folder for name, folder in found.items() if name in SPOILT}
+    print("\nThe same with spoilt images:\n")
+    print(table(faults, spoilt_drives, frames, trials, arguments.out / "spoilt.json"))
     return 0
 
 

@@ -100,7 +100,7 @@ EXPERIMENTS = (
         "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
         arguments=("--wrong", "0", "0.05", "0.1", "0.2"),
     ),
-    Experiment("perturbations", "Spoilt recordings", arguments=("--trials", "3")),
+    Experiment("perturbations", "Real drives many times over, and spoilt"),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip
 

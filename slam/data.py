@@ -274,6 +274,25 @@ class Estimate:
         return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
 
 
+@dataclass(frozen=True)
+class CommonError:
+    """The part of a pose's error that all poses of a run share, as the rig's error makes it: ``shares @ scale @ c``.
+
+    Attributes:
+        shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
+        scale: these errors by ones of unit variance, c, as they are known now (m, m).
+    """
+
+    shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def covariance(self) -> Array:
+        """What it adds to the pose's covariance (6, 6)."""
+        root = self.shares @ self.scale
+        return np.asarray(root @ root.T)
+
+
 class Revision(Protocol):
     """A change of the rig's correction in the course of a run, for measurements that were corrected as before."""
 
@@ -328,6 +347,7 @@ class FrameResult:
         refused_loop: the same of a frame whose place seemed to be this one, where the path contradicts that.
         keyframe: whether the frame has become a keyframe.
         returned: ids of landmarks of that place that came back into the map.
+        common: the part of the pose's covariance that all frames share; empty after a loop, which mixes the two.
     """
 
     index: int
@@ -353,6 +373,7 @@ class FrameResult:
     refused_loop: int | None = None
     keyframe: bool = False
     returned: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    common: CommonError = field(default_factory=CommonError)
 
     def __repr__(self) -> str:
         why = f" ({self.reason})" if self.reason else ""

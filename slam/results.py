@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import FrameResult, FrameStatus, Revision, UpdateStatus
+from slam.data import CommonError, FrameResult, FrameStatus, Revision, UpdateStatus
 from slam.geometry.se3 import Array, inverse
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.mapper import MapChange, Step
@@ -22,6 +22,7 @@ def frame_result(
     revision: Revision | None,
     milliseconds: Mapping[str, float],
     atlas: Atlas,
+    common: CommonError,
 ) -> FrameResult:
     """What a step did.
 
@@ -33,6 +34,7 @@ def frame_result(
         revision: how the pixels of earlier frames were corrected anew before it.
         milliseconds: wall time per stage.
         atlas: after the step; takes poses to the map.
+        common: the part of the pose's error that it shares with those of other frames, as they were given.
     """
     status, reason = frame_status(step, len(change.added), mapped_before)
     return FrameResult(
@@ -58,6 +60,7 @@ def frame_result(
         refused_loop=atlas.refused_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
         returned=change.returned.ids,
+        common=common if atlas.anchor is None else CommonError(),
     )
 
 

@@ -9,16 +9,15 @@ from typing import overload
 import numpy as np
 
 from slam import registry
-from slam.calibration import KeptCalibration, Revision, RigUncertainty, SelfCalibration
+from slam.calibration import KeptCalibration, Revision, RigCorrection, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
+from slam.data import CommonError, Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import AligningFrontend, Backend, Frontend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.atlas.keyframes import CommonError
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper, Step
@@ -266,9 +265,10 @@ class StereoSlam:
             new = np.setdiff1d(change.added.ids, change.erased)
             self._uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
-            step = replace(step, estimate=self._considered(estimate), common=self._common_error())
+            step = replace(step, estimate=self._considered(estimate), common=self._common_error(self._accounted))
             atlas, change = self._close_loops(step, change)
-        result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas)
+        common = self._common_error(self.calibration.applied)
+        result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
             self._last.after(step, change, anchors), change.landmarks, atlas, Stages(),
@@ -343,7 +343,7 @@ class StereoSlam:
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
-        return self.atlas.estimate(self._considered(self.backend.estimate()), self._common_error())
+        return self.atlas.estimate(self._considered(self.backend.estimate()), self._common_error(self._accounted))
 
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.
@@ -383,12 +383,17 @@ class StereoSlam:
             return estimate
         return self._uncertainty.added_to(estimate, self.calibration.posterior.covariance)
 
-    def _common_error(self) -> CommonError:
-        """The part of the pose's error that it shares with those of other frames."""
+    def _common_error(self, made_with: RigCorrection) -> CommonError:
+        """The part of the pose's error that it shares with those of other frames.
+
+        Args:
+            made_with: the correction that the poses were made with: `_accounted` for the path as it is now, in which a
+                back end may have revised earlier poses; the applied one for poses as they were given.
+        """
         if not self.calibration.config.enabled:
             return CommonError()
         covariance = self.calibration.posterior.covariance
-        return CommonError(*self._uncertainty.shared(covariance, self._accounted.parameters))
+        return CommonError(*self._uncertainty.shared(covariance, made_with.parameters))
 
     def _revise(self) -> Revision | None:
         """Apply what has become known of the rig's error, also to what a back end was given before, if it can do that.

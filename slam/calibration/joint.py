@@ -17,6 +17,7 @@ from slam.geometry.se3 import Array
 
 #: Recordings agree in a parameter where they differ by less than so many standard deviations of their difference.
 AGREES = 2.0
+_SAYS = 1.0  # of the prior's information on a parameter: a recording that adds less says nothing of it
 _DIFFERS = 3.0  # and do not where by more than so many; between the two, chance may do it in one of 21 parameters
 
 
@@ -46,12 +47,13 @@ def joint_calibration(model: RigModel, evidence: Sequence[Evidence], systematic:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far recordings are from each other.
+    """How far recordings are from each other, by what each says itself.
 
     Attributes:
         names: of the parameters (n,).
-        largest: the largest difference of two recordings in each parameter (n,) [standard deviations].
-        pairs: the recordings (n, 2) that differ so much.
+        largest: the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN where fewer
+            than two say anything.
+        pairs: the recordings (n, 2) that differ so much; no meaning where there is no difference.
     """
 
     names: tuple[str, ...]
@@ -61,26 +63,47 @@ class Agreement:
     @property
     def words(self) -> str:
         """The result in a line."""
-        worst = int(np.argmax(self.largest))
+        known = np.isfinite(self.largest)
+        if not known.any():
+            return "Nothing can be said of whether the recordings agree: no parameter is shown by two of them."
+        worst, total = int(np.nanargmax(self.largest)), len(known)
+        every = "every parameter" if known.all() else f"all {known.sum()} of {total} parameters that two of them show"
         least = f"the largest difference is {self.largest[worst]:.1f} sigma, in {self.names[worst]}"
         if self.largest[worst] <= AGREES:
-            return f"The recordings agree in every parameter: {least}."
+            return f"The recordings agree in {every}: {least}."
         differing = [name for name, z in zip(self.names, self.largest) if z > AGREES]
         if self.largest[worst] <= _DIFFERS:
             return f"The recordings agree, but for {', '.join(differing)}, where chance may do it: {least}."
         return f"The recordings do not agree in {', '.join(differing)}: {least}. Is it one rig, and has it not changed?"
 
 
-def agreement(posteriors: Sequence[RigPosterior]) -> Agreement | None:
-    """Differences of each two recordings (what each alone makes of the calibration as delivered); None of one alone.
+def agreement(model: RigModel, evidence: Sequence[Evidence], systematic: float) -> Agreement | None:
+    """Differences of each two recordings; None of one alone.
 
-    Where a recording says little both are near the calibration as delivered: that is no evidence of agreement, and wide
-    standard deviations show it.
+    What they share, the prior, is no evidence of agreement. So the prior is taken away from each parameter's marginal
+    posterior: the quotient of the two is the likelihood of that parameter by the recording alone, whatever the others
+    are. A recording that says less of a parameter than the prior says nothing.
+
+    Args:
+        model: the parameters' meaning.
+        evidence: of each recording, without any prior.
+        systematic: as `joint_calibration` has it.
     """
-    if len(posteriors) < 2:
+    if len(evidence) < 2:
         return None
-    mean, variance = (np.array([getattr(p, name) for p in posteriors]) for name in ("mean", "sigma"))
-    first, second = np.triu_indices(len(posteriors), 1)
-    z = np.abs(mean[first] - mean[second]) / np.hypot(variance[first], variance[second])
-    rows = np.argmax(z, axis=0)
-    return Agreement(posteriors[0].names, z.max(axis=0), np.column_stack([first[rows], second[rows]]))
+    prior, variance = as_delivered(model).covariances[-1], systematic_variance(model, systematic)
+    before = 1 / np.diag(prior)
+    means, informations = [], []
+    for part in evidence:
+        part = part.with_error(variance)
+        covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
+        moved = covariance @ part.cross
+        after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))
+        said = np.where(after - before > _SAYS * before, after - before, np.nan)
+        means.append(after * (covariance @ part.e) / said)
+        informations.append(said)
+    mean, own = np.array(means), 1 / np.array(informations)
+    first, second = np.triu_indices(len(evidence), 1)
+    z = np.abs(mean[first] - mean[second]) / np.sqrt(own[first] + own[second])
+    rows = np.argmax(np.nan_to_num(z, nan=-1.0), axis=0)
+    return Agreement(model.names, z[rows, np.arange(z.shape[1])], np.column_stack([first[rows], second[rows]]))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -44,6 +46,8 @@ def calibrate(
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
     done = run([open_sequence(text, format=format) for text in texts], targets, show, settings, frames)
+    if done.warning:
+        logging.getLogger(__name__).warning("%s", done.warning)
     if not quiet:
         _print(done)
         if targets.opencv is not None or targets.kalibr is not None:
@@ -65,13 +69,18 @@ def _print(done: Calibrated) -> None:
     for row, name in enumerate(joint.names):
         beliefs = [joint, *(one.posterior for one in shown)]
         cells = [_cell(float(p.mean[row]), float(p.sigma[row])) for p in beliefs]
-        table.add_row(name, *cells, *([] if done.agreed is None else [f"{done.agreed.largest[row]:.1f} σ"]))
+        table.add_row(name, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
     console.print(table)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
     if done.agreed is not None:
         console.print(done.agreed.words, markup=False)
+
+
+def _sigmas(difference: float) -> str:
+    """A difference in standard deviations; a dash where there is none."""
+    return f"{difference:.1f} σ" if np.isfinite(difference) else "–"
 
 
 def _cell(mean: float, sigma: float) -> str:

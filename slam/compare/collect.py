@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.compare.frames import count_one
 from slam.compare.measure import object_figures
-from slam.data import FrameResult, FrameStatus, IdArray
+from slam.data import CommonError, FrameResult, FrameStatus, IdArray
 from slam.errors import TrajectoryError
 from slam.evaluation.association_truth import SurfacePoints, TrueWorld
 from slam.evaluation.consistency import STRETCHES, stretch_nees
@@ -106,6 +106,7 @@ class Collector:
                 dict(result.milliseconds),
                 result.located,
                 result.T_map_odom,
+                result.common,
             )
         )
 
@@ -122,20 +123,19 @@ class Collector:
         if not frames:
             return Measured({}, {}, np.zeros((0, len(SERIES_COLUMNS))))
         online = Trajectory(np.array([f.stamp for f in frames]), np.array([f.pose for f in frames]))
-        covariances = np.array([f.covariance for f in frames])
         rows = np.array([f.tracked for f in frames])
-        tracked, honest = online.select(rows), covariances[rows]
+        tracked = online.select(rows)
         final = final.select(pair(final.stamps, tracked.stamps, _SAME) >= 0)
         metrics = {
             **_accuracy(tracked, final, self.sequence),
             **_loop_figures(tracked, np.array([f.T_map_odom for f in frames])[rows], self.sequence, summary),
-            **_consistency(tracked, honest, self.sequence, frames),
+            **_consistency(tracked, self.sequence, frames),
             **self._landmark_errors(final, ids, positions),
             **self._map_figures(),
             **object_figures(summary),
         }
         metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
-        return Measured(metrics, _milliseconds(self._frames), _series(online, covariances, self.sequence, frames))
+        return Measured(metrics, _milliseconds(self._frames), _series(online, self.sequence, frames))
 
     def _landmark_errors(self, final: Trajectory, ids: IdArray, positions: Array) -> dict[str, float]:
         """Distances of the map's landmarks from the surface points they are, after the alignment of the poses."""
@@ -205,6 +205,7 @@ class _Frame:
     milliseconds: dict[str, float]
     located: bool
     T_map_odom: Array
+    common: CommonError
 
     @property
     def tracked(self) -> bool:
@@ -270,9 +271,11 @@ def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
     return {"rpe_1s_m": errors.translation_statistics.rmse, "rpe_1s_deg": errors.rotation_statistics.rmse}
 
 
-def _consistency(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> dict[str, float]:
-    """NEES from the start and over stretches of the path, scale, and NIS."""
-    found = consistency(online, covariances, sequence) if len(online) else {}
+def _consistency(tracked: Trajectory, sequence: Sequence, frames: list[_Frame]) -> dict[str, float]:
+    """NEES from the start and over stretches of the path, scale, and NIS; accuracy is that of tracked frames."""
+    known = [f for f in frames if f.tracked]
+    covariances, common = np.array([f.covariance for f in known]), [f.common for f in known]
+    found = consistency(tracked, covariances, sequence, common) if known else {}
     names = {"nees_per_dof": "mean NEES"}
     names.update({f"nees_{length:g}m_per_dof": f"NEES over {length:g} m" for length in STRETCHES})
     figures = {key: found[name] / found["dof"] for key, name in names.items() if name in found}
@@ -293,11 +296,12 @@ def _milliseconds(frames: list[_Frame]) -> dict[str, float]:
     return {**medians, "total": float(np.median([sum(m.values()) for m in later]))}
 
 
-def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: list[_Frame]) -> Array:
+def _series(online: Trajectory, sequence: Sequence, frames: list[_Frame]) -> Array:
     """Error, claimed deviations, NEES and NIS of every frame, relative to the first pose: rows of `SERIES_COLUMNS`."""
     rows = np.full((len(frames), len(SERIES_COLUMNS)), np.nan)
     rows[:, 0] = [f.number for f in frames]
     rows[:, 1] = online.stamps
+    covariances = np.array([f.covariance for f in frames])
     R, P = online.poses[:, :3, :3], covariances[:, 3:, 3:]
     rows[:, 5:8] = np.sqrt(np.maximum(np.diagonal(R @ P @ np.swapaxes(R, 1, 2), axis1=1, axis2=2), 0))
     rows[:, 10:14] = [(f.nis, f.dof, f.map_size, f.tracked) for f in frames]
@@ -311,15 +315,16 @@ def _series(online: Trajectory, covariances: Array, sequence: Sequence, frames: 
     rows[at, 2:5] = own.positions - expected[:, :3, 3]
     rows[at, 8] = rotation_angle(np.swapaxes(expected[:, :3, :3], 1, 2) @ own.poses[:, :3, :3])
     if len(at) > 1 and at[0] == tracked[0]:
-        rows[at, 9] = _nees_from_start(own, true, covariances[at], getattr(sequence, "truth_noise", TruthNoise()))
+        noise, common = getattr(sequence, "truth_noise", TruthNoise()), [frames[row].common for row in at]
+        rows[at, 9] = _nees_from_start(own, true, covariances[at], noise, common)
     return rows
 
 
-def _nees_from_start(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> Array:
+def _nees_from_start(
+    own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise, common: list[CommonError]
+) -> Array:
     """NEES (N,) of each pose relative to the first; NaN for the first, and where a covariance is none."""
     values = np.full(len(own), np.nan)
-    first = np.zeros(1, np.intp)
-    for k in range(1, len(own)):  # one by one: `stretch_nees` does not say which it leaves out
-        found = stretch_nees(own, true, covariances, noise, first, first + k)
-        values[k] = found[0] if len(found) else np.nan
+    first = np.zeros(len(own) - 1, np.intp)
+    values[1:] = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)), common)
     return values

@@ -1,34 +1,44 @@
 """Whether pose covariances are as large as the errors: NEES from the start, over stretches of the path, and of scale.
 
 With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i to frame j is, to first order,
-``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry grow by increments that do not depend on what was
-before, so the covariance of that difference is ``P_j − A P_i Aᵀ``. Where an old place is measured again it may not be
-positive definite; such stretches are left out.
+``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
+what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``. Errors of the rig are the same in all
+frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
+old place is measured again the former may not be positive definite; such stretches are left out.
 
 Truth has errors of its own. `TruthNoise` gives each true pose an independent one, the first included: the turn of a
-recording's first true pose would otherwise count as an error of the whole path.
+recording's first true pose would otherwise count as an error of the whole path. What is the same in all poses, a turn
+between the axes of the truth's sensor and the camera's, is found from all stretches of one length by least squares and
+taken out. Stretches over which the truth contradicts itself are not judged (`slam.evaluation.doubtful_truth`).
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
 
+import numpy as np
+
+from slam.data import CommonError
+from slam.evaluation.doubtful_truth import RowArray, doubtful
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.geometry.arrays import Array
-from slam.geometry.se3 import adjoint, inverse
+from slam.geometry.se3 import adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 
 #: Lengths of the stretches over which relative poses are judged [m].
 STRETCHES = (1.0, 10.0, 100.0)
 
-RowArray = NDArray[np.intp]
-
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
 
 
-def consistency_figures(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:
+def consistency_figures(
+    own: Trajectory,
+    true: Trajectory,
+    covariances: Array,
+    noise: TruthNoise,
+    common: Sequence[CommonError] | None = None,
+) -> dict[str, float]:
     """The figures of a run's summary; those that the path is too short for are left out.
 
     One run's errors are correlated over time: its mean may leave the band, which holds for independent ones, without
@@ -39,14 +49,16 @@ def consistency_figures(own: Trajectory, true: Trajectory, covariances: Array, n
         true: the truth at the same stamps.
         covariances: of the path's poses (N, 6, 6).
         noise: of the truth.
+        common: the part of the covariances that the poses share (N); None for none.
 
     Returns:
         "mean NEES" from the start and its 95 % band for independent errors, "NEES over L m" for each of `STRETCHES`;
-        six is right for all of these; "scale error [%]" and "scale sigma [%]".
+        six is right for all of these; "doubtful truth over L m", the share of stretches left out, where there are any;
+        "scale error [%]" and "scale sigma [%]".
     """
     first = np.zeros(len(own) - 1, np.intp)
-    from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)))
-    low, high = chi_square_band(_DOF, max(len(from_start), 1))
+    from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)), common)
+    low, high = chi_square_band(_DOF, max(int(np.isfinite(from_start).sum()), 1))
     figures = {"mean NEES": _mean(from_start), "band low": low, "band high": high, "dof": float(_DOF)}
     closed = _closings(covariances)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(true.positions, axis=0), axis=1).cumsum()])
@@ -54,9 +66,12 @@ def consistency_figures(own: Trajectory, true: Trajectory, covariances: Array, n
         last = np.searchsorted(along, along + length).astype(np.intp)
         starts = np.flatnonzero(last < len(own))
         starts = starts[closed[starts] == closed[last[starts]]]
-        values = stretch_nees(own, true, covariances, noise, starts, last[starts])
-        if len(values):
+        values = stretch_nees(own, true, covariances, noise, starts, last[starts], common)
+        if np.isfinite(values).any():
             figures[f"NEES over {length:g} m"] = _mean(values)
+        left_out = doubtful(true, noise, starts, last[starts])
+        if left_out.any():
+            figures[f"doubtful truth over {length:g} m"] = float(np.mean(left_out))
     figures.update(_scale(own, true, covariances, noise))
     return figures
 
@@ -72,19 +87,74 @@ def _closings(covariances: Array) -> RowArray:
 
 
 def stretch_nees(
-    own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise, first: RowArray, last: RowArray
+    own: Trajectory,
+    true: Trajectory,
+    covariances: Array,
+    noise: TruthNoise,
+    first: RowArray,
+    last: RowArray,
+    common: Sequence[CommonError] | None = None,
 ) -> Array:
-    """NEES (K,) of the relative poses between rows `first` and `last` (M,); K < M where covariances are unusable."""
+    """NEES (M,) of the relative poses between rows `first` and `last` (M,).
+
+    NaN where the covariance is none, or the truth is doubtful.
+    """
+    first, last = np.broadcast_arrays(first, last)
     estimated = inverse(own.poses[first]) @ own.poses[last]
     residuals = pose_residuals(estimated, inverse(true.poses[first]) @ true.poses[last])
     A = np.array([adjoint(inverse(T)) for T in estimated]).reshape(-1, _DOF, _DOF)
-    P = covariances[last] - A @ covariances[first] @ np.swapaxes(A, 1, 2)
-    P = P + noise.covariance + A @ noise.covariance @ np.swapaxes(A, 1, 2)
-    P = 0.5 * (P + np.swapaxes(P, 1, 2))
-    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
-    usable = np.flatnonzero(finite)
-    usable = usable[np.linalg.eigvalsh(P[usable])[:, 0] > _SMALLEST]
-    return nees(residuals[usable], P[usable])
+    noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
+    Q = _truth_covariances(true, noise)
+    N = noises[last] + Q[last] - A @ (noises[first] - Q[first]) @ np.swapaxes(A, 1, 2)
+    N = 0.5 * (N + np.swapaxes(N, 1, 2))
+    finite = np.isfinite(N).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
+    usable = np.flatnonzero(finite & ~doubtful(true, noise, first, last))
+    usable = usable[np.linalg.eigvalsh(N[usable])[:, 0] > _SMALLEST]
+    P = N
+    if common is not None:
+        P = N + np.array([_shared(a, common[i], common[j]) for a, i, j in zip(A, first, last)]).reshape(N.shape)
+    values = np.full(len(first), np.nan)
+    if len(usable):
+        r = _remounted(residuals[usable], A[usable], P[usable], noise.mounting)
+        values[usable] = nees(r, P[usable])
+    return values
+
+
+def _truth_covariances(true: Trajectory, noise: TruthNoise) -> Array:
+    """Covariances (N, 6, 6) of the true poses; the error of a stamp is one along the motion."""
+    Q = np.tile(noise.covariance, (len(true), 1, 1))
+    if noise.time and len(true) > 1:
+        rate = log(inverse(true.poses[:-1]) @ true.poses[1:]) / np.diff(true.stamps)[:, None]
+        moved = noise.time * np.concatenate([rate, rate[-1:]])
+        Q += moved[:, :, None] * moved[:, None]
+    return Q
+
+
+def _remounted(residuals: Array, A: Array, P: Array, mounting: float) -> Array:
+    """Residuals (M, 6) without what a constant rotation between the truth's axes and the camera's explains of them.
+
+    With ``T_true = T exp(w)`` for all poses, a relative pose is off by ``(1 − A) w``.
+
+    Args:
+        residuals: of relative poses (M, 6).
+        A: adjoints (M, 6, 6) of their inverses.
+        P: their covariances (M, 6, 6).
+        mounting: standard deviation of each axis of w beforehand [rad].
+    """
+    if not mounting:
+        return residuals
+    J = (np.eye(_DOF) - A)[:, :, :3]
+    JW = np.swapaxes(np.linalg.solve(P, J), 1, 2)
+    information = np.tensordot(JW, J, axes=((0, 2), (0, 1))) + np.eye(3) / mounting**2
+    return residuals - J @ np.linalg.solve(information, np.tensordot(JW, residuals, axes=((0, 2), (0, 1))))
+
+
+def _shared(A: Array, first: CommonError, last: CommonError) -> Array:
+    """What errors that the poses at its ends share add to the covariance of a relative pose (6, 6)."""
+    if first.shares.shape == last.shares.shape:
+        relative = (last.shares - A @ first.shares) @ last.scale
+        return np.asarray(relative @ relative.T)
+    return np.asarray(last.covariance - A @ first.covariance @ A.T)  # one is after a loop, where nothing is apart
 
 
 def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:
@@ -106,7 +176,7 @@ def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNo
 
 
 def _mean(values: Array) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 def verdict(figures: dict[str, float]) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 
+from slam.data import CommonError
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import consistency_figures
 from slam.evaluation.metrics import (
@@ -86,17 +88,21 @@ def _against_truth(own: Trajectory, true: Trajectory) -> dict[str, float]:
     }
 
 
-def consistency(estimate: Trajectory, covariances: Array, sequence: WithTruth) -> dict[str, float]:
+def consistency(
+    estimate: Trajectory, covariances: Array, sequence: WithTruth, common: Sequence[CommonError] | None = None
+) -> dict[str, float]:
     """How honest the pose covariances are, see `slam.evaluation.consistency`; empty without truth for the first pose.
 
     Args:
         estimate: the online path.
         covariances: of its poses (N, 6, 6).
         sequence: with ground truth or without; its `truth_noise`, where it has one, is that of the truth.
+        common: the part of the covariances that the poses share (N); None where that is not known, or nothing.
     """
     pairs = _common(estimate, sequence.ground_truth)
     if pairs is None or pairs[0].stamps[0] != estimate.stamps[0]:
         return {}
     rows = np.searchsorted(estimate.stamps, pairs[0].stamps)
     noise = getattr(sequence, "truth_noise", TruthNoise())
-    return consistency_figures(*pairs, covariances[rows], noise)
+    shared = None if common is None else [common[row] for row in rows]
+    return consistency_figures(*pairs, covariances[rows], noise, shared)

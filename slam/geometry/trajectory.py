@@ -185,12 +185,24 @@ def _read_table(path: str | Path, delimiter: str | None, columns: int) -> Array:
 
 @dataclass(frozen=True)
 class TruthNoise:
-    """Standard deviations of a sequence's true poses: of each rotation axis [rad] and of each coordinate [m]."""
+    """How far a sequence's true poses may be off.
+
+    Attributes:
+        rotation: standard deviation of each rotation axis [rad], independent in each pose.
+        translation: the same of each coordinate [m].
+        time: the same of the stamps [s]: a pose is that of a moment before or after.
+        mounting: standard deviation of a rotation between the truth's axes and the camera's [rad] that is the same in
+            all poses: how the other sensor is mounted, and its own slow errors.
+        wheels: the camera is on a vehicle that does not slip sideways, and looks ahead.
+    """
 
     rotation: float = 0.0
     translation: float = 0.0
+    time: float = 0.0
+    mounting: float = 0.0
+    wheels: bool = False
 
     @property
     def covariance(self) -> Array:
-        """Covariance (6, 6) of one true pose, [rotation, translation], in its own axes."""
+        """Covariance (6, 6) of one true pose, [rotation, translation], in its own axes; without that of its stamp."""
         return np.diag(np.repeat(np.square([self.rotation, self.translation]), 3))

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import BoolArray, CommonError, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.errors import ConfigurationError
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
-from slam.mapping.atlas.keyframes import CommonError
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features

@@ -28,6 +28,11 @@ from slam.system import StereoSlam
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
 _SETTINGS = ("objects.mode=off",)
 
+_NO_PAIRS = (
+    "no two views far enough apart were compared: rows alone say next to nothing of disparities; "
+    "take longer recordings in which the camera moves on"
+)
+
 #: Shows the progress of a recording of so many frames: gives what is called after each.
 Show = Callable[[StereoSequence, int], AbstractContextManager[Callable[[FrameResult], None]]]
 
@@ -89,12 +94,14 @@ class Calibrated:
         kept: by all together.
         agreed: whether they agree; None where one alone shows motion.
         off: how far pixels of the corrected calibration are from the corrected pixels, root mean square [px].
+        warning: a line on why little can be expected of it; empty for none.
     """
 
     found: Sequence[Found]
     kept: KeptCalibration
     agreed: Agreement | None
     off: float
+    warning: str
 
 
 def calibrate(
@@ -121,21 +128,23 @@ def calibrate(
     targets.require(rig)
     found = [_run(sequence, settings, frames, show) for sequence in sequences]
     model = RigModel(rig)
-    moving = [one for one in found if one.evidence is not None]
+    evidence = [one.evidence for one in found if one.evidence is not None]
     systematic = _config(sequences[0], settings).self_calibration.systematic
-    kept = joint_calibration(model, [one.evidence for one in moving if one.evidence is not None], systematic)
-    agreed = agreement([one.posterior for one in moving])
+    kept = joint_calibration(model, evidence, systematic)
+    agreed = agreement(model, evidence, systematic)
     corrected = corrected_rig(model, kept.posterior.mean)
     every = [
         {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
     ]
+    warning = "" if any(one.pairs for one in found) else _NO_PAIRS
     tree = {**kept.to_json(), "recordings": every, "agreement": None if agreed is None else agreed.words}
+    tree["warnings"] = [warning] if warning else []
     write_text(targets.out, json.dumps(tree, indent=1) + "\n")
     if targets.opencv is not None:
         write_opencv(targets.opencv, corrected.rig)
     if targets.kalibr is not None:
         write_kalibr(targets.kalibr, corrected.rig)
-    return Calibrated(found, kept, agreed, float(np.hypot(corrected.left_off, corrected.right_off)))
+    return Calibrated(found, kept, agreed, float(np.hypot(corrected.left_off, corrected.right_off)), warning)
 
 
 def _require_one_rig(sequences: Sequence[StereoSequence]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, FrameResult
+from slam.data import CommonError, Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
@@ -31,6 +31,7 @@ class RunRecord:
     poses: list[Array] = field(default_factory=list)
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
+    common: list[CommonError] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
@@ -55,6 +56,7 @@ class RunRecord:
         self.stamps.append(result.estimate.stamp)
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
+        self.common.append(result.common)
         self.measured.append(result.status.measured)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
@@ -110,7 +112,12 @@ def results_of(
         },
         "consistency": {
             "NIS per degree of freedom": record.nis / record.nis_dof if record.nis_dof else None,
-            **consistency(record.trajectory.select(measured), np.array(record.covariances)[measured], sequence),
+            **consistency(
+                record.trajectory.select(measured),
+                np.array(record.covariances)[measured],
+                sequence,
+                [record.common[row] for row in np.flatnonzero(measured)],
+            ),
         },
     }
     if isinstance(system, StereoSlam):

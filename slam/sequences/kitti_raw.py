@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,9 @@ from slam.sequences.oxts import read_oxts
 from slam.sequences.source import MOST_FRAMES, ImagePairs, Listing, numbered, pair_listings, stamped
 from slam.sequences.tables import date_time, read_rows, shorten
 from slam.sequences.truth import require_truth
+
+#: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
+_OXTS_TIME = 0.01 / np.sqrt(12)
 
 _PAIRS = (("00", "01"), ("02", "03"))  # grey first, colour where there is no grey
 
@@ -60,7 +64,9 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         truth = _ground_truth(folder, day, origin, T_left_reference, left, stamps, faults)
     source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
     kind = options.get("kind", "driving")
-    return RecordedSequence(folder.name, "kitti-raw", kind, rig, source, truth, gps, warnings, OXTS_NOISE)
+    time = 0.0 if (folder / "oxts").is_dir() else _OXTS_TIME
+    noise = replace(OXTS_NOISE, time=time, wheels=kind == "driving")
+    return RecordedSequence(folder.name, "kitti-raw", kind, rig, source, truth, gps, warnings, noise)
 
 
 def _day(folder: Path) -> Path:

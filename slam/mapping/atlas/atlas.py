@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam.data import Estimate
+from slam.data import CommonError, Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, adjoints, shared_out
-from slam.mapping.atlas.keyframes import CommonError, Keyframe, Loop, what_was_added
+from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
 from slam.mapping.atlas.places import PlaceIndex
 
 
@@ -27,7 +27,7 @@ class Anchor:
     Attributes:
         covariance: of its pose, perturbing on the right, and of the common errors (6 + m, 6 + m).
         common: the common errors (m,), where their variance was one.
-        scale: what they stand for (m, m), see `slam.mapping.atlas.keyframes.CommonError`.
+        scale: what they stand for (m, m), see `slam.data.CommonError`.
     """
 
     covariance: Array

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,25 +11,6 @@ from slam.data import IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
-
-
-@dataclass(frozen=True)
-class CommonError:
-    """The part of a pose's error that all poses of a run share, as the rig's error makes it: ``shares @ scale @ c``.
-
-    Attributes:
-        shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
-        scale: these errors by ones of unit variance, c, as they are known now (m, m).
-    """
-
-    shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
-    scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
-
-    @property
-    def covariance(self) -> Array:
-        """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.scale
-        return np.asarray(root @ root.T)
 
 
 @dataclass(frozen=True)
@@ -43,7 +24,7 @@ class Keyframe:
         covariance: its covariance (6, 6) then, by noise alone.
         step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
             right.
-        shares: derivative (6, m) of the pose by the errors that all poses share, see `CommonError`.
+        shares: derivative (6, m) of the pose by the errors that all poses share, see `slam.data.CommonError`.
         travelled: length of the path up to here [m].
         depth: median depth of the features [m].
         points: features in coordinates of the rectified left camera (F, 3) [m].

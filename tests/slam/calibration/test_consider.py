@@ -96,6 +96,18 @@ def test_what_is_known_of_the_rig_is_in_the_covariances(backend):
     for k, T in enumerate(path(20)):
         result = other.process_features(cloud.features(T, k / 30)[0])
     np.testing.assert_array_equal(result.estimate.covariance, other.backend.estimate(landmarks=False).covariance)
+    assert not result.common.shares.size
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_result_says_what_its_error_shares_with_other_frames(backend):
+    system, truth = StereoSlam(RIG, None, backend, config=CONFIG), path(4)
+    cloud = Cloud(150)
+    for k, T in enumerate(truth):
+        result = system.process_features(cloud.features(T, k / 30)[0])
+    apart = result.estimate.covariance - result.common.covariance
+    np.testing.assert_allclose(apart, system.backend.estimate(landmarks=False).covariance, rtol=1e-6, atol=1e-12)
+    assert np.trace(result.common.covariance) > 0
 
 
 def test_a_known_error_stays_in_a_path_that_is_not_revised():

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,9 +115,10 @@ def test_recordings_together_are_surer_and_agree(first):
     joint = joint_calibration(first.model, [d.evidence() for d in drives], first.config.systematic).posterior
     assert np.abs((joint.mean - TURNED) / joint.sigma).max() < 3
     assert np.linalg.slogdet(joint.covariance)[1] < min(np.linalg.slogdet(d.posterior.covariance)[1] for d in drives)
-    found = agreement([d.posterior for d in drives])
+    found = agreement(first.model, [d.evidence() for d in drives], first.config.systematic)
     assert found.words.startswith("The recordings agree") and found.largest.shape == joint.mean.shape
-    assert agreement([first.posterior]) is None
+    assert np.nanmax(found.largest) < 3
+    assert agreement(first.model, [first.evidence()], first.config.systematic) is None
 
 
 def test_one_recording_alone_says_what_its_run_says(first):
@@ -141,10 +141,19 @@ def test_recordings_that_say_more_and_less_are_never_worse_than_the_one_alone(fi
 
 
 def test_recordings_of_another_rig_do_not_agree(first):
-    other = replace(first.posterior, mean=first.posterior.mean + 5 * first.posterior.sigma * (np.arange(21) == 18))
-    found = agreement([first.posterior, other])
-    assert found.words.startswith("The recordings do not agree in roll: the largest difference is 3.5 sigma")
-    assert found.pairs[18].tolist() == [0, 1]
+    other = drive(TURNED + parameters(roll=3e-3), seed=2, frames=20)
+    found = agreement(first.model, [first.evidence(), other.evidence()], first.config.systematic)
+    assert found.words.startswith("The recordings do not agree in") and "roll" in found.words
+    assert found.largest[18] > 3 and found.pairs[18].tolist() == [0, 1]
+
+
+def test_the_prior_that_recordings_share_is_no_agreement(first):
+    """Two that say next to nothing are both near the calibration as delivered."""
+    silent = [d.evidence().scaled(1e-9) for d in (first, drive(TURNED + parameters(roll=3e-3), seed=2, frames=20))]
+    found = agreement(first.model, silent, first.config.systematic)
+    assert np.isnan(found.largest).all() and found.words.startswith("Nothing can be said")
+    half = agreement(first.model, [first.evidence(), silent[1]], first.config.systematic)
+    assert np.isnan(half.largest).all()
 
 
 def test_without_motion_there_is_nothing_to_join(first):

@@ -109,3 +109,13 @@ def test_what_is_there_is_not_overwritten_and_no_recording_counts_twice(made, tm
         command("calibrate", WORLD, "--out", folder / "rig.json")
     with pytest.raises(SlamError, match="given twice"):
         command("calibrate", WORLD, WORLD, "--out", tmp_path / "rig.json")
+
+
+def test_recordings_without_pairs_of_views_get_a_warning(tmp_path, monkeypatch, caplog):
+    from slam.calibration.estimator import SelfCalibration
+
+    monkeypatch.setattr(SelfCalibration, "pairs", property(lambda _: 0))
+    monkeypatch.setattr(SelfCalibration, "evidence", lambda self: sum(self._parts()[1:], self._parts()[0]))
+    command("calibrate", WORLD, "--frames", "0:3", "--out", tmp_path / "rig.json", "-q")
+    assert "rows alone" in caplog.text
+    assert "rows alone" in json.loads((tmp_path / "rig.json").read_text())["warnings"][0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.data import CommonError
 from slam.evaluation.consistency import consistency_figures, stretch_nees, verdict
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -71,4 +72,51 @@ def test_stretches_without_a_usable_covariance_are_left_out():
     own, true, P = odometry(0)
     P[30] = 1e-9 * np.eye(6)  # as after a loop: smaller than before it
     first = np.arange(20, 30)
-    assert len(stretch_nees(own, true, P, NONE, first, np.full(10, 30))) == 0
+    assert np.isnan(stretch_nees(own, true, P, NONE, first, np.full(10, 30))).all()
+
+
+def with_common_error(seed: int):
+    """Odometry of a rig whose baseline is wrong by 2 %: the same in all frames, and known to be possible."""
+    own, true, P = odometry(seed)
+    off = 0.02 * np.random.default_rng([seed, 1]).normal()
+    shares, common = np.zeros((6, 1)), []
+    for k in range(len(own)):
+        if k:
+            A = adjoint(inverse(inverse(true.poses[k - 1]) @ true.poses[k]))
+            shares = A @ shares + np.concatenate([np.zeros(3), STEP[3:]])[:, None]
+        common.append(CommonError(shares, np.array([[0.02]])))
+        own.poses[k] = own.poses[k] @ exp(-off * shares[:, 0])
+    return own, true, P + np.array([c.covariance for c in common]), common
+
+
+def test_errors_that_all_poses_share_count_once():
+    runs = [with_common_error(seed) for seed in range(40)]
+    apart = [consistency_figures(own, true, P, NONE, common) for own, true, P, common in runs]
+    for key in ("mean NEES", "NEES over 1 m", "NEES over 10 m"):
+        assert 4.8 < np.mean([figures[key] for figures in apart]) < 7.2, key
+    alike = [consistency_figures(own, true, P, NONE)["NEES over 10 m"] for own, true, P, _ in runs]
+    assert not 5.0 < np.mean(alike) < 7.0
+
+
+def test_how_the_other_sensor_is_mounted_is_found():
+    noise = TruthNoise(rotation=1e-4, translation=0.01, mounting=0.02)
+    mounted = exp(np.array([0.01, -0.02, 0.005, 0, 0, 0]))
+    figures = []
+    for seed in range(10):
+        own, true, P = odometry(seed, noise=noise)
+        figures.append(consistency_figures(own, Trajectory(true.stamps, true.poses @ mounted), P, noise))
+    assert 4.5 < np.mean([f["NEES over 10 m"] for f in figures]) < 7.0
+    fixed = consistency_figures(own, Trajectory(true.stamps, true.poses @ mounted), P, TruthNoise(1e-4, 0.01))
+    assert fixed["NEES over 10 m"] > 12
+
+
+def test_truth_of_another_moment_is_off_along_the_motion():
+    late, rng = TruthNoise(time=0.005), np.random.default_rng(3)
+    figures: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(20):
+        own, true, P = odometry(seed)
+        by = exp(np.outer(10 * 0.005 * rng.normal(size=len(true)), STEP))  # ten steps a second
+        moved = Trajectory(true.stamps, true.poses @ by)
+        for known in figures:
+            figures[known].append(consistency_figures(own, moved, P, late if known else NONE)["NEES over 1 m"])
+    assert 5.0 < np.mean(figures[True]) < 7.0 < 12 < np.mean(figures[False])
