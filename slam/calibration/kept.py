@@ -18,6 +18,10 @@ from slam.geometry.rig import StereoRig
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
 _SAME = 1e-5  # relative difference of numbers of the same calibration, written and read
+_NOT_KEPT = (
+    "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
+    "sequence: 'FOLDER?calibration=FILE'"
+)
 _SUMMARY, _KEY = "summary.json", "self_calibration"
 
 
@@ -133,11 +137,11 @@ def load_calibration(path: str | Path) -> KeptCalibration:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{file}: not the summary of a run, and no file of `slam calibrate`") from error
+        raise CalibrationError(f"{file}: {_NOT_KEPT}") from error
     if isinstance(tree, Mapping):
         tree = tree.get(_KEY, tree)
     if not isinstance(tree, Mapping) or "parameters" not in tree:
-        raise CalibrationError(f"{file}: no calibration in this file")
+        raise CalibrationError(f"{file}: {_NOT_KEPT}")
     try:
         return KeptCalibration.from_json(tree)
     except CalibrationError as error:

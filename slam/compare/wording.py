@@ -20,7 +20,7 @@ WORDS = {
     Verdict.OPEN: "open",
     Verdict.EQUAL: "equal",
     Verdict.SINGLE: "one trial",
-    Verdict.NONE: "none",
+    Verdict.NONE: "no pair",
     Verdict.UNTESTED: "",
 }
 
