@@ -189,8 +189,8 @@ class StereoRig:
     def project_stereo(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
         """Stereo measurements ``(uL, vL, uR)`` (N, 3) and Jacobian (N, 3, 3) by points (N, 3) in left coordinates.
 
-        The right image's row adds nothing but the epipolar check (paper A uses only its x, Eq. 8), so it is no
-        part of the measurement. Rows of points behind a camera are NaN. Without `jacobian` it has no rows.
+        The right image's row adds only the epipolar check (paper A uses only its x, Eq. 8), so it is no part of the
+        measurement. Rows of points behind a camera are NaN. With ``jacobian=False`` the Jacobian is empty.
         """
         if self.is_rectified:
             return self._project_rectified(points, jacobian)
