@@ -214,9 +214,9 @@ class StereoSlam:
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 
-        A frame with nothing to see is no error: the pose is predicted and the status says so. A step that is ended by an
-        exception, such as an interrupt, leaves the map as it was (see `roll_back`); the back end is already at the stamp
-        of that frame, so continue with a later one. What self-calibration has learnt from the frame stays.
+        A frame with nothing to see is no error: the pose is predicted and the status says so. A step that is ended by
+        an exception, such as an interrupt, leaves the map as it was (see `roll_back`); the back end is already at the
+        stamp of that frame, so continue with a later one. What self-calibration has learnt from the frame stays.
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
@@ -325,7 +325,7 @@ class StereoSlam:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """The left camera's path: the latest estimate of each frame's pose; in a known map, since the camera was found."""
+        """The left camera's path: the latest estimate of each frame's pose; in a known map, since it was found."""
         with self._stepping:
             return self.atlas.path(self._path())
 

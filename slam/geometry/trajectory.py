@@ -58,8 +58,8 @@ class Trajectory:
 
         Args:
             axis: of matplotlib, to draw into; None for a new figure.
-            plane: the coordinates to the right and up, such as ``"xz"``, the top view if the world is the first camera's
-                frame. If it is empty, the two in which the path extends farthest.
+            plane: the coordinates to the right and up, such as ``"xz"``: the top view, if the world is the first
+                camera's frame. If it is empty, the two in which the path extends farthest.
             **options: of the line, such as ``label="ekf"``.
 
         Returns:
