@@ -29,6 +29,7 @@ from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
+from slam.showing import count
 from slam.tracking.alignment import Aligned, Anchors, align, anchored
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
@@ -148,6 +149,12 @@ class StereoSlam:
             self.landmarks = known_map.rows
             self.atlas = Atlas.of_earlier_run(known_map.keyframes, known_map.keyframe_poses, known_map.loops)
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
+
+    def __repr__(self) -> str:
+        frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
+        known = 0 if self.landmarks is None else len(self.landmarks)
+        done = f"{count(self._last.index + 1, 'frame')}, {count(known, 'landmark')}"
+        return f"StereoSlam({frontend}, {type(self.backend).__name__}, {done})"
 
     @overload
     def process(self, frame: StereoFrame, /) -> FrameResult: ...
