@@ -71,7 +71,7 @@ class StereoRig:
         if -b[0] < 0:
             raise CalibrationError(
                 f"the right camera stands {b[0]:.4f} m to the left of the left one: "
-                "are the cameras swapped, or is the sign of T (or of P2) wrong?"
+                "are the cameras swapped, or is the sign of T (or of P2) wrong? T is about (-baseline, 0, 0)"
             )
         if -b[0] < 0.5 * baseline:
             raise CalibrationError("the cameras do not stand side by side: the baseline is not along image rows")

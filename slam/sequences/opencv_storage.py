@@ -104,18 +104,21 @@ def _plain_rig(entries: Mapping[str, Any], size: Size, unit: float) -> StereoRig
     for name in _PLAIN:
         try:
             values[name] = float(entries[name])
+            require_possible(np.array([values[name]]), name)
         except KeyError:
             wrong.append(f"{name} is missing")
-        except (TypeError, ValueError, OverflowError):
+        except NO_NUMBERS:
             wrong.append(f"{name} is no number")
+        except CalibrationError as error:
+            wrong.append(str(error))
         else:
-            demand = "finite" if name in ("cx", "cy") else "positive"
-            if not np.isfinite(values[name]) or (values[name] <= 0 and demand == "positive"):
-                wrong.append(f"{name} is {values[name]:g}, which must be {demand}")
+            if values[name] <= 0 and name not in ("cx", "cy"):
+                wrong.append(f"{name} is {values[name]:g}, which must be positive")
     if wrong:
         raise CalibrationError(f"{'; '.join(wrong)} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)")
     fx, fy, cx, cy, baseline = values.values()
-    return StereoRig.from_pinhole([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], size=size, baseline=unit * baseline)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return StereoRig.from_pinhole(K, size=size, baseline=unit * baseline)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -47,8 +47,9 @@ def load_rig(
 
     Args:
         *paths: one file: OpenCV's (YAML, XML, JSON), Kalibr's camchain, KITTI's ``calib.txt`` or
-            ``calib_cam_to_cam.txt``. Two files: OpenCV's intrinsics and extrinsics, or EuRoC's ``sensor.yaml`` of the
-            left and the right camera. Or the folder where they are under their usual names.
+            ``calib_cam_to_cam.txt``, or the numbers fx, fy, cx, cy [px] and baseline in YAML. Two files: OpenCV's
+            intrinsics and extrinsics, or EuRoC's ``sensor.yaml`` of the left and the right camera. Or the folder where
+            they are under their usual names.
         size: width and height of the images [px], where the file names none.
         unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
         rectified: of an OpenCV file take the rectified cameras (``P1``, ``P2``).
