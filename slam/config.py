@@ -14,8 +14,8 @@ from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracking.association import AssociationConfig
 
-#: Map management of a kind of motion: a car does not come back soon to what lies behind it, and comes so much nearer to
-#: what lies ahead that the looks change.
+#: Map management by kind of motion: a car does not soon come back to what lies behind it, and comes so much nearer to
+#: what lies ahead that descriptors change.
 MAPS = {
     "handheld": MapConfig(),
     "driving": MapConfig(
@@ -23,7 +23,7 @@ MAPS = {
     ),
 }
 
-#: Association by kind of motion: the looks of what a car comes nearer to are renewed: it may be seen from anywhere.
+#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter.
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
     "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),

@@ -240,7 +240,7 @@ class UpdateReport:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The back end's belief at one time.
+    """The back end's estimate of pose and landmarks at one time.
 
     Attributes:
         stamp: time [s].
@@ -323,8 +323,8 @@ class FrameResult:
     Attributes:
         index: number of the step.
         status: how it ended.
-        reason: one line where the status is not tracked, else empty.
-        estimate: pose and map after the step; without the landmarks, which `StereoSlam.estimate` gives.
+        reason: one line that says why, if the status is not tracked; else empty.
+        estimate: pose after the step, without landmarks; `StereoSlam.estimate` has these, too.
         report: the back end's report.
         features: of the frame.
         predicted: number of landmarks in the angle of view.
@@ -335,18 +335,19 @@ class FrameResult:
         erased: ids of landmarks that left the map.
         map_size: number of landmarks in the map.
         milliseconds: wall time per stage.
-        moving_features: rows of features that are judged to move (V,); they never become landmarks.
+        moving_features: rows of features classified as moving (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
-        located: False where the camera has not been found yet in the map that it was started with: its pose is none.
-        revision: before the step, the pixels of all earlier frames were corrected anew (`RevisingBackend`); None where
-            they were not.
-        T_map_odom: pose (4, 4) of the frame that the back end estimates in, which never jumps, in the map; the identity
+        located: False as long as the camera has not been found in the map that the system was started with; there is no
+            pose then.
+        revision: the new correction of all earlier pixels, where it changed before this step (`RevisingBackend`); else
+            None.
+        T_map_odom: pose (4, 4) in the map of the back end's own world frame, in which poses never jump; the identity
             before the first loop.
-        loop: index of the frame whose place this one shows again, where that closed a loop; −1 for a place of the map
-            that the system was started with; None where no loop was closed.
-        refused_loop: the same of a frame whose place seemed to be this one, where the path contradicts that.
+        loop: index of the earlier frame of the same place, where a loop is closed; −1 if it is in the map that the
+            system was started with; None without a loop.
+        refused_loop: the same for a loop that is refused because it contradicts the path.
         keyframe: whether the frame has become a keyframe.
-        returned: ids of landmarks of that place that came back into the map.
+        returned: ids of landmarks of that place that are in the map again.
         common: the part of the pose's covariance that all frames share; empty after a loop, which mixes the two.
     """
 

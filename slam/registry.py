@@ -4,13 +4,17 @@ Another package adds a back end with::
 
     [project.entry-points."slam.backends"]
     mine = "my_package.module:MyBackend"
+
+Without a package, ``my_module:MyBackend`` is a name as well; the module may be in the working folder.
 """
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from slam.errors import UnknownNameError
@@ -40,19 +44,22 @@ def names(role: str) -> list[str]:
 
 
 def resolve(role: str, name: str) -> Any:
-    """The class (or factory) behind a name.
+    """The class (or factory) behind a name, or behind ``module:attribute``.
 
     Raises:
         UnknownNameError: the name is not known (the message lists the known ones), or its module cannot be imported.
     """
-    try:
-        module, _, attribute = _table(role)[name].partition(":")
-    except KeyError:
-        raise UnknownNameError(unknown(role[:-1].replace("end", " end"), name, names(role))) from None
+    what = role[:-1].replace("end", " end")
+    target = name if ":" in name else _table(role).get(name)
+    if target is None:
+        raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: module:Class")
+    if target is name and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))  # last: nothing that is installed is replaced
+    module, _, attribute = target.partition(":")
     try:
         return getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise UnknownNameError(f"{role[:-1].replace('end', ' end')} {name!r} cannot be loaded: {error}") from error
+    except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {error}") from error
 
 
 def create(role: str, name: str, rig: Any, **options: Any) -> Any:

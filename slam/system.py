@@ -28,6 +28,7 @@ from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
+from slam.showing import count
 from slam.tracking.alignment import Aligned, Anchors, align, anchored
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
@@ -68,8 +69,9 @@ class _Last:
 class StereoSlam:
     """Stereo SLAM with a front end and a back end of choice.
 
-    For one thread at a time; systems of their own may run in several threads, and give the same bytes as alone. A
-    system can be pickled and copied with `copy.deepcopy` where its parts can; the copy goes on to the same bytes.
+    Use a system from one thread at a time; several systems may run in several threads, and give the same bytes as
+    alone. A system whose parts can be pickled or copied (`copy.deepcopy`) can be, too; the copy continues with the same
+    bytes.
 
     Args:
         rig: the two cameras.
@@ -78,10 +80,10 @@ class StereoSlam:
         backend: a name (see ``backends.names()``) or an object with `Backend`'s methods.
         kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
         config: all settings; overrides `kind`.
-        known_map: a map to start in (see `slam.load_map`). The world is then the map's; frames are lost until the
-            camera is found in it. The back end must be given by its name.
-        rig_prior: what earlier recordings have shown of the rig's error (see `slam.load_calibration`). It is corrected
-            from the first frame on, and goes on being learnt.
+        known_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames are lost until
+            the camera is found in it. The back end must be given by name.
+        rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
+            corrected from the first frame on, and estimated further.
 
     Raises:
         CalibrationError: `rig_prior` is of another rig.
@@ -147,6 +149,12 @@ class StereoSlam:
             self.atlas = Atlas.of_earlier_run(known_map.keyframes, known_map.keyframe_poses, known_map.loops)
             self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
 
+    def __repr__(self) -> str:
+        frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
+        known = 0 if self.landmarks is None else len(self.landmarks)
+        done = f"{count(self._last.index + 1, 'frame')}, {count(known, 'landmark')}"
+        return f"StereoSlam({frontend}, {type(self.backend).__name__}, {done})"
+
     @overload
     def process(self, frame: StereoFrame, /) -> FrameResult: ...
     @overload
@@ -185,12 +193,12 @@ class StereoSlam:
         """Every frame with the result of its step.
 
         Args:
-            frames: a sequence, or frames in order of time; `slam.LiveFrames` of them for those that are not too late.
-            overlap: read the next frame and extract its features in a second thread meanwhile. The results are the same
-                to the byte; only the times differ.
+            frames: a sequence, or frames in order of time; as `slam.LiveFrames`, those that come too late are dropped.
+            overlap: read the next frame and extract its features in a second thread. The results have the same bytes;
+                only the times differ.
 
         Raises:
-            As `process`, where the frame comes whose step fails.
+            As `process`, at the frame whose step fails.
         """
         extracted = map(self._extract, frames)
         depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
@@ -212,9 +220,9 @@ class StereoSlam:
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
 
-        A frame with nothing to see is no error: the state is predicted and the status says so. A step that an exception
-        ends, an interrupt for instance, did not happen, except that the back end's belief stands at its stamp: continue
-        with a later frame; see `roll_back`. (What the calibration has learnt from its features stays.)
+        A frame with nothing to see is no error: the pose is predicted and the status says so. A step that is ended by
+        an exception, such as an interrupt, leaves the map as it was (see `roll_back`); the back end is already at the
+        stamp of that frame, so continue with a later one. What self-calibration has learnt from the frame stays.
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
@@ -324,7 +332,7 @@ class StereoSlam:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """The left camera's path: the latest estimate of each frame's pose (in a known map, from when it was found)."""
+        """The left camera's path: the latest estimate of each frame's pose; in a known map, since it was found."""
         with self._stepping:
             return self.atlas.path(self._path())
 
@@ -364,7 +372,7 @@ class StereoSlam:
 
     @property
     def warnings(self) -> list[str]:
-        """What looked wrong with the images and their times, a line each (see `slam.tracking.input_warnings`)."""
+        """What looks wrong with images, stamps or baseline, a line each (see `slam.tracking.input_warnings`)."""
         return list(self._input_warnings.lines)
 
     def __getstate__(self) -> dict[str, object]:

@@ -256,7 +256,8 @@ class EkfBackend:
         return Problem(
             prior, state.covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
-            None if guess is None else state.change_to(guess), state.by_world(slots) if state.consistent else None,
+            None if guess is None else state.change_to(guess),
+            state.gauge_jacobian(slots) if state.consistent else None,
         )  # fmt: skip
 
     def _inflated_noises(self) -> list[Array]:

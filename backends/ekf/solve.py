@@ -186,7 +186,7 @@ class Gated:
 
 
 def gate(problem: Problem, at_guess: bool = False) -> Gated:
-    """Judge each landmark by itself, with its innovation linearised at the prior or at the guess.
+    """Test each landmark by itself, with its innovation linearised at the prior or at the guess.
 
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
@@ -211,7 +211,7 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
 def solve(problem: Problem, gated: Gated) -> Solution | None:
     """Solve with what passed the gate, and take out what the other measurements contradict, the worst first.
 
-    A wrong match spoils its neighbours' judgement, so a round takes out only landmarks at least half as far off as
+    A wrong match spoils the tests of its neighbours, so a round takes out only landmarks at least half as far off as
     the worst one, until all that is left agrees.
 
     Returns:

@@ -219,8 +219,8 @@ class FilterState:
 
     # --- displacements of the whole world, which are unobservable ---
 
-    def by_world(self, slots: IndexArray) -> Array:
-        """Derivatives (6 + 3M, 6) of [r, φ, landmarks] by a displacement of the world."""
+    def gauge_jacobian(self, slots: IndexArray) -> Array:
+        """Jacobian (6 + 3M, 6) of [r, φ, landmarks] by a displacement of the world, which is unobservable."""
         own = np.eye(6)
         own[:3, 3:] = -se3.hat(self.camera[:3])
         own[3:, 3:] = np.linalg.inv(self.turning(self.camera))

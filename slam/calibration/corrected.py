@@ -59,9 +59,9 @@ def _camera(
 
     Args:
         camera: as calibrated.
-        ideal: its rectified twin.
-        rectify: takes its pixels (N, 2) to those of the twin.
-        R: takes its axes to those of the twin (3, 3).
+        ideal: the camera of the rectified rig that takes its place.
+        rectify: takes its pixels (N, 2) to those of the rectified camera.
+        R: takes its axes to those of the rectified camera (3, 3).
         theta: the corrections (8,) of `LENS`.
     """
     u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), _GRID)))

@@ -1,4 +1,4 @@
-"""A calibration that is kept: what recordings have shown of a rig, in a file, as the prior of further recordings."""
+"""Files of estimated errors of a rig: the result of self-calibration on recordings, as the prior of further ones."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ from slam.geometry.rig import StereoRig
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
 _SAME = 1e-5  # relative difference of numbers of the same calibration, written and read
+_NOT_KEPT = (
+    "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
+    "sequence: 'FOLDER?calibration=FILE'"
+)
 _SUMMARY, _KEY = "summary.json", "self_calibration"
 
 
@@ -73,12 +77,12 @@ class RigNumbers:
 
 @dataclass(frozen=True)
 class KeptCalibration:
-    """What recordings have shown of a rig.
+    """The errors of a rig's calibration as self-calibration has estimated them, with covariance.
 
     Attributes:
-        posterior: corrections of the calibration as delivered.
-        rig: the rig as delivered.
-        residual: scale of what no parameter holds, from 0 to 1 (see `slam.calibration.prior`).
+        posterior: estimated corrections of the rig as calibrated.
+        rig: numbers of the rig as calibrated, to recognise it.
+        residual: scale, from 0 to 1, of the errors that no parameter describes (see `slam.calibration.prior`).
     """
 
     posterior: RigPosterior
@@ -86,10 +90,10 @@ class KeptCalibration:
     residual: float = 1.0
 
     def require_fits(self, rig: StereoRig) -> None:
-        """Raise where it is not of this rig.
+        """Raise if it is for another rig.
 
         Raises:
-            CalibrationError: a number of the calibration as delivered is another one.
+            CalibrationError: a number of the rig as calibrated differs.
         """
         difference = self.rig.difference(RigNumbers.of(rig))
         if difference:
@@ -104,7 +108,7 @@ class KeptCalibration:
         """The inverse of `to_json`.
 
         Raises:
-            CalibrationError: a key is missing, a value is of the wrong kind, or the parameters are others than ours.
+            CalibrationError: a key is missing, a value is of the wrong type, or the parameters are of another version.
         """
         posterior = RigPosterior.from_json(tree)
         if posterior.names != RigModel.names:
@@ -119,13 +123,13 @@ class KeptCalibration:
 
 
 def load_calibration(path: str | Path) -> KeptCalibration:
-    """Read what recordings have shown of a rig.
+    """Read the errors of a rig as self-calibration has estimated them.
 
     Args:
         path: file of `slam calibrate`, ``summary.json`` of a run, or the folder of a run.
 
     Raises:
-        CalibrationError: it cannot be read, or is none.
+        CalibrationError: the file cannot be read, or is something else.
     """
     file = expanded(path, CalibrationError)
     file = file / _SUMMARY if file.is_dir() else file
@@ -133,11 +137,11 @@ def load_calibration(path: str | Path) -> KeptCalibration:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{file}: not the summary of a run, and no file of `slam calibrate`") from error
+        raise CalibrationError(f"{file}: {_NOT_KEPT}") from error
     if isinstance(tree, Mapping):
         tree = tree.get(_KEY, tree)
     if not isinstance(tree, Mapping) or "parameters" not in tree:
-        raise CalibrationError(f"{file}: no calibration in this file")
+        raise CalibrationError(f"{file}: {_NOT_KEPT}")
     try:
         return KeptCalibration.from_json(tree)
     except CalibrationError as error:

@@ -9,7 +9,7 @@ import threading
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -136,7 +136,7 @@ def run_command(
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.compile_beside import compiled_beside
-    from slam.commands.display import Progress, print_summary
+    from slam.commands.display import Progress
     from slam.commands.folders import run_folder
     from slam.commands.run import Wanted, prepare
     from slam.run.runner import run
@@ -165,8 +165,7 @@ def run_command(
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until)
     _leave_picture(folder, picture)
-    if not quiet:
-        print_summary([summary], folder)
+    _finish(summary, folder, quiet)
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
@@ -180,7 +179,7 @@ def replay_command(
     quiet: QuietOption = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
-    from slam.commands.display import Progress, print_summary
+    from slam.commands.display import Progress
     from slam.commands.folders import run_folder
     from slam.commands.run import command_line
     from slam.config import SystemConfig
@@ -196,8 +195,7 @@ def replay_command(
         with progress, whole_frames(progress.frame) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
     _leave_picture(folder, picture)
-    if not quiet:
-        print_summary([summary], folder)
+    _finish(summary, folder, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")
@@ -387,6 +385,19 @@ def _title(sequence: Sequence | Recording, backend: str) -> str:
     """A short name for a progress bar: of a world its name alone."""
     name = sequence.name.partition("?")[0]
     return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
+
+
+def _finish(summary: dict[str, Any], folder: Path, quiet: bool) -> None:
+    """Print the table of a run, and one line where most frames were not tracked; exit status 1 where none was."""
+    from slam.commands.display import print_summary
+    from slam.run.outcome import nothing_tracked
+
+    if not quiet:
+        print_summary([summary], folder)
+    if summary["tracking"]:
+        print(f"slam: {summary['tracking']}", file=sys.stderr)
+    if nothing_tracked(summary):
+        raise typer.Exit(1)
 
 
 def _leave_picture(folder: Path, wanted: bool) -> None:

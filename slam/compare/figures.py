@@ -19,6 +19,7 @@ from slam.compare.trial import SERIES
 from slam.evaluation.metrics import align, associate, chi_square_band
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
+from slam.run.figures import widths
 from slam.sequences import open_sequence
 
 if TYPE_CHECKING:
@@ -120,10 +121,10 @@ def draw_paths(group: Group) -> Figure:
     """Top view of the first trial's paths and the true one."""
     figure, axis = _axes(3.6)
     truth = None
-    for name, run in example(group).items():
+    for width, (name, run) in zip(widths(len(group.runs), 1.6), example(group).items()):
         own, true = paths(run)
         truth = true if truth is None else truth
-        axis.plot(*own.positions[:, [0, 2]].T, color=colours(group)[name], lw=1.6, label=name)
+        axis.plot(*own.positions[:, [0, 2]].T, color=colours(group)[name], lw=width, label=name)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color="0.3", lw=1, label="truth")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
@@ -136,13 +137,13 @@ def draw_paths(group: Group) -> Figure:
 def draw_errors(group: Group) -> Figure:
     """Position error of the first trial over time, component by component, inside the ±3σ that each run claims."""
     figure, axes = _rows(3, 1.5)
-    for name, run in example(group).items():
+    for width, (name, run) in zip(widths(len(group.runs), 1.0), example(group).items()):
         s = read_series(run)
         t = s["stamp"] - s["stamp"][0]
         for axis, c in zip(axes, "xyz"):
             band = 300 * s[f"sd_{c}"]
             axis.fill_between(t, -band, band, color=colours(group)[name], alpha=0.13, lw=0)
-            axis.plot(t, 100 * s[f"error_{c}"], color=colours(group)[name], lw=1, label=name)
+            axis.plot(t, 100 * s[f"error_{c}"], color=colours(group)[name], lw=width, label=name)
     for axis, label in zip(axes, ("right", "down", "forward")):
         axis.axhline(0, color="0.6", lw=0.5)
         axis.set_ylabel(f"{label} [cm]")

@@ -144,8 +144,8 @@ class Trial:
     @property
     def folder(self) -> str:
         """Where its files go, below the comparison's ``runs``."""
-        parts = (short_name(self.sequence), short_name(self.variant.name), f"seed_{self.seed}", self.backend)
-        return "/".join((*parts, self.mode.replace(" ", "_")))
+        parts = (short_name(self.sequence), short_name(self.variant.name), f"seed_{self.seed}")
+        return "/".join((*parts, short_name(self.backend), self.mode.replace(" ", "_")))
 
 
 def is_world(sequence: str) -> bool:

@@ -20,7 +20,7 @@ WORDS = {
     Verdict.OPEN: "open",
     Verdict.EQUAL: "equal",
     Verdict.SINGLE: "one trial",
-    Verdict.NONE: "none",
+    Verdict.NONE: "no pair",
     Verdict.UNTESTED: "",
 }
 
@@ -166,7 +166,7 @@ def caution(trials: int, tests: int = 1) -> str:
         why = f"even where all agree, chance alone does as much in {100 * least:.2g} % of such comparisons"
     else:
         why = f"even where all agree, p is {least:.2g}, and {tests} tests multiply it (Holm)"
-        what += ", but likely at best"
+        what = "differences can be likely at best, not certain"
     intervals = f" Intervals of a mean are given from {FEWEST} trials on." if trials < FEWEST else ""
     return f"With {trials} trials {what}: {why}. It takes {enough} or more (--trials).{intervals}"
 

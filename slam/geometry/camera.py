@@ -35,7 +35,7 @@ class PinholeCamera:
         distortion: its coefficients.
 
     Raises:
-        CalibrationError: a value is not finite, a focal length or size not positive, or the number of
+        CalibrationError: a value is not finite, a focal length or size is not positive, or the number of
             distortion coefficients does not fit the model.
     """
 

@@ -71,7 +71,7 @@ class StereoRig:
         if -b[0] < 0:
             raise CalibrationError(
                 f"the right camera stands {b[0]:.4f} m to the left of the left one: "
-                "are the cameras swapped, or is the sign of T (or of P2) wrong?"
+                "are the cameras swapped, or is the sign of T (or of P2) wrong? T is about (-baseline, 0, 0)"
             )
         if -b[0] < 0.5 * baseline:
             raise CalibrationError("the cameras do not stand side by side: the baseline is not along image rows")
@@ -189,8 +189,8 @@ class StereoRig:
     def project_stereo(self, points: Array, jacobian: bool = True) -> tuple[Array, Array]:
         """Stereo measurements ``(uL, vL, uR)`` (N, 3) and Jacobian (N, 3, 3) by points (N, 3) in left coordinates.
 
-        The right image's row adds nothing but the epipolar check (paper A uses only its x, Eq. 8), so it is no
-        part of the measurement. Rows of points behind a camera are NaN. Without `jacobian` it has no rows.
+        The right image's row adds only the epipolar check (paper A uses only its x, Eq. 8), so it is no part of the
+        measurement. Rows of points behind a camera are NaN. With ``jacobian=False`` the Jacobian is empty.
         """
         if self.is_rectified:
             return self._project_rectified(points, jacobian)

@@ -58,12 +58,12 @@ class Trajectory:
 
         Args:
             axis: of matplotlib, to draw into; None for a new figure.
-            plane: the coordinates to the right and up, such as ``"xz"``: the top view, where the world is the first
-                camera's frame. The two that reach farthest where it is empty.
+            plane: the coordinates to the right and up, such as ``"xz"``: the top view, if the world is the first
+                camera's frame. If it is empty, the two in which the path extends farthest.
             **options: of the line, such as ``label="ekf"``.
 
         Returns:
-            the axis, for more on it.
+            the axis.
 
         Raises:
             TrajectoryError: the plane is not named by two of x, y, z.

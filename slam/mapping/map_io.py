@@ -66,15 +66,15 @@ class SavedMap:
         descriptors: unit vectors (N, D) float32.
         laplacian: signs of the Laplacian (N,) int8.
         seen: number of frames in which each was measured (N,).
-        in_view: number of frames in which each should have been detected or was (N,).
+        in_view: number of frames in which each was detected or should have been (N,).
         frontend: name of the front end that the descriptors are from; empty where it is not known.
-        world_frame: what the world's axes are, for people.
+        world_frame: what the world's axes are, in words.
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
-        keyframes: places that the camera has been to, with their poses as a back end estimated them at the time.
-        keyframe_poses: their poses in the map's world frame (K, 4, 4); by default the same.
-        loops: between keyframes, that led from the ones to the others.
+        keyframes: with their poses as the back end estimated them at the time.
+        keyframe_poses: their poses in the map's world frame (K, 4, 4), corrected by loops; by default the same.
+        loops: between keyframes.
 
     Raises:
         SlamError: arrays that do not fit together, or landmarks that no back end would take.

@@ -1,7 +1,7 @@
-"""The detector of moving objects: tracks all features, judges which move, and keeps the bodies that they make up.
+"""The detector of moving objects: tracks all features, classifies which move, and keeps the bodies that they form.
 
-A step has two parts, called after the back end's update: `judge` says which features move, before any of them becomes
-a landmark; `update` gives the bodies' observations to the back end and reports the bodies.
+A step has two parts, called after the back end's update: `classify` says which features move, before any of them
+becomes a landmark; `update` gives the bodies' observations to the back end and reports the bodies.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.recovery import locate
-from slam.objects.regions import judge_scene, limit
+from slam.objects.regions import classify_scene, limit
 from slam.objects.revision import Mend, revise_tracks
 from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
@@ -90,7 +90,7 @@ class MovingObjectDetector:
     # ------------------------------------------------------------------------------------------- a step, first part
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
-        """Follow all tracks into this frame, judge them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
+        """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
@@ -109,7 +109,7 @@ class MovingObjectDetector:
         self._find_bodies(times, T_world_left)
         self._follow_candidates(times, T_world_left)
         self._begin_tracks(features, local, T_world_left, landmark)
-        return self._judgement(features)
+        return self._motion_labels(features)
 
     def _begin(self, features: StereoFeatures) -> Array:
         """Move on by a frame; times of the window's slots less the present (W,) [s], zero where there is none yet."""
@@ -189,7 +189,7 @@ class MovingObjectDetector:
         ages = (self.slot - np.arange(c.window)) % c.window
         moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
         place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
-        scene = judge_scene(moved, place, c.suspect, c.min_support)
+        scene = classify_scene(moved, place, c.suspect, c.min_support)
         tracks.doubtful[:] = False
         tracks.doubtful[rows] = scene.alone > c.doubtful
         alike = np.zeros(len(tracks), bool)
@@ -389,7 +389,7 @@ class MovingObjectDetector:
         record(tracks, new, self.slot, *measure(self.rig, T_world_left, points, z, self.sigma))
         fit_positions(tracks, new)
 
-    def _judgement(self, features: StereoFeatures) -> MotionLabels:
+    def _motion_labels(self, features: StereoFeatures) -> MotionLabels:
         tracks = self.tracks
         assert tracks is not None
         on, near = membership.on_bodies(self.bodies, tracks, self.config.margin)

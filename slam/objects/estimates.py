@@ -54,7 +54,7 @@ class BodyEstimates:
         known = {body.id for body in bodies.values() if body.estimate is not None}
         observations = [_observations(body, tracks, features) for body in bodies.values() if body.measured]
         told = [o for o in observations if o.id in known or o.has_stereo.sum() >= _TO_START]
-        estimates = _begun_anew(bodies, backend, backend.update_objects(told), observations)
+        estimates = _restarted(bodies, backend, backend.update_objects(told), observations)
         strangers = [e.id for e in estimates if e.id not in bodies]  # of before a restart
         if strangers:
             backend.remove_objects(strangers)
@@ -87,7 +87,7 @@ class BodyEstimates:
         return estimate.measured or (short and seldom and body.existence > _LIKELY)
 
 
-def _begun_anew(
+def _restarted(
     bodies: dict[int, Body], backend: ObjectBackend, estimates: list[ObjectEstimate],
     observations: list[ObjectObservations],
 ) -> list[ObjectEstimate]:  # fmt: skip

@@ -38,8 +38,8 @@ def follow(
 ) -> None:
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
-    Members of bodies take on the looks of their feature also where `slam.objects.recovery.locate` does not confirm it
-    afterwards: it is the body's pose that is wrong more often than the match.
+    Members of bodies take over the descriptor of their feature also where `slam.objects.recovery.locate` does not
+    confirm it afterwards: it is the body's pose that is wrong more often than the match.
 
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
     is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes

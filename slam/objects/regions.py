@@ -2,7 +2,7 @@
 
 Each track brings a displacement ``d_i`` (3,): where its last few frames see it, less where the frames before did. A
 camera pose that is off moves all still points by one small rigid motion ``d_i = ρ + θ × (p_i − c)``; so does a body's
-own motion, but for its points alone. Therefore no displacement is judged by itself: the tracks inside a window of
+own motion, but for its points alone. Therefore no displacement is tested by itself: the tracks inside a window of
 directions and depths, for windows of every size, are tested against the rest of them. The common motion that the window
 says and the one that the rest says are compared with the covariance of both,
 
@@ -74,7 +74,7 @@ def limit(test: float, size: NDArray[np.intp] | int) -> Array:
     return test * (1.0 + _TAIL / np.maximum(size, 1.0))
 
 
-def judge_scene(moved: Displacements, place: Array, test: float, support: int) -> Scene:
+def classify_scene(moved: Displacements, place: Array, test: float, support: int) -> Scene:
     """Groups that moved on their own, and every track's displacement against the rest.
 
     Args:

@@ -16,7 +16,7 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
-from slam.run.figures import RunData, draw_map, position_errors
+from slam.run.figures import RunData, draw_map, position_errors, widths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +30,7 @@ _STAGE_COLOURS = {
     "read": "#bdbdbd", "extract": "#1565c0", "predict": "#90caf9", "associate": "#ef6c00",
     "update": "#c62828", "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32",
 }  # fmt: skip
+_BANDS = ("-", "--", ":", "-.")  # lines around bands: of equal ones both are seen
 _TRUTH = "0.25"
 _AXES = ("right", "down", "forward")
 _MOST_MAPS = 3  # side by side in the summary
@@ -141,8 +142,8 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     paths, truth = _in_one_world(runs)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, run, path in zip(_repeated(_COLOURS, len(runs)), runs, paths):
-        axis.plot(*path.positions[:, [0, 2]].T, color=colour, lw=2.0, alpha=0.75, label=run.name)
+    for colour, width, run, path in zip(_repeated(_COLOURS, len(runs)), widths(len(runs), 2.0), runs, paths):
+        axis.plot(*path.positions[:, [0, 2]].T, color=colour, lw=width, alpha=0.75, label=run.name)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
     axis.set(title="Path, online, from above (dot: start)", xlabel="right [m]", ylabel="forward [m]")
     axis.set_aspect("equal", adjustable="datalim")
@@ -171,12 +172,15 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     known = any(run.truth is not None for run in runs)
     series = [_errors_of(run) for run in runs]
     factor, unit = _unit(max((float(np.nanmax(np.abs(error), initial=0.0)) for _, error, _ in series), default=0.0))
-    for colour, run, (time, error, sigma) in zip(_repeated(_COLOURS, len(runs)), runs, series):
+    styles = zip(_repeated(_COLOURS, len(runs)), _repeated(_BANDS, len(runs)), widths(len(runs), 1.1))
+    for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
         for axis, e, s in zip(axes, factor * error.T, 3 * factor * sigma.T):
             axis.fill_between(time, -s, s, color=colour, alpha=0.12, lw=0)
-            axis.plot(time, np.stack([-s, s], axis=1), color=colour, alpha=0.6, lw=0.6)
+            label = None if known else run.name
+            axis.plot(time, s, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes, label=label)
+            axis.plot(time, -s, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes)
             if run.truth is not None:
-                axis.plot(time, e, color=colour, lw=1.1, label=run.name)
+                axis.plot(time, e, color=colour, lw=width, label=run.name)
     for axis, name in zip(axes, _AXES):
         axis.set_ylabel(f"{name} [{unit}]")
         axis.axhline(0, color="0.6", lw=0.5)
@@ -185,8 +189,8 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     turned = ", truth turned to fit" if any(run.truth is not None and not run.truth_is_exact for run in runs) else ""
     axes[0].set_title(f"{title}{turned}; band: ±3σ as claimed")
     axes[-1].set_xlabel("time [s]")
-    if known:
-        axes[0].legend(fontsize=8, frameon=False, ncols=4)
+    if known or len(runs) > 1:
+        axes[0].legend(fontsize=8, framealpha=0.8, edgecolor="none", ncols=4)
 
 
 def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
@@ -243,8 +247,8 @@ def _title(runs: Sequence[RunData]) -> str:
     return f"{runs[0].sequence}: {frames}"
 
 
-def _repeated(colours: Sequence[str], count: int) -> list[str]:
-    return [colours[i % len(colours)] for i in range(count)]
+def _repeated(styles: Sequence[str], count: int) -> list[str]:
+    return [styles[i % len(styles)] for i in range(count)]
 
 
 def _figure(width: float, height: float) -> Figure:

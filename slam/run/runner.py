@@ -21,6 +21,7 @@ from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.last_files import LastFiles
+from slam.run.outcome import outcome
 from slam.run.outputs import RunFiles
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
@@ -303,6 +304,7 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
+        "tracking": outcome(record, sequence.rig, getattr(system, "warnings", ()), options.known_map is not None),
         "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
     }
     if live is not None:

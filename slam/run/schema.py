@@ -60,8 +60,8 @@ FRAME_TABLE = (
     Columns(
         ("keyframe", "loop", "refused"),
         "",
-        "1 for a keyframe, else 0; the frame whose place was seen again, closing a loop (`map`: of the known map); "
-        "the same where that contradicts the path",
+        "1 for a keyframe, else 0; the earlier frame of the same place, where a loop is closed (`map`: it is in the "
+        "known map); the same for a loop that is refused because it contradicts the path",
     ),
     Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
     Columns(

@@ -37,6 +37,7 @@ class RunRecord:
     times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
     ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
+    features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -51,6 +52,7 @@ class RunRecord:
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())
+        self.features.append((len(result.features), int(result.features.has_stereo.sum())))
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)

@@ -161,13 +161,10 @@ class CameraSequence:
     def _rig(self, paths: list[Path], size: tuple[int, int], options: Mapping[str, str]) -> StereoRig:
         """The rig of the calibration, which must be for images of this size."""
         try:
-            rig = rigs.read_rig(paths, size, options)
+            return rigs.read_rig(paths, size, options)
         except SequenceError as error:
             hint = "" if self._size_wanted[0] else "; ask the camera for another size with width=… and height=…"
             raise SequenceError(f"{self.name}: {error}{hint}") from None
-        with FaultLog(self.warnings) as faults:
-            rigs.warn_of_unit(rig, paths[0], options, faults)
-        return rig
 
 
 class _Cameras:
@@ -197,7 +194,7 @@ class _Cameras:
         try:
             for address in addresses:
                 self._devices.append(devices.open_device(address, *wanted))
-        except SequenceError:
+        except BaseException:
             self.release()
             raise
 

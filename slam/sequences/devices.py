@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from slam.errors import SequenceError
+from slam.errors import ConfigurationError, SequenceError
 from slam.sequences.quiet import quiet_libraries
 from slam.sequences.videos import FASTEST, SLOWEST
 
@@ -32,17 +32,18 @@ class Device(Protocol):
 
 
 class PlayedFile:
-    """A video file in a device's part: its images come at the rate of the file.
+    """A video file in a device's part.
 
     Args:
         capture: the file, a ``cv2.VideoCapture``.
+        fps: its images come so many a second; None for the rate of the file.
     """
 
-    def __init__(self, capture: Any) -> None:
+    def __init__(self, capture: Any, fps: float | None = None) -> None:
         import cv2
 
         self._capture = capture
-        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        rate = float(capture.get(cv2.CAP_PROP_FPS)) if fps is None else fps
         self._period = 1 / rate if SLOWEST <= rate <= FASTEST else 0.0
         self._due = time.monotonic()
 
@@ -68,13 +69,14 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
 
     Args:
         address: a number; a GStreamer pipeline that ends in ``appsink``; ``rtsp://…`` or another address of a
-            network; or a video file, which is played at its own rate.
-        width: asked of a camera with a number [px]; None for its own choice.
+            network; or a video file, which is played.
+        width: asked of the camera [px]; None for its own choice.
         height: the same.
-        fps: the same [1/s].
+        fps: the same [1/s]; of a file, how fast it is played.
 
     Raises:
         SequenceError: it cannot be opened.
+        ConfigurationError: width or height is asked of a file.
     """
     import cv2
 
@@ -91,7 +93,10 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
         if not capture.isOpened():
             raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
         if plays_a_file(address):
-            return PlayedFile(capture)
+            if width is not None or height is not None:
+                capture.release()
+                raise ConfigurationError(f"camera:{address}: a file has a size of its own: leave out width and height")
+            return PlayedFile(capture, fps)
         wanted = ((cv2.CAP_PROP_FRAME_WIDTH, width), (cv2.CAP_PROP_FRAME_HEIGHT, height), (cv2.CAP_PROP_FPS, fps))
         for name, value in wanted:
             if value is not None:

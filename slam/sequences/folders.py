@@ -14,7 +14,7 @@ from slam.geometry.se3 import Array
 from slam.sequences import rigs
 from slam.sequences.base import RecordedSequence
 from slam.sequences.faults import FaultLog
-from slam.sequences.rigs import calibration_files, read_rig, warn_of_unit
+from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.source import (
     MOST_FRAMES,
     ImagePairs,
@@ -34,6 +34,8 @@ OPTIONS = frozenset({"left", "right", "times", "fps"}) | rigs.OPTIONS
 
 #: Frames per second of image folders that say nothing of time.
 RATE = 10.0
+
+_SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
 
 _NAMES = (("left", "right"), ("image_left", "image_right"), ("cam0", "cam1"))
 _TIMES = ("times.txt", "timestamps.txt")
@@ -70,7 +72,6 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
             source = replace(source, size=size)
         paths = calibration_files(folder, options)
         rig = read_rig(paths, size, options)
-        warn_of_unit(rig, paths[0], options, faults)
     return RecordedSequence(folder.name, "folders", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
@@ -148,14 +149,34 @@ def _image_pairs(
 
 
 def _stamps_in(left: list[str], right: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Stamps [ns] where every name is one: 19 digits are nanoseconds, 16 microseconds, 10 and a fraction seconds."""
-    keys = []
-    for names in (left, right):
-        stamps = [_stamp(name.rpartition(".")[0]) for name in names]
-        if any(s is None for s in stamps):
-            return None
-        keys.append(np.array(stamps, np.int64))
-    return keys[0], keys[1]
+    """Stamps [ns] where every name is one.
+
+    19 digits are nanoseconds, 16 microseconds, 13 milliseconds, 10 and a fraction seconds. Other numbers are
+    nanoseconds where they are so far apart that they cannot count frames.
+    """
+    stamps = [[_stamp(name.rpartition(".")[0]) for name in names] for names in (left, right)]
+    if all(stamp is not None for own in stamps for stamp in own):
+        return np.array(stamps[0], np.int64), np.array(stamps[1], np.int64)
+    a, b = (_whole_numbers(names) for names in (left, right))
+    if a is None or b is None:
+        return None
+    if min(_median_step(a), _median_step(b)) >= _SHORTEST:
+        return a, b
+    milliseconds = all(10**12 <= number < 10**13 for number in (*a, *b))
+    return (a * 10**6, b * 10**6) if milliseconds else None
+
+
+def _whole_numbers(names: list[str]) -> np.ndarray | None:
+    """The names as numbers; None where one is something else."""
+    stems = [name.rpartition(".")[0] for name in names]
+    if not all(re.fullmatch(r"\d{1,19}", stem, re.ASCII) and int(stem) <= MOST_NANOSECONDS for stem in stems):
+        return None
+    return np.array(stems, np.int64)
+
+
+def _median_step(numbers: np.ndarray) -> float:
+    """How far numbers are apart; zero for a single one."""
+    return float(np.median(np.diff(np.sort(numbers)))) if len(numbers) > 1 else 0.0
 
 
 def _stamp(stem: str) -> int | None:

@@ -16,10 +16,10 @@ _REMEMBERED = 16  # frames whose arrival is known
 
 
 class LiveFrames:
-    """Frames when they are due: each is there at its stamp, and only the newest one waits; iterate once.
+    """Frames at their own rate: each comes at the time of its stamp, and only the newest one waits; iterate once.
 
-    A thread of its own reads them. Whoever is too slow for their rate gets fewer, and is never behind by more than the
-    frame that is worked on. Where reading is slower than the frames' rate, their clock waits for it.
+    A second thread reads them. If processing is too slow, frames are dropped, so that it is never behind by more than
+    the frame in work. If reading is slower than the frames' rate, their clock waits.
 
     Args:
         frames: a sequence, or frames in order of time.
@@ -27,8 +27,8 @@ class LiveFrames:
         until: the frames end when it is set, also while the next one is waited for.
 
     Attributes:
-        dropped: frames that were there and not taken, since a newer one came.
-        clock_waited: by how much reading was too slow for the frames' own rate, in all [s].
+        dropped: number of frames that were replaced by a newer one before they were taken.
+        clock_waited: how long the clock has waited for reading, in total [s].
 
     Example:
         >>> import slam
@@ -72,11 +72,11 @@ class LiveFrames:
 
     @property
     def ended_early(self) -> bool:
-        """Whether the end was asked for before the last frame was taken."""
+        """Whether it was ended by `until` before the last frame."""
         return self._ended_early
 
     def age(self, frame: StereoFrame) -> float:
-        """Time since one of the frames taken last came [s]; NaN for all others."""
+        """How long ago a frame came [s], for the frames taken last; NaN for others."""
         now = time.monotonic()
         return next((now - since for index, since in self._arrivals if index == frame.index), float("nan"))
 

@@ -38,6 +38,7 @@ _TRANSLATION = ("t", "trans", "translation", "translationvector", "stereot", "ts
 _SIZES = (("imagewidth", "imageheight"), ("width", "height"), ("leftwidth", "leftheight"))
 _SIZE = ("imagesize", "size", "imgsize", "resolution")
 _MODEL = ("distortionmodel", "cameramodel", "model")
+_PLAIN = ("fx", "fy", "cx", "cy", "baseline")  # all that a rectified pair of equal cameras needs
 
 
 def opencv_rig(
@@ -46,17 +47,19 @@ def opencv_rig(
     """The rig of one or more files (such as intrinsics.yml and extrinsics.yml), and the image size they are for.
 
     The entries are two camera matrices, their distortions, and R and T as ``cv2.stereoCalibrate`` gives them
-    (``h_right = R h_left + T``); or, for rectified images, the two projection matrices.
+    (``h_right = R h_left + T``); or, for rectified images, the two projection matrices, or the numbers fx, fy, cx, cy
+    [px] and baseline.
 
     Args:
         paths: the files.
         images: width and height of the images, used where the files name none; None where they are not known.
-        unit: metres per unit of T and of the projections' last column.
+        unit: metres per unit of T, of the projections' last column, and of the baseline.
         rectified: take the projection matrices, although camera matrices may be there too.
         fisheye: the distortion is ``cv2.fisheye``'s; also where the file names such a model.
 
     Raises:
-        CalibrationError: a file is missing or unreadable, an entry is missing, or the rig is impossible.
+        CalibrationError: a file is missing or unreadable, entries are missing (all are named), or the rig is
+            impossible.
     """
     entries: dict[str, Any] = {}
     for path in paths:
@@ -65,16 +68,57 @@ def opencv_rig(
         size = _size(entries) or images
         if size is None:
             raise CalibrationError("names no image size: give size=(width, height)")
-        P = [_find(entries, _PROJECTION, side, (3, 4)) for side in (0, 1)]
-        has_matrices = _find(entries, _MATRIX, 0, (3, 3)) is not None
-        if rectified or (not has_matrices and P[0] is not None):
-            if P[0] is None or P[1] is None:
-                raise CalibrationError("no projection matrices (P1, P2) in it")
+        K, P = ([_find(entries, kind, side, None) is not None for side in (0, 1)] for kind in (_MATRIX, _PROJECTION))
+        if not any(K + P) and any(entries.get(name) is not None for name in _PLAIN):
+            return _plain_rig(entries, size, unit), size
+        if rectified or (any(P) and not K[0]):
+            _require({"P1": P[0], "P2": P[1]}, entries)
+            left, right = (_of_side(entries, _PROJECTION, side, (3, 4)) for side in (0, 1))
             scale = np.array([1, 1, 1, unit])
-            return rig_from_projections(P[0] * scale, P[1] * scale, size), size
+            return rig_from_projections(left * scale, right * scale, size), size
+        R, T = (_first(entries, names) is not None for names in (_ROTATION, _TRANSLATION))
+        _require({"K1": K[0], "K2": K[1], "R": R, "T": T}, entries)
         fisheye = fisheye or str(_first(entries, _MODEL)).lower() in ("equidistant", "fisheye")
         cameras = [_camera(entries, side, size, fisheye) for side in (0, 1)]
         return rig_from_transform(cameras[0], cameras[1], _extrinsics(entries, unit)), size
+
+
+def _require(there: Mapping[str, bool], entries: Mapping[str, Any]) -> None:
+    """Raise CalibrationError with the names of all entries that are not there, and of those that are."""
+    missing = [name for name, found in there.items() if not found]
+    if missing:
+        verb, known = "is" if len(missing) == 1 else "are", ", ".join(sorted(entries)) or "nothing"
+        raise CalibrationError(
+            f"{', '.join(missing)} {verb} missing; in it: {known}. A stereo calibration "
+            "has K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
+        )
+
+
+def _plain_rig(entries: Mapping[str, Any], size: Size, unit: float) -> StereoRig:
+    """A rectified rig of two equal cameras by five numbers; `unit` is metres per unit of the baseline.
+
+    Raises:
+        CalibrationError: numbers are missing or impossible; all of them are named.
+    """
+    values, wrong = {}, []
+    for name in _PLAIN:
+        try:
+            values[name] = float(entries[name])
+            require_possible(np.array([values[name]]), name)
+        except KeyError:
+            wrong.append(f"{name} is missing")
+        except NO_NUMBERS:
+            wrong.append(f"{name} is no number")
+        except CalibrationError as error:
+            wrong.append(str(error))
+        else:
+            if values[name] <= 0 and name not in ("cx", "cy"):
+                wrong.append(f"{name} is {values[name]:g}, which must be positive")
+    if wrong:
+        raise CalibrationError(f"{'; '.join(wrong)} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)")
+    fx, fy, cx, cy, baseline = values.values()
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return StereoRig.from_pinhole(K, size=size, baseline=unit * baseline)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -117,6 +161,13 @@ def _find(entries: dict[str, Any], patterns: Sequence[str], side: int, shape: tu
     return None if name is None else _matrix(entries[name], name, shape)
 
 
+def _of_side(entries: dict[str, Any], patterns: Sequence[str], side: int, shape: tuple[int, ...]) -> Array:
+    """A camera's matrix that is there."""
+    found = _find(entries, patterns, side, shape)
+    assert found is not None  # `_require` has seen it
+    return found
+
+
 def _matrix(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
     """A finite matrix of the shape; flat where that is None."""
     data = value.get("data") if isinstance(value, Mapping) else value
@@ -131,18 +182,13 @@ def _matrix(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
 
 def _camera(entries: dict[str, Any], side: int, size: Size, fisheye: bool) -> PinholeCamera:
     """One camera from its matrix and its distortion."""
-    K = _find(entries, _MATRIX, side, (3, 3))
-    if K is None:
-        names = ", ".join(sorted(entries)) or "nothing"
-        raise CalibrationError(f"no camera matrix of the {('left', 'right')[side]} camera in it (K1, K2), but {names}")
+    K = _of_side(entries, _MATRIX, side, (3, 3))
     return PinholeCamera.from_matrix(K, _find(entries, _DISTORTION, side, None), size, fisheye)
 
 
 def _extrinsics(entries: dict[str, Any], unit: float) -> Array:
     """``T_right_left`` (4, 4) [m]; a rotation vector is accepted for R."""
     R, t = _first(entries, _ROTATION), _first(entries, _TRANSLATION)
-    if R is None or t is None:
-        raise CalibrationError("R and T, how the cameras stand to each other, are missing")
     rotation = _matrix(R, "R", None)
     rotation = so3_exp(rotation) if rotation.size == 3 else _matrix(R, "R", (3, 3))
     return pose(rotation, unit * _matrix(t, "T", (3,)))

@@ -18,7 +18,6 @@ from slam.sequences.calibration import (
     rig_from_cameras,
     rig_from_projections,
 )
-from slam.sequences.faults import FaultLog
 from slam.sequences.images import Size
 from slam.sequences.opencv_storage import opencv_rig
 from slam.sequences.source import require_size
@@ -35,7 +34,6 @@ _SENSORS = tuple(tuple(f"{root}{cam}/sensor.yaml" for cam in ("cam0", "cam1")) f
 _KITTI = ("calib.txt", "calib_cam_to_cam.txt")
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
-_LONG_BASELINE = 5.0  # [m]; more than that is more often a forgotten unit than a rig
 
 
 def load_rig(
@@ -49,8 +47,9 @@ def load_rig(
 
     Args:
         *paths: one file: OpenCV's (YAML, XML, JSON), Kalibr's camchain, KITTI's ``calib.txt`` or
-            ``calib_cam_to_cam.txt``. Two files: OpenCV's intrinsics and extrinsics, or EuRoC's ``sensor.yaml`` of the
-            left and the right camera. Or the folder where they are under their usual names.
+            ``calib_cam_to_cam.txt``, or the numbers fx, fy, cx, cy [px] and baseline in YAML. Two files: OpenCV's
+            intrinsics and extrinsics, or EuRoC's ``sensor.yaml`` of the left and the right camera. Or the folder where
+            they are under their usual names.
         size: width and height of the images [px], where the file names none.
         unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
         rectified: of an OpenCV file take the rectified cameras (``P1``, ``P2``).
@@ -155,13 +154,6 @@ def _usual(folder: Path, names: Sequence[Sequence[str]]) -> list[Path]:
     """The first of several sets of files that is complete; empty where none is."""
     sets = ([folder / name for name in names_] for names_ in names)
     return next((files for files in sets if all(file.is_file() for file in files)), [])
-
-
-def warn_of_unit(rig: StereoRig, path: Path, options: Mapping[str, str], faults: FaultLog) -> None:
-    """Report a baseline so long that the unit may be another one."""
-    if rig.baseline > _LONG_BASELINE:
-        hint = "" if "unit" in options else "; if the calibration is in millimetres, add unit=mm"
-        faults.report("calibration", f"{path}: the cameras are {rig.baseline:g} m apart{hint}")
 
 
 def flag(options: Mapping[str, str], name: str) -> bool:

@@ -63,7 +63,7 @@ def open_folder(path: Path, options: dict[str, str]) -> RecordedSequence:
         tolerance = _tolerance(options, ordered[0])
         left, partners = pair_listings(ordered[0], ordered[1], tolerance, "ns", faults)
         left, partners, stamps = in_seconds(left, partners, faults)
-        rig = _rig(path, topics, size, options, faults)
+        rig = _rig(path, topics, size, options)
     rows = np.array([int(name) for name in left.names])
     right_rows = np.array([-1 if name is None else int(name) for name in partners])
     source = RosPairs(stamps, path, left_all, right_all, rows, right_rows, size)
@@ -256,13 +256,11 @@ def _tolerance(options: dict[str, str], left: Listing) -> int:
     return round(1e9 * seconds)
 
 
-def _rig(path: Path, topics: Topics, size: Size, options: dict[str, str], faults: FaultLog) -> StereoRig:
+def _rig(path: Path, topics: Topics, size: Size, options: dict[str, str]) -> StereoRig:
     """The rig by the calibration file that is named, else by the camera messages."""
     if "calibration" in options:
         paths = rigs.calibration_files(path if path.is_dir() else path.parent, options)
-        rig = rigs.read_rig(paths, size, options)
-        rigs.warn_of_unit(rig, paths[0], options, faults)
-        return rig
+        return rigs.read_rig(paths, size, options)
     assert topics.left_info is not None and topics.right_info is not None
     where = Path(topics.info_names)
     rectified = rigs.flag(options, "rectified") if "rectified" in options else topics.rectified

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 from slam import registry
-from slam.errors import SlamError, UnknownNameError
+from slam.errors import SlamError
 from slam.testing import TIERS, findings
 
 
@@ -20,7 +17,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tier", choices=list(TIERS), default="good", help="the last tier to check (default: good)")
     given = parser.parse_args(arguments)
     try:
-        factory = _resolve(given.backend)
+        factory = registry.resolve("backends", given.backend)
     except SlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -35,22 +32,6 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"          {found.failure}.\n          Asked for: {found.demand}")
     print(f"{failures} failed" if failures else "all passed")
     return int(failures > 0)
-
-
-def _resolve(name: str) -> Any:
-    """The class of a registered name, or of ``module:Class``, also of a module in the present folder.
-
-    Raises:
-        UnknownNameError: there is none.
-    """
-    module, colon, attribute = name.partition(":")
-    if not colon:
-        return registry.resolve("backends", name)
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        return getattr(import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UnknownNameError(f"back end {name!r} cannot be loaded: {error}") from error
 
 
 if __name__ == "__main__":

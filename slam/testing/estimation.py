@@ -24,6 +24,7 @@ from slam.testing.scene import (
     make_scene,
     require,
     require_same,
+    require_status,
     started,
     tracked,
 )
@@ -74,8 +75,8 @@ def _follows(factory: Factory, scene: Scene) -> None:
 def _is_in_order(report: UpdateReport, seen: Observations) -> None:
     """Fail unless a report of good observations says so."""
     used, rejected, dof = len(report.used), len(report.rejected), report.dof
-    fine = report.status is UpdateStatus.OK and report.reason == ""
-    require(fine, f"status of an update with good observations: {report.status} {report.reason!r}, not ok")
+    require_status(report, UpdateStatus.OK, "an update with good observations")
+    require(report.reason == "", f"an update that is ok gives a reason: {report.reason!r}")
     require(used > 0.8 * (used + rejected), f"{rejected} of {used + rejected} good observations were rejected")
     own = not np.isin(report.used, report.rejected).any() and np.isin(report.used, seen.ids).all()
     require(own, "a landmark is both used and rejected, or was not observed")
@@ -129,7 +130,7 @@ def left_pixels_alone_are_measured(factory: Factory) -> None:
         if k > 3:
             seen = replace(seen, uv_right=np.full_like(seen.uv_right, np.nan)).select(run.in_map(seen))
         _, report = run.step(k, seen)
-    require(report.status is UpdateStatus.OK, f"status of an update with left pixels alone: {report.status}, not ok")
+    require_status(report, UpdateStatus.OK, "an update with left pixels alone")
     require(report.dof <= 3 * len(report.used), "right pixels that were not observed count as degrees of freedom")
     assert_near(run.backend.estimate().T_world_left, scene.poses[-1], "pose by left pixels", factor=3)
 
@@ -152,6 +153,6 @@ def guess_is_no_measurement(factory: Factory) -> None:
     for offset in (np.zeros(6), np.array([0.02, -0.03, 0.01, 0.1, -0.1, 0.2])):
         backend, seen = all_but_the_last(factory, scene)
         report = backend.update(seen, guess=scene.poses[-1] @ se3.exp(offset))
-        require(report.status is UpdateStatus.OK, f"status of an update with a guess: {report.status}, not ok")
+        require_status(report, UpdateStatus.OK, "an update with a guess")
         how = "good" if not offset.any() else "bad"
         assert_near(backend.estimate().T_world_left, scene.poses[-1], f"pose with a {how} guess to start from")

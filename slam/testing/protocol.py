@@ -22,6 +22,7 @@ from slam.testing.scene import (
     raises,
     require,
     require_same,
+    require_status,
     started,
     tracked,
 )
@@ -81,9 +82,7 @@ def nothing_seen_is_no_error(factory: Factory) -> None:
     for k in range(6, 12):
         backend.predict(DT * k)
         report = backend.update(Observations.empty())
-        require(
-            report.status is UpdateStatus.EMPTY, f"status of a frame without observations: {report.status}, not empty"
-        )
+        require_status(report, UpdateStatus.EMPTY, "a frame without observations")
         none = report.dof == 0 and np.isnan(report.nis) and not len(report.used) and not len(report.rejected)
         require(none, "a report without observations has some used or rejected, degrees of freedom, or a NIS")
     after = backend.estimate()
@@ -187,7 +186,7 @@ def removed_landmarks_are_gone(factory: Factory) -> None:
     raises(MeasurementError, backend.positions, gone[:1], what="position of a removed landmark")
     for k in range(8, len(scene.frames)):
         prediction, report = run.step(k, scene.frames[k])
-        require(report.status is UpdateStatus.OK, f"status after a removal: {report.status}, not ok")
+        require_status(report, UpdateStatus.OK, "an update after a removal")
         require(k > 8 or not np.isin(prediction.ids, gone).any(), "a removed landmark is predicted")
     assert_near(backend.estimate().T_world_left, scene.poses[-1], "pose after removals")
     back = gone[np.isin(gone, scene.frames[-1].ids)]

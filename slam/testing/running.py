@@ -17,6 +17,7 @@ from slam.testing.scene import (
     make_scene,
     require,
     require_same,
+    require_status,
     started,
     tracked,
 )
@@ -52,11 +53,10 @@ def updates_are_reported(factory: Factory) -> None:
     backend.predict(DT)
     report = backend.update(make_scene(2).frames[1].select(np.isin(make_scene(2).frames[1].ids, seen.ids)))
     require(isinstance(report, UpdateReport), f"update returned {type(report).__name__}, not an UpdateReport")
-    require(report.status is UpdateStatus.OK, f"status of an update with good observations: {report.status}, not ok")
+    require_status(report, UpdateStatus.OK, "an update with good observations")
     require(len(report.used) > 0 and np.isin(report.used, seen.ids).all(), "update used none of the good observations")
     backend.predict(2 * DT)
-    status = backend.update(Observations.empty()).status
-    require(status is UpdateStatus.EMPTY, f"status of a frame without observations: {status}, not empty")
+    require_status(backend.update(Observations.empty()), UpdateStatus.EMPTY, "a frame without observations")
 
 
 def estimates_have_their_shapes(factory: Factory) -> None:

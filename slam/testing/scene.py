@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam.data import BoolArray, Observations, Prediction, UpdateReport
+from slam.data import BoolArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
@@ -121,6 +121,17 @@ def require(holds: bool | np.bool_, sentence: str) -> None:
     """Fail with a sentence unless something holds."""
     if not holds:
         raise AssertionError(sentence)
+
+
+def require_status(report: UpdateReport, expected: UpdateStatus, what: str) -> None:
+    """Fail unless an update ended as expected; `what` is the update's description."""
+    status = report.status
+    if not isinstance(status, UpdateStatus):
+        require(
+            False,
+            f"status of {what} is {status!r}, a {type(status).__name__}, not slam.data.UpdateStatus.{expected.name}",
+        )
+    require(status is expected, f"status of {what}: {status.value} {report.reason!r}, not {expected.value}")
 
 
 def require_same(found: ArrayLike, expected: ArrayLike, what: str, tolerance: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""What looks wrong with the images and their times, said once each with what to do."""
+"""What looks wrong with the images, their times and the baseline, said once each with what to do."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
-from slam.tracking.pair_check import pair_geometry
+from slam.tracking.pair_check import NO_DISPARITY, pair_geometry
 from slam.tracking.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 
 #: Times between frames that cameras have [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
+
+#: Baselines that rigs have [m]; others are more often a length in another unit.
+SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
 _INTERVALS = 5  # times between frames whose median is judged: single frames may be missing
 _POOR = 5  # frames in a row that must show too little before it is said
@@ -42,8 +45,11 @@ class InputWarnings:
         self._rig, self._rows = rig, rows
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
-        self._count = self._poor = 0
-        self._pair_is_known = self._texture_is_known = False
+        self._count = self._poor = self._unpaired = 0
+        self._pair_is_known = self._texture_is_known = self._partners_are_known = False
+        unlikely = baseline_doubt(rig)
+        if unlikely:
+            self._warn(unlikely)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
         """Look at a frame and what the front end found in it; what is no frame is for others to refuse."""
@@ -57,6 +63,8 @@ class InputWarnings:
             self._check_texture(len(features))
         if not self._pair_is_known and frame.right is not None and _is_a_power_of_two(self._count):
             self._check_pair(frame.left, frame.right)
+        if not self._partners_are_known and frame.right is not None:
+            self._check_partners(len(features), int(features.has_stereo.sum()))
         self._pair_is_known |= self._count >= _LAST_LOOK
         self._count += 1
 
@@ -84,6 +92,16 @@ class InputWarnings:
                 "sharper focus, shorter exposure, or a view with more texture"
             )
 
+    def _check_partners(self, features: int, stereo: int) -> None:
+        """Images of which hardly any feature is found in the other one, for several frames."""
+        self._unpaired = self._unpaired + 1 if features >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
+        if self._unpaired >= _POOR:
+            self._partners_are_known = True
+            self._warn(
+                f"only {stereo} of {features} features of frame {self._count} are found in the right image: check that "
+                "the images are of two cameras at one moment, the left one first, and that the calibration is theirs"
+            )
+
     def _check_pair(self, left: np.ndarray, right: np.ndarray) -> None:
         """Cameras that look swapped, and rows that do not agree."""
         if not (_is_image(left, self._rig) and _is_image(right, self._rig)):
@@ -94,11 +112,18 @@ class InputWarnings:
             self._pair_is_known = True
             return
         self._pair_is_known = found.conclusive
+        self._partners_are_known |= found.swapped or found.same or found.rows_differ  # the reason is known then
         if found.swapped:
             self._warn(
                 f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras "
                 f"when the images are exchanged, {found.as_given} as they are; exchange them "
                 "(left=…&right=… of a folder, swap=yes of a camera)"
+            )
+        elif found.same:
+            horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
+            self._warn(
+                f"left and right image show the same: {found.without_disparity} of {found.matches} features have no "
+                f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
             )
         elif found.rows_differ:
             self._warn(
@@ -109,6 +134,16 @@ class InputWarnings:
     def _warn(self, line: str) -> None:
         self.lines.append(line)
         logger.warning("%s", line)
+
+
+def baseline_doubt(rig: StereoRig) -> str:
+    """What is wrong with a baseline that no rig has; empty where it is likely."""
+    if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
+        return ""
+    return (
+        f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres? "
+        "(an OpenCV file in millimetres needs unit=mm)"
+    )
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -1,4 +1,4 @@
-"""Whether two images are a stereo pair of their rig: which camera is the left one, and whether rows agree.
+"""Whether two images are a stereo pair of their rig: which camera is the left one, whether rows agree, and depth shows.
 
 The front end looks for a feature's partner in the same row and to the left alone, so it cannot tell. Here features are
 matched wherever they lie; those that agree with one another (a fundamental matrix, by RANSAC) are held against the rig.
@@ -16,6 +16,10 @@ from slam.geometry.se3 import Array
 
 _FEATURES = 1000  # of an image that are matched
 _TOLERANCE = 2.0  # [px] from an epipolar line: ORB places features to a pixel or two
+
+#: Disparities below this are none [px].
+NO_DISPARITY = _TOLERANCE
+
 _SAMPLE = 8  # matches that any fundamental matrix can be made to fit
 _SIGMAS = 5.0  # a chance of 3e-7 to be wrong
 
@@ -29,6 +33,7 @@ class PairGeometry:
         conclusive: there are more than wrong matches would give by chance; else the other numbers are zero.
         as_given: number of them in their rows, and farther right in the left image, as they must be.
         as_swapped: the same if the left image is the right camera's, and the other way round.
+        without_disparity: number of them in their rows at the same place in both images.
         off_rows: number of matches farther from their row than the front end looks.
         row_offset: median distance of their rows [px].
     """
@@ -37,6 +42,7 @@ class PairGeometry:
     conclusive: bool = False
     as_given: int = 0
     as_swapped: int = 0
+    without_disparity: int = 0
     off_rows: int = 0
     row_offset: float = 0.0
 
@@ -44,6 +50,11 @@ class PairGeometry:
     def swapped(self) -> bool:
         """The matches fit the rig far better with the images exchanged."""
         return self.conclusive and _most(self.as_swapped, self.as_given)
+
+    @property
+    def same(self) -> bool:
+        """Most matches are at the same place in both images."""
+        return self.conclusive and _most(self.without_disparity, self.matches - self.without_disparity)
 
     @property
     def rows_differ(self) -> bool:
@@ -78,6 +89,7 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         True,
         int(((shift > _TOLERANCE) & (np.abs(offset) <= band)).sum()),
         int(((shift_swapped > _TOLERANCE) & (np.abs(offset_swapped) <= band)).sum()),
+        int(((np.abs(shift) <= _TOLERANCE) & (np.abs(offset) <= band)).sum()),
         int((np.abs(offset) > band).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
     )

@@ -126,7 +126,7 @@ class Appearance:
 
 
 def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
-    """Looks of all landmarks.
+    """Descriptors of all landmarks.
 
     Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
     from another one. Those that drift are as far apart as SURF's on a drive through a town: also the nearest of some

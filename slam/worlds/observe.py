@@ -181,7 +181,7 @@ def _features(
     world: World, looks: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
     uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
 ) -> SimulatedFeatures:  # fmt: skip
-    """Features with the looks of their landmarks; `source` are their rows in `seen`, −1 for those that are nothing."""
+    """Features with the descriptors of their landmarks; `source` are their rows in `seen`, −1 for false ones."""
     ids = np.append(seen.ids, _FALSE)[source]  # row −1 is the last one
     size = np.append(seen.size, 12.0)[source]
     false = np.flatnonzero(ids == _FALSE)

@@ -139,7 +139,7 @@ class WorldSequence:
 
     @cached_property
     def _looks(self) -> Appearance:
-        """Looks of the landmarks."""
+        """Descriptors of the landmarks."""
         return appearance(self.world, self._model, self.values["layout"])
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,18 @@ def test_a_missing_method_and_a_defect_are_named():
     assert "predict, update, add, remove, estimate, positions, trajectory missing" in next(findings(Empty)).failure
     said = [found.failure for found in findings(Buggy, "runs") if found.failure]
     assert said[0] == "raised AttributeError: 'Buggy' object has no attribute 'nothing_of_this_name'"
+
+
+def test_a_status_that_is_a_word_is_told_from_the_right_one():
+    class Wordy(FixedMapBackend):
+        def update(self, observations, guess=None):
+            report = super().update(observations, guess)
+            return replace(report, status=str(report.status))
+
+    failed = {found.check: found.failure for found in findings(Wordy, "runs") if found.failure}
+    assert failed["updates_are_reported"] == (
+        "status of an update with good observations is 'ok', a str, not slam.data.UpdateStatus.OK"
+    )
 
 
 def test_tiers_are_taken_one_after_the_other():

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from slam import registry
 from slam.commands.compare import variants_of
 from slam.config import SystemConfig
-from slam.errors import SlamError
+from slam.errors import SlamError, UnknownNameError
 from slam.naming import suggestion
 from slam.sequences import open_sequence
 
@@ -46,6 +48,26 @@ def test_a_format_is_suggested(tmp_path):
 def test_a_back_end_is_suggested():
     with pytest.raises(SlamError, match=r"unknown back end 'smother' \(did you mean 'smoother'\?\); known: batch"):
         registry.resolve("backends", "smother")
+
+
+def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
+    (tmp_path / "my_own_module.py").write_text(
+        "class Mine:\n    def __init__(self, rig, models=None):\n        self.rig = rig\n"
+    )
+    (tmp_path / "a_broken_module.py").write_text("class Mine(:\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert registry.create("backends", "my_own_module:Mine", "rig").rig == "rig"
+    assert sys.path[-1] == str(tmp_path)  # last: nothing that is installed is replaced
+    for name in (
+        "my_own_module:Other",
+        "my_own_module:",
+        ":Mine",
+        "no_module_of_this_name:Mine",
+        "a_broken_module:Mine",
+    ):
+        with pytest.raises(UnknownNameError, match=f"back end '{name}' cannot be loaded"):
+            registry.resolve("backends", name)
 
 
 @pytest.mark.parametrize(

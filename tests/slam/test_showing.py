@@ -39,7 +39,7 @@ def test_every_line_is_short_and_says_what_matters(sequence, system):
         for thing in (
             sequence, sequence.frame(0), sequence.rig, sequence.observations(0), system.estimate(), result,
             result.report, system.landmarks, system.trajectory(), system.snapshot(), prediction,
-            slam.Observations.empty(),
+            slam.Observations.empty(), system,
         )
     }  # fmt: skip
     for name, text in shown.items():
@@ -49,6 +49,7 @@ def test_every_line_is_short_and_says_what_matters(sequence, system):
     assert f"{len(result.matched)} of {result.predicted} landmarks matched" in shown["FrameResult"]
     assert f"{len(system.landmarks)} landmarks" in shown["Estimate"]
     assert shown["Trajectory"].startswith("Trajectory(4 poses, 0.100 s, ")
+    assert shown["StereoSlam"] == f"StereoSlam(no front end, EkfBackend, 4 frames, {len(system.landmarks)} landmarks)"
     assert "covariance=6x6" in shown["Prediction"]
     assert shown["Observations"] == "Observations(0 landmarks, 0 with a right pixel)"
 

@@ -56,7 +56,7 @@ class Atlas:
         keyframes: in order of time.
         index: which of them look alike.
         loops: those that the pose graph holds.
-        refused: sightings that contradicted the path, as the numbers of both keyframes.
+        refused: loops that contradict the path, as the numbers of both keyframes.
         corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
         anchor: how well the last of these is known; None without a loop.
         T_map_odom: pose (4, 4) of the back end's frame in the map.
@@ -101,7 +101,7 @@ class Atlas:
         return np.array([self.pose_in_map(k) for k in range(len(self))]).reshape(-1, 4, 4)
 
     def summary(self) -> dict[str, int]:
-        """Numbers of keyframes, of loops closed in this run, and of sightings that contradicted the path.
+        """Numbers of keyframes, of loops closed in this run, and of loops refused as they contradict the path.
 
         In a known map, its keyframes are counted too, and apart as ``known``.
         """

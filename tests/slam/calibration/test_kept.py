@@ -79,7 +79,7 @@ def spoilt(tree, change):
         (lambda t: t["rig"].update(focal="long"), "of which rig"),
         (lambda t: t["rig"].update(focal=float("nan")), "finite"),
         (lambda t: t.update(residual_scale="x"), "residual_scale"),
-        (lambda t: t.pop("parameters"), "no calibration"),
+        (lambda t: t.pop("parameters"), "neither a file of"),
         (lambda t: t["parameters"].pop(), "cannot be read"),
         (lambda t: t["parameters"][0].update(name="colour"), "not those of this version"),
         (lambda t: t["covariance"][0].__setitem__(0, -1.0), "covariance"),

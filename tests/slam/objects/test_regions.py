@@ -4,7 +4,7 @@ import numpy as np
 
 from slam.geometry.se3 import hat
 from slam.objects.displacements import Displacements
-from slam.objects.regions import judge_scene
+from slam.objects.regions import classify_scene
 
 RNG = np.random.default_rng(3)
 
@@ -24,14 +24,14 @@ def scene(count=80, near=12, shift=(0.0, 0.0, 0.0), pose_error=(0.0,) * 6, noise
 def test_a_wrong_pose_moves_nothing():
     """A rotation of 20 mrad and a shift of 2 cm displace every point by more than ten deviations."""
     moved, view = scene(pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = judge_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0, 4)
     assert not found.groups
     assert found.alone.max() < 30  # χ²(3) of 80 points: 99.9999 %
 
 
 def test_the_near_group_is_found_though_the_pose_is_wrong():
     moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.02, 0.005, 0.02, 0.0, 0.01]))
-    found = judge_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0, 4)
     assert len(found.groups) == 1
     assert set(found.groups[0].members) <= set(range(12)) and len(found.groups[0].members) >= 10
     assert abs(found.groups[0].away - 0.006) < 0.002
@@ -40,13 +40,13 @@ def test_the_near_group_is_found_though_the_pose_is_wrong():
 def test_where_the_near_group_rules_the_pose_it_is_still_the_one_that_moves():
     """The pose follows the box, so that its own points stand still and the wall is displaced."""
     moved, view = scene(shift=(0.006, 0.0, 0.0), pose_error=np.array([0.0, 0.0, 0.0, -0.006, 0.0, 0.0]))
-    found = judge_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0, 4)
     assert len(found.groups) == 1 and set(found.groups[0].members) <= set(range(12))
 
 
 def test_too_few_tracks_say_nothing():
     moved, view = scene(count=8, near=4, shift=(0.1, 0, 0))
-    assert not judge_scene(moved, view, 30.0, 4).groups
+    assert not classify_scene(moved, view, 30.0, 4).groups
 
 
 def test_single_false_tracks_find_no_company():
@@ -54,7 +54,7 @@ def test_single_false_tracks_find_no_company():
     moved, view = scene()
     for row, jump in zip((20, 40, 60), np.eye(3)):
         moved.d[row] += 0.5 * jump
-    found = judge_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0, 4)
     assert not found.groups
     assert set(np.flatnonzero(found.alone > 100)) == {20, 40, 60}
 
@@ -67,6 +67,6 @@ def test_two_groups_that_move_differently_are_two():
         [moved.points[second, :2] / moved.points[second, 2:], np.log(moved.points[second, 2])]
     )
     moved.d[second] += (0.0, -0.008, 0.0)
-    found = judge_scene(moved, view, 30.0, 4)
+    found = classify_scene(moved, view, 30.0, 4)
     assert len(found.groups) == 2
     assert {frozenset(g.members <= 11) for g in found.groups} == {frozenset({True}), frozenset({False})}

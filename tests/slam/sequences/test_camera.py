@@ -131,6 +131,16 @@ def test_a_video_file_plays_a_device_at_its_own_rate(rig_here, scene, tmp_path):
     assert frames[0].left.shape == (HEIGHT, WIDTH)
 
 
+def test_a_file_is_played_as_fast_as_asked(rig_here, scene, tmp_path):
+    write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 1.0)
+    began = time.monotonic()
+    frames = list(slam.open_sequence("camera:both.avi?fps=40"))
+    assert 0.04 < time.monotonic() - began < 1.0
+    assert np.diff([f.stamp for f in frames]).max() < 0.5
+    with pytest.raises(ConfigurationError, match="a file has a size of its own: leave out width and height"):
+        slam.open_sequence("camera:both.avi?width=640")
+
+
 # ------------------------------------------------------------------------------------------------ faults
 
 

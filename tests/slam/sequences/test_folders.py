@@ -44,12 +44,23 @@ def rename(folder: Path, names: list[str]) -> None:
     [
         ([f"{1_403_715_273_000_000_000 + i * 50_000_000}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
         ([f"{1_403_715_273_000_000 + i * 50_000}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
+        ([f"{1_403_715_273_000 + i * 50}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
+        ([f"{2_000_000_000 * (i + 1)}.png" for i in range(6)], 2.0 * np.arange(1, 7)),
         ([f"1403715273.{5 * i:02d}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
         ([f"frame{i:04d}.png" for i in (3, 4, 5, 7, 8, 9)], 0.1 * np.array([0, 1, 2, 4, 5, 6])),
         (["a.png", "b.png", "c.png", "d.png", "e.png", "f.png"], 0.1 * np.arange(6)),
         ([f"{i:06d}_x0.png" for i in range(6)], 0.1 * np.arange(6)),
     ],
-    ids=["nanoseconds", "microseconds", "seconds", "numbers", "letters", "last-number-is-none"],
+    ids=[
+        "nanoseconds",
+        "microseconds",
+        "milliseconds",
+        "since-the-start",
+        "seconds",
+        "numbers",
+        "letters",
+        "last-number-is-none",
+    ],
 )
 def test_names_give_stamps_or_numbers_or_order(two_folders: Path, names: list[str], stamps: np.ndarray) -> None:
     for side in ("left", "right"):
@@ -102,7 +113,7 @@ def test_sides_can_be_told_also_as_patterns(two_folders: Path, tmp_path: Path) -
         ("fps=fast", ConfigurationError, "got 'fast'"),
         ("unit=feet", ConfigurationError, "unit must be one of m, cm, mm"),
         ("rectified=maybe", ConfigurationError, "rectified must be yes or no"),
-        ("rectified=yes", CalibrationError, "no projection matrices"),
+        ("rectified=yes", CalibrationError, "P1, P2 are missing"),
     ],
 )
 def test_impossible_options(two_folders: Path, query: str, error: type[Exception], text: str) -> None:
@@ -194,8 +205,8 @@ def test_distortions_of_every_length(tmp_path: Path, build: SimpleNamespace) -> 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"K2": None}, "no camera matrix of the right camera"),
-        ({"R": None}, "R and T, how the cameras stand to each other, are missing"),
+        ({"K2": None, "T": None}, "K2, T are missing"),
+        ({"R": None}, "R is missing"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation matrix"),
         ({"R": np.eye(2)}, "R is no matrix of shape"),
         ({"T": np.zeros((3, 1))}, "baseline is zero"),
@@ -212,13 +223,28 @@ def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, te
     assert str(tmp_path / "a.yml") in str(error.value)
 
 
-def test_a_baseline_in_millimetres_is_doubted(two_folders: Path, build: SimpleNamespace) -> None:
+def test_a_baseline_in_millimetres(two_folders: Path, build: SimpleNamespace) -> None:
     build.write_storage(two_folders / "calibration.yaml", build.stereo_entries(200.0))
-    sequence = open_sequence(f"{two_folders}?fps=10")
-    assert "if the calibration is in millimetres, add unit=mm" in sequence.warnings[0]
-    sequence = open_sequence(f"{two_folders}?fps=10&unit=mm")
-    assert sequence.warnings == []
-    assert sequence.rig.baseline == pytest.approx(0.2, rel=1e-4)
+    assert open_sequence(f"{two_folders}?fps=10").rig.baseline == pytest.approx(200, rel=1e-4)
+    assert open_sequence(f"{two_folders}?fps=10&unit=mm").rig.baseline == pytest.approx(0.2, rel=1e-4)
+
+
+def test_a_rectified_pair_by_five_numbers(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("fx: 500\nfy: 501\ncx: 31.5\ncy: 23.5\nbaseline: 120.0\n")
+    rig, _ = opencv_rig([file], SIZE, unit=0.001)
+    assert (rig.left.fu, rig.left.fv, rig.left.u0, rig.left.v0) == (500, 501, 31.5, 23.5)
+    assert rig.left == rig.right
+    assert np.allclose(rig.b, [-0.12, 0, 0])
+
+
+def test_all_that_is_wrong_with_five_numbers_is_said_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("fx: 500\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
+    with pytest.raises(CalibrationError) as error:
+        opencv_rig([file], SIZE)
+    for part in ("fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which must be positive"):
+        assert part in str(error.value)
 
 
 CAMCHAIN = """cam0:

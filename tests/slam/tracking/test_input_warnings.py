@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -21,13 +22,14 @@ FRAME = next(iter(SEQUENCE))
 RIG = SEQUENCE.rig
 
 
-def lines(frames, features=200, rig=RIG, kind="handheld"):
-    """What is said of frames in which the front end found so many features."""
+def lines(frames, features=200, rig=RIG, kind="handheld", stereo=200):
+    """What is said of frames in which the front end found so many features, so many with a right pixel."""
     watch = InputWarnings(rig, models_for(kind), 1.5)
     image = np.zeros((features, 2))
     found = replace(
         StereoFeatures.empty(0.0),
-        **{name: image for name in ("uv_left", "uv_right", "descriptors")},
+        **{name: image for name in ("uv_left", "descriptors")},
+        uv_right=np.where(np.arange(features)[:, None] < stereo, image, np.nan),
         **{name: image[:, 0] for name in ("scale", "angle", "response", "laplacian")},
     )
     for frame in frames:
@@ -102,6 +104,30 @@ def test_images_of_different_things_say_nothing():
     assert lines([replace(FRAME, right=None)]) == []
 
 
+def test_one_image_twice_is_named():
+    (line,) = lines([replace(f, right=f.left) for f in stamped(0.05 * np.arange(8))])
+    assert "left and right image show the same" in line
+    assert f"nearer than {RIG.left.fu * RIG.baseline / 2:.0f} m" in line
+
+
+def test_images_without_partners_are_named_once():
+    """One lens as two cameras: the halves of an image show different things."""
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in range(2)]
+    frames = [StereoFrame(k, 0.05 * k, *noise) for k in range(12)]
+    (line,) = lines(frames, stereo=3)
+    assert line.startswith("only 3 of 200 features of frame 4 are found in the right image")
+    assert lines(frames[:4], stereo=3) == []
+    assert lines([replace(frame, right=None) for frame in frames], stereo=0) == []
+
+
+@pytest.mark.parametrize(("baseline", "doubted"), [(120.0, True), (0.00012, True), (0.006, False), (9.0, False)])
+def test_a_baseline_in_another_unit_is_doubted(baseline, doubted):
+    rig = slam.StereoRig.from_pinhole(RIG.left.K, baseline=baseline, size=(320, 240))
+    said = InputWarnings(rig, models_for("handheld"), 1.5).lines
+    assert [f"{baseline:g} m apart" in line for line in said] == [True] * doubted
+
+
 def test_colour_and_sixteen_bits():
     colour = [cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in images(FRAME)]
     deep = [image.astype(np.uint16) * 257 for image in images(FRAME)]
@@ -154,9 +180,14 @@ def test_a_run_says_it_on_the_terminal_and_in_its_summary(slam_command, tmp_path
         storage.write(name, value)
     storage.release()
     done = slam_command("run", f"{tmp_path / 'mine'}?fps=20", "--out", tmp_path / "out", "--quiet", "--no-picture")
-    assert done.returncode == 0
-    assert done.stderr.count("look swapped") == 1
-    assert (tmp_path / "out" / "summary.json").read_text().count("look swapped") == 1
+    assert done.returncode == 1
+    said, kept = done.stderr, json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert said.count("WARNING: left and right look swapped") == 1
+    assert said.splitlines()[-1].startswith("slam: no frame was tracked; likely cause: left and right look swapped")
+    assert [line for line in kept["warnings"] if "look swapped" in line] == [
+        said.splitlines()[-1].partition("cause: ")[2]
+    ]
+    assert kept["tracking"].startswith("no frame was tracked")
     done = slam_command(
         "run", f"{tmp_path / 'mine'}?fps=20&left=right&right=left", "--out", tmp_path / "o2", "--quiet", "--no-picture"
     )

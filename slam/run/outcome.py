@@ -1,0 +1,54 @@
+"""How a run went as a whole: whether the camera was tracked, and if not, why not, in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from slam.geometry.rig import StereoRig
+from slam.run.summary import RunRecord
+from slam.tracking.input_warnings import baseline_doubt
+from slam.tracking.state import ENOUGH_FEATURES
+
+_TRACKED = "tracked"
+
+
+def outcome(record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_map: bool = False) -> str:
+    """What to say of a run in which most frames were not tracked, with the likely cause; empty for others.
+
+    Args:
+        record: of the run. Its first frame is not counted: there is no map yet.
+        rig: the cameras.
+        warnings: what looked wrong with the images and their times; the first is taken for the cause.
+        in_map: the run began in the map of an earlier one.
+    """
+    frames, tracked = len(record.statuses) - 1, record.statuses[1:].count(_TRACKED)
+    if frames < 1 or 2 * tracked >= frames:
+        return ""
+    how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
+    return f"{how} tracked; likely cause: {warnings[0] if warnings else _cause(record, rig, in_map)}"
+
+
+def nothing_tracked(summary: dict[str, Any]) -> bool:
+    """Whether a run of several frames tracked none, by its summary."""
+    return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
+
+
+def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
+    """The first step that gave too little, and what to look at."""
+    features, stereo = np.median(record.features, axis=0)
+    if features < ENOUGH_FEATURES:
+        return f"the images show hardly anything to follow ({features:.0f} features in the median frame)"
+    if in_map:
+        return "the camera is not where the map was made, or the place looks different now"
+    if stereo < ENOUGH_FEATURES:
+        return (
+            f"in the median frame {stereo:.0f} of {features:.0f} features are found in the right image: check that the "
+            "images are of two cameras, the left one first, and the calibration"
+        )
+    return baseline_doubt(rig) or (
+        "features are found in both images, but not again in the next frame: frames too far apart, images that are not "
+        "in order of time, or the calibration of another camera"
+    )

@@ -1,0 +1,48 @@
+"""A run in which most frames were not tracked says so, with the first step that gave too little as the likely cause."""
+
+from __future__ import annotations
+
+import pytest
+
+from slam.geometry.rig import StereoRig
+from slam.run.outcome import nothing_tracked, outcome
+from slam.run.summary import RunRecord
+
+RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+
+
+def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150)) -> RunRecord:
+    statuses = ["started", *["tracked"] * tracked, *["lost"] * (frames - 1 - tracked)]
+    return RunRecord(statuses=statuses, features=[features] * frames)
+
+
+@pytest.mark.parametrize(
+    ("tracked", "words"),
+    [(20, ""), (10, ""), (9, "only 9 of 20 frames were tracked"), (1, "only 1 of 20 frames was"), (0, "no frame was")],
+)
+def test_fewer_than_half_are_told(tracked, words):
+    said = outcome(record(tracked), RIG)
+    assert said.startswith(words) and bool(said) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("features", "baseline", "more", "words"),
+    [
+        ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median frame)"),
+        ((200, 3), 0.12, {}, "in the median frame 3 of 200 features are found in the right image"),
+        ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
+        ((200, 150), 0.12, {}, "features are found in both images, but not again in the next frame"),
+        ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
+        ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),
+    ],
+)
+def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, more, words):
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, baseline, 320, 240)
+    assert outcome(record(0, features=features), rig, **more).startswith(f"no frame was tracked; likely cause: {words}")
+
+
+def test_a_run_of_one_frame_has_nothing_to_track():
+    assert outcome(record(0, 1), RIG) == ""
+    assert not nothing_tracked({"frames": 1, "status": {"started": 1}})
+    assert nothing_tracked({"frames": 2, "status": {"started": 1, "lost": 1}})
+    assert not nothing_tracked({"frames": 2, "status": {"started": 1, "tracked": 1}})
