@@ -25,14 +25,21 @@ class Anchor:
     """What the pose graph said of the last keyframe when a loop was closed last.
 
     Attributes:
-        covariance: of its pose, perturbing on the right, and of the common errors (6 + m, 6 + m).
-        common: the common errors (m,), where their variance was one.
-        scale: what they stand for (m, m), see `slam.mapping.atlas.keyframes.CommonError`.
+        covariance: of its pose, perturbing on the right, and of the common errors (6 + n, 6 + n).
+        common: the common errors (n,), where their variance was one.
+        rig: what they stand for.
     """
 
     covariance: Array
     common: Array
-    scale: Array
+    rig: CommonError
+
+    def common_as(self, rig: CommonError) -> Array:
+        """The common errors (n,), where they stand for what they do now: the rig's posterior changes meanwhile."""
+        if rig.scale.shape != self.rig.scale.shape:
+            return np.zeros(rig.scale.shape[1])
+        error = self.rig.scale @ self.common + self.rig.known - rig.known
+        return np.asarray(np.linalg.lstsq(rig.scale, error)[0])
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
@@ -43,8 +50,8 @@ class Anchor:
             back: adjoint (6, 6) of the keyframe's pose seen from the later one.
             shares: derivative (6, m) of the motion since by the common errors.
         """
-        J = np.concatenate([back, shares @ self.scale], axis=1)
-        found = shares @ self.scale @ self.common
+        J = np.concatenate([back, shares @ self.rig.scale], axis=1)
+        found = shares @ (self.rig.scale @ self.common + self.rig.known)
         return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
 
 
@@ -98,7 +105,8 @@ class Atlas:
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        return np.array([self.pose_in_map(k) for k in range(len(self))]).reshape(-1, 4, 4)
+        since = np.array([k.T_odom_left for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 4, 4)
+        return np.concatenate([self.corrected, self.T_map_odom @ since])
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of sightings that contradicted the path.
@@ -121,22 +129,24 @@ class Atlas:
             return None
         return self.keyframes[self.refused[-1][0]].frame
 
-    def chain(self, scale: Array, path: Trajectory | None = None) -> Chain:
+    def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now.
 
         Args:
-            scale: what common errors of unit variance stand for (m, m).
+            rig: what common errors stand for now.
             path: the path so far.
         """
         poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
         if path is not None:
             rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
             poses[self.known :] = path.poses[rows]
-        fits = [k.shares.shape[1] == len(scale) for k in self.keyframes]  # not where a known map was made without them
-        none = np.zeros((6, len(scale)))
-        common = np.array([k.shares if fit else none for k, fit in zip(self.keyframes, fits)]) @ scale
+        count, m = len(self), len(rig.known)
+        none = np.zeros((6, m))  # where a known map was made without them
+        shares = np.array([k.shares if k.shares.shape[1] == m else none for k in self.keyframes]).reshape(6 * count, m)
+        common = (shares @ np.column_stack([rig.scale, rig.known])).reshape(count, 6, rig.scale.shape[1] + 1)
         common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
-        return Chain(poses, np.array([k.step_covariance for k in self.keyframes]), common)
+        steps = np.array([k.step_covariance for k in self.keyframes]).reshape(-1, 6, 6)
+        return Chain(poses, steps, common[:, :, :-1], common[:, :, -1])
 
     def in_map(self, chain: Chain) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
@@ -147,12 +157,6 @@ class Atlas:
         if number < len(self.corrected):
             return np.asarray(self.corrected[number])
         return self.T_map_odom @ self.keyframes[number].T_odom_left
-
-    def positions(self) -> Array:
-        """Positions (K, 3) [m] of all keyframes in the map."""
-        since = np.array([k.T_odom_left[:3, 3] for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 3)
-        T = self.T_map_odom
-        return np.concatenate([self.corrected[:, :3, 3], since @ T[:3, :3].T + T[:3, 3]])
 
     def estimate(self, estimate: Estimate, common: CommonError) -> Estimate:
         """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says.
@@ -181,7 +185,7 @@ class Atlas:
             return path
         from slam.mapping.atlas.pose_graph import solve
 
-        chain = self.chain(self.anchor.scale, path)
+        chain = self.chain(self.anchor.rig, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))

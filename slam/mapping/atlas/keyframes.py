@@ -15,20 +15,22 @@ from slam.mapping.atlas.config import AtlasConfig
 
 @dataclass(frozen=True)
 class CommonError:
-    """The part of a pose's error that all poses of a run share, as the rig's error makes it: ``shares @ scale @ c``.
+    """What poses are off by through the rig's error: ``shares @ (scale @ c + known)``, with the same c for all poses.
 
     Attributes:
         shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
-        scale: these errors by ones of unit variance, c, as they are known now (m, m).
+        scale: these errors by ones of unit variance, c, as they are known now (m, n).
+        known: the part of them that is known by now, but stays in poses of before (m,).
     """
 
     shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
     scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    known: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def covariance(self) -> Array:
-        """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.scale
+        """What it adds to the pose's covariance (6, 6); that the known part has not been corrected counts as well."""
+        root = self.shares @ np.column_stack([self.scale, self.known])
         return np.asarray(root @ root.T)
 
 
