@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slam.data import Estimate
-from slam.geometry.se3 import Array, adjoint, inverse, log
+from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, adjoints, shared_out
 from slam.mapping.atlas.keyframes import CommonError, Keyframe, Loop, what_was_added
@@ -159,7 +159,7 @@ class Atlas:
         return self.T_map_odom @ self.keyframes[number].T_odom_left
 
     def estimate(self, estimate: Estimate, common: CommonError) -> Estimate:
-        """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says.
+        """An estimate in odom, taken to the map; after a loop it is as certain as the pose graph says.
 
         Args:
             estimate: with covariances by noise and by the common error.
@@ -171,12 +171,13 @@ class Atlas:
         before = self.keyframes[len(self.corrected) - 1]
         back = adjoint(inverse(estimate.T_world_left) @ before.T_odom_left)
         noise = what_was_added(estimate.covariance - common.covariance, back @ before.covariance @ back.T)
+        covariance = self.anchor.later(back, common.shares - back @ before.shares) + noise
         return replace(
             estimate,
             T_world_left=T @ estimate.T_world_left,
-            covariance=self.anchor.later(back, common.shares - back @ before.shares) + noise,
+            covariance=covariance,
             positions=estimate.positions @ R.T + T[:3, 3],
-            covariances=R @ estimate.covariances @ R.T,
+            covariances=R @ landmarks_by_pose(estimate, covariance) @ R.T,
         )
 
     def path(self, path: Trajectory) -> Trajectory:
@@ -189,6 +190,20 @@ class Atlas:
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))
+
+
+def landmarks_by_pose(estimate: Estimate, covariance: Array) -> Array:
+    """Covariances (N, 3, 3) of landmarks after the camera's pose, from which they are seen, has got another one (6, 6).
+
+    What a landmark's covariance has more than the pose's at its place is its own, and stays. A landmark that was surer
+    in the estimate keeps its covariance: its place does not depend on where the camera is now.
+    """
+    T, P = estimate.T_world_left, estimate.covariances
+    J = T[:3, :3] @ points_by_pose(transform(inverse(T), estimate.positions))
+    before, after = (J @ pose @ np.swapaxes(J, 1, 2) for pose in (estimate.covariance, covariance))
+    moved = what_was_added(P, before) + after
+    surer = np.trace(moved, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
+    return np.where(surer[:, None, None], moved, P)
 
 
 def _between_keyframes(path: Trajectory, stamps: Array, moved: Array) -> Array:
