@@ -34,9 +34,9 @@ from slam.worlds.export import write_euroc
 
 TOWN = "synthetic:town?descriptor=16&focal_error=0.005&speed=2&frames=420"
 SHORT = {
-    "desk": "synthetic:desk?frames=300",
-    "aisle": "synthetic:aisle?frames=300",
-    "street": "synthetic:street?frames=150",
+    "desk": "synthetic:desk?frames=200",
+    "aisle": "synthetic:aisle?frames=200",
+    "street": "synthetic:street?frames=100",
 }
 _COMMON = 23  # errors that all poses share: those of the rig
 _AROUND = 500  # keyframes of a lap
