@@ -223,7 +223,7 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--paths", nargs="*", default=["06", "07"])
+    parser.add_argument("--paths", nargs="*", default=["06"])
     parser.add_argument("--backend", nargs="*", default=list(BACKENDS))
     parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
     parser.add_argument("--only-paths", action="store_true")
@@ -248,7 +248,7 @@ def main() -> None:
     from experiments import loops_parts as parts
 
     print("\nTowns where half of the stretches of the streets look like another one, driven with `ekf`:\n")
-    print(parts.alike(1 if given.quick else 10))
+    print(parts.alike(1 if given.quick else 3))
     if not given.quick:
         print("\n`smoother`, bounded as by default, against the full one, on the same features:\n")
         print(parts.bounded())

@@ -276,20 +276,27 @@ class Estimate:
 
 @dataclass(frozen=True)
 class CommonError:
-    """The part of a pose's error that all poses of a run share, as the rig's error makes it: ``shares @ scale @ c``.
+    """What poses are off by through the rig's error: ``shares @ (scale @ c + known)``, with the same c for all poses.
 
     Attributes:
         shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
-        scale: these errors by ones of unit variance, c, as they are known now (m, m).
+        scale: these errors by ones of unit variance, c, as they are known now (m, n).
+        known: the part of them that is known by now, but stays in poses of before (m,).
     """
 
     shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
     scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    known: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def root(self) -> Array:
+        """A square root (m, n + 1) of the errors' covariance; that the known part was not corrected counts as well."""
+        return np.column_stack([self.scale, self.known])
 
     @property
     def covariance(self) -> Array:
         """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.scale
+        root = self.shares @ self.root
         return np.asarray(root @ root.T)
 
 

@@ -14,7 +14,14 @@ from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, solve
-from slam.calibration.prior import as_delivered, as_found, prior_information, residual_variance, systematic_variance
+from slam.calibration.prior import (
+    as_delivered,
+    as_found,
+    focal_sigma,
+    prior_information,
+    residual_variance,
+    systematic_variance,
+)
 from slam.calibration.rows import row_evidence
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
@@ -68,6 +75,8 @@ class SelfCalibration:
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
         start = self._prior.covariances[-1] if kept is None else self._prior.covariances.mean(axis=0)
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
+        zoom = focal_sigma(self.model) > 0
+        self._focal = zoom / zoom.sum()  # the focal lengths' common error by the parameters
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
         self._solution = Solution(self._prior.mean, start, start, float(self._prior.residual[-1]))
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
@@ -98,9 +107,9 @@ class SelfCalibration:
         Nothing is corrected before motion has taken half of the prior's variance from the disparities, unless there is
         a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Nor
         where the calibration as delivered explains the motion nearly as well: rows have errors of their own, by wrong
-        matches for instance. Where that is no longer so, the calibration as
-        delivered is taken again. Where disparities would change by less than
-        `least` standard deviations (root mean square over the image), features are corrected as before.
+        matches for instance. Where that is no longer so, the calibration as delivered is taken again. Where both the
+        disparities of far points (root mean square over the image) and the focal length, which those do not show, would
+        change by less than `least` standard deviations, features are corrected as before.
         """
         if not self.config.enabled:
             return None
@@ -108,7 +117,11 @@ class SelfCalibration:
         known = self._kept or (variance <= _KNOWN * self._unknown and self._motion_agrees())
         mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
         step = mean - self.applied.parameters
-        if not step.any() or np.square(self._far @ step).mean() <= least**2 * variance:
+        if not step.any():
+            return None
+        focal = self._focal @ self._solution.inner @ self._focal
+        changes = np.square(self._far @ step).mean() / variance, (self._focal @ step) ** 2 / focal
+        if max(changes) <= least**2:
             return None
         before, self.applied = self.applied, RigCorrection(self.model, mean.copy())
         return Revision(before, self.applied)

@@ -152,7 +152,7 @@ def _remounted(residuals: Array, A: Array, P: Array, mounting: float) -> Array:
 def _shared(A: Array, first: CommonError, last: CommonError) -> Array:
     """What errors that the poses at its ends share add to the covariance of a relative pose (6, 6)."""
     if first.shares.shape == last.shares.shape:
-        relative = (last.shares - A @ first.shares) @ last.scale
+        relative = (last.shares - A @ first.shares) @ last.root
         return np.asarray(relative @ relative.T)
     return np.asarray(last.covariance - A @ first.covariance @ A.T)  # one is after a loop, where nothing is apart
 

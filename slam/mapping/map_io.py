@@ -40,7 +40,8 @@ class HasMap(Protocol):
 
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 3  # of the file's form; version 2 has no keyframes
+_VERSION = 4  # of the file's form
+_WITHOUT_PLACES = "2"  # the version that is read as well; 3 had keyframes without the common errors of their poses
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.
@@ -246,11 +247,12 @@ def decode(data: bytes, source: str) -> SavedMap:
     if not first.startswith(_MAGIC.encode()):
         raise SlamError(f"{source}: not a saved map")
     version = first[len(_MAGIC) :].decode("ascii", "replace")
-    if version not in ("2", str(_VERSION)):
-        raise SlamError(f"{source}: a map of version {version!r}; this program reads versions 2 and {_VERSION}")
+    if version not in (_WITHOUT_PLACES, str(_VERSION)):
+        known = f"this program reads versions {_WITHOUT_PLACES} and {_VERSION}: make the map anew with --save-map"
+        raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")
-    return SavedMap(**_members(body, source, version != "2"), source=source)
+    return SavedMap(**_members(body, source, version != _WITHOUT_PLACES), source=source)
 
 
 def _members(body: bytes, source: str, with_places: bool) -> dict[str, Any]:

@@ -125,7 +125,7 @@ class Viewer:
     def _draw_places(self, system: StereoSlam) -> None:
         """Keyframes, the path through them as loops have corrected it, and loops, closed and refused."""
         rr, atlas = self._rr, system.atlas
-        at = atlas.positions()
+        at = atlas.poses_in_map()[:, :3, 3]
         self._log("world/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
         self._log("world/places/path", rr.LineStrips3D([at[atlas.known :]], colors=_PLACE))
         for name, pairs, colour in (

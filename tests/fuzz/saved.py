@@ -89,7 +89,7 @@ def read_map(rng: np.random.Generator, folder: Path) -> None:
     archive = _pack(rng, _mutated(rng, _unpack(body)))
     if kind == 2:
         archive = broken_bytes(rng, archive)
-    signed = b"surf-stereo-slam map 3\n" + hashlib.sha256(archive).hexdigest().encode() + b"\n" + archive
+    signed = b"surf-stereo-slam map 4\n" + hashlib.sha256(archive).hexdigest().encode() + b"\n" + archive
     rig, frames = scene()
     system = StereoSlam(rig, None, choose(rng, _BACKENDS), known_map=decode(signed, "a.map"))
     for features in frames[:3]:

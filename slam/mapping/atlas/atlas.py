@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slam.data import CommonError, Estimate
-from slam.geometry.se3 import Array, adjoint, inverse, log
+from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, adjoints, shared_out
 from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
@@ -25,14 +25,21 @@ class Anchor:
     """What the pose graph said of the last keyframe when a loop was closed last.
 
     Attributes:
-        covariance: of its pose, perturbing on the right, and of the common errors (6 + m, 6 + m).
-        common: the common errors (m,), where their variance was one.
-        scale: what they stand for (m, m), see `slam.data.CommonError`.
+        covariance: of its pose, perturbing on the right, and of the common errors (6 + n, 6 + n).
+        common: the common errors (n,), where their variance was one.
+        rig: what they stand for, see `slam.data.CommonError`.
     """
 
     covariance: Array
     common: Array
-    scale: Array
+    rig: CommonError
+
+    def common_as(self, rig: CommonError) -> Array:
+        """The common errors (n,), where they stand for what they do now: the rig's posterior changes meanwhile."""
+        if rig.scale.shape != self.rig.scale.shape:
+            return np.zeros(rig.scale.shape[1])
+        error = self.rig.scale @ self.common + self.rig.known - rig.known
+        return np.asarray(np.linalg.lstsq(rig.scale, error)[0])
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
@@ -43,8 +50,8 @@ class Anchor:
             back: adjoint (6, 6) of the keyframe's pose seen from the later one.
             shares: derivative (6, m) of the motion since by the common errors.
         """
-        J = np.concatenate([back, shares @ self.scale], axis=1)
-        found = shares @ self.scale @ self.common
+        J = np.concatenate([back, shares @ self.rig.scale], axis=1)
+        found = shares @ (self.rig.scale @ self.common + self.rig.known)
         return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
 
 
@@ -98,7 +105,8 @@ class Atlas:
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        return np.array([self.pose_in_map(k) for k in range(len(self))]).reshape(-1, 4, 4)
+        since = np.array([k.T_odom_left for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 4, 4)
+        return np.concatenate([self.corrected, self.T_map_odom @ since])
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused as they contradict the path.
@@ -121,22 +129,24 @@ class Atlas:
             return None
         return self.keyframes[self.refused[-1][0]].frame
 
-    def chain(self, scale: Array, path: Trajectory | None = None) -> Chain:
+    def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
         """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now.
 
         Args:
-            scale: what common errors of unit variance stand for (m, m).
+            rig: what common errors stand for now.
             path: the path so far.
         """
         poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
         if path is not None:
             rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
             poses[self.known :] = path.poses[rows]
-        fits = [k.shares.shape[1] == len(scale) for k in self.keyframes]  # not where a known map was made without them
-        none = np.zeros((6, len(scale)))
-        common = np.array([k.shares if fit else none for k, fit in zip(self.keyframes, fits)]) @ scale
+        count, m = len(self), len(rig.known)
+        none = np.zeros((6, m))  # where a known map was made without them
+        shares = np.array([k.shares if k.shares.shape[1] == m else none for k in self.keyframes]).reshape(6 * count, m)
+        common = (shares @ rig.root).reshape(count, 6, rig.scale.shape[1] + 1)
         common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
-        return Chain(poses, np.array([k.step_covariance for k in self.keyframes]), common)
+        steps = np.array([k.step_covariance for k in self.keyframes]).reshape(-1, 6, 6)
+        return Chain(poses, steps, common[:, :, :-1], common[:, :, -1])
 
     def in_map(self, chain: Chain) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
@@ -148,14 +158,8 @@ class Atlas:
             return np.asarray(self.corrected[number])
         return self.T_map_odom @ self.keyframes[number].T_odom_left
 
-    def positions(self) -> Array:
-        """Positions (K, 3) [m] of all keyframes in the map."""
-        since = np.array([k.T_odom_left[:3, 3] for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 3)
-        T = self.T_map_odom
-        return np.concatenate([self.corrected[:, :3, 3], since @ T[:3, :3].T + T[:3, 3]])
-
     def estimate(self, estimate: Estimate, common: CommonError) -> Estimate:
-        """An estimate in odom, taken to the map; after a loop its pose is as certain as the pose graph says.
+        """An estimate in odom, taken to the map; after a loop it is as certain as the pose graph says.
 
         Args:
             estimate: with covariances by noise and by the common error.
@@ -167,12 +171,13 @@ class Atlas:
         before = self.keyframes[len(self.corrected) - 1]
         back = adjoint(inverse(estimate.T_world_left) @ before.T_odom_left)
         noise = what_was_added(estimate.covariance - common.covariance, back @ before.covariance @ back.T)
+        covariance = self.anchor.later(back, common.shares - back @ before.shares) + noise
         return replace(
             estimate,
             T_world_left=T @ estimate.T_world_left,
-            covariance=self.anchor.later(back, common.shares - back @ before.shares) + noise,
+            covariance=covariance,
             positions=estimate.positions @ R.T + T[:3, 3],
-            covariances=R @ estimate.covariances @ R.T,
+            covariances=R @ landmarks_by_pose(estimate, covariance) @ R.T,
         )
 
     def path(self, path: Trajectory) -> Trajectory:
@@ -181,10 +186,24 @@ class Atlas:
             return path
         from slam.mapping.atlas.pose_graph import solve
 
-        chain = self.chain(self.anchor.scale, path)
+        chain = self.chain(self.anchor.rig, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))
+
+
+def landmarks_by_pose(estimate: Estimate, covariance: Array) -> Array:
+    """Covariances (N, 3, 3) of landmarks after the camera's pose, from which they are seen, has got another one (6, 6).
+
+    What a landmark's covariance has more than the pose's at its place is its own, and stays. A landmark that was surer
+    in the estimate keeps its covariance: its place does not depend on where the camera is now.
+    """
+    T, P = estimate.T_world_left, estimate.covariances
+    J = T[:3, :3] @ points_by_pose(transform(inverse(T), estimate.positions))
+    before, after = (J @ pose @ np.swapaxes(J, 1, 2) for pose in (estimate.covariance, covariance))
+    moved = what_was_added(P, before) + after
+    surer = np.trace(moved, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
+    return np.where(surer[:, None, None], moved, P)
 
 
 def _between_keyframes(path: Trajectory, stamps: Array, moved: Array) -> Array:

@@ -5,12 +5,14 @@ along the path, where noise averages out, so the two are kept apart: with T the 
 
     T_true = T exp(noise + C c),
 
-where c are common errors of unit variance, the same for all steps (a consider state: Schmidt, 1966).
+where c are common errors of unit variance, the same for all steps (a consider state: Schmidt, 1966). What has become
+known of the rig since a step was made, and was not corrected in it, is neither: it is added to ``C c`` as it is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,20 +29,22 @@ class Chain:
         steps: covariance (K, 6, 6) of the motion from the keyframe before by noise, perturbing on the right; the first
             has no meaning.
         common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; none by default.
+        known: by what the same motion is known to be off (K, 6); zero by default.
     """
 
     poses: Array
     steps: Array
     common: Array = field(default=None)  # type: ignore[arg-type]
+    known: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         if self.common is None:
             object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
+        if self.known is None:
+            object.__setattr__(self, "known", np.zeros((len(self.poses), 6)))
 
-    def carried(self, ends: NDArray[np.intp]) -> tuple[Array, Array]:
-        """How far each keyframe is off by what its stretch has carried to it: noise, and the common errors' part.
-
-        Covariance (K, 6, 6) and derivative (K, 6, m), perturbing the pose at which the stretch ends.
+    def carried(self, ends: NDArray[np.intp]) -> Carried:
+        """How far each keyframe is off by what its stretch has carried to it, perturbing the pose at which that ends.
 
         Args:
             ends: the keyframes that bound stretches, ascending, the first and the last one among them.
@@ -50,27 +54,42 @@ class Chain:
         begin = ends[np.maximum(np.searchsorted(ends, number) - 1, 0)]
         A = adjoints(inverse(self.poses[end]) @ self.poses)
         parts = []
-        for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common):
+        for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common, (A @ self.known[:, :, None])[:, :, 0]):
             step[ends[0]] = 0
             total = np.cumsum(step, axis=0)
-            parts.append(np.asarray(total - total[begin]))
-        return parts[0], parts[1]
+            total -= total[begin]
+            parts.append(total)
+        return Carried(*parts)
 
     def motion(self, first: int, second: int) -> tuple[Array, Array]:
         """Motion (4, 4) from one keyframe to another, and its covariance (6, 6), perturbing on the right."""
         a, b = sorted((first, second))
         rows = slice(a, b + 1)
-        part = Chain(self.poses[rows], self.steps[rows], self.common[rows])
-        noise, common = (each[-1] for each in part.carried(np.unique([0, b - a])))
+        part = Chain(self.poses[rows], self.steps[rows], self.common[rows], self.known[rows])
+        noise, common, known = (each[-1] for each in part.carried(np.unique([0, b - a])))
         P = noise + common @ common.T
-        T = inverse(self.poses[first]) @ self.poses[second]
+        T = inverse(self.poses[a]) @ self.poses[b] @ exp(known)
         if first > second:
-            A = adjoint(inverse(T))
-            P = A @ P @ A.T
+            A = adjoint(T)
+            T, P = inverse(T), A @ P @ A.T
         return T, P
 
 
-def spread(chain: Chain, ends: NDArray[np.intp], carried: tuple[Array, Array], moved: Array, common: Array) -> Array:
+class Carried(NamedTuple):
+    """What each keyframe's stretch has carried to it.
+
+    Attributes:
+        noise: covariance (K, 6, 6).
+        common: derivative (K, 6, m) by the common errors.
+        known: by what it is known to be off (K, 6).
+    """
+
+    noise: Array
+    common: Array
+    known: Array
+
+
+def spread(chain: Chain, ends: NDArray[np.intp], carried: Carried, moved: Array, common: Array) -> Array:
     """Poses (K, 4, 4) of all keyframes, from those of some: each stretch's change is shared out.
 
     What the common errors say of each step goes to that step, the rest in proportion to the noise.
@@ -83,18 +102,16 @@ def spread(chain: Chain, ends: NDArray[np.intp], carried: tuple[Array, Array], m
         common: the common errors (m,).
     """
     number = np.arange(len(chain.poses))
-    at = np.maximum(np.searchsorted(ends, number), 1)
-    begin, end = ends[at - 1], ends[at]
-    noise, by_common = carried
-    known = by_common @ common
-    a = inverse(chain.poses[begin])
-    step = a @ chain.poses[end]
-    change = log(inverse(step) @ inverse(moved[at - 1]) @ moved[at])
-    whole = noise[end] + LEAST_VARIANCE * np.eye(6)
-    part = known + (noise @ np.linalg.solve(whole, (change - known[end])[:, :, None]))[:, :, 0]
+    at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch
+    rest = inverse(chain.poses) @ chain.poses[ends[at + 1]]
+    known = carried.common @ common + carried.known
+    change = log(inverse(chain.poses[ends[1:]]) @ chain.poses[ends[:-1]] @ inverse(moved[:-1]) @ moved[1:])
+    whole = carried.noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
+    weight = np.linalg.solve(whole, (change - known[ends[1:]])[:, :, None])
+    part = known + (carried.noise @ weight[at])[:, :, 0]
     part[ends[0]] = 0
-    part[ends[1:]] = change[ends[1:]]
-    out = shared_out(moved[at - 1], a @ chain.poses, inverse(chain.poses) @ chain.poses[end], part)
+    part[ends[1:]] = change
+    out = shared_out(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)
     out[ends] = moved
     return out
 

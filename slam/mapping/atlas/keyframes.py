@@ -135,11 +135,11 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
 
 
 def what_was_added(after: Array, before: Array) -> Array:
-    """The positive part (6, 6) of what one covariance has more than another.
+    """The positive part (…, n, n) of what covariances have more than others.
 
     Rotations and metres are brought to one scale by the deviations of `after`.
     """
-    scale = np.sqrt(np.diag(after))
-    values, vectors = np.linalg.eigh((after - before) / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(root @ root.T)
+    deviations = np.sqrt(np.diagonal(after, axis1=-2, axis2=-1))[..., :, None]
+    values, vectors = np.linalg.eigh((after - before) / (deviations * np.swapaxes(deviations, -1, -2)))
+    root = deviations * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return np.asarray(root @ np.swapaxes(root, -1, -2))

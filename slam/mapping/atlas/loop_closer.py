@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, CommonError, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
@@ -32,6 +32,8 @@ from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import LandmarkMatches, Localizer
 
+_NEARBY = 4  # keyframes that are compared as the path is near them, besides those that look alike
+_CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
 _VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared in detail
 _PATIENCE = 3  # keyframes within which another one must see the same return
 _MINIMAL = 6  # features that give a pose with a covariance
@@ -80,7 +82,9 @@ class LoopCloser:
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         self._shelf = Shelf() if config.on_disk else None
-        self._localizer = Localizer(self._rig, replace(association, wide_hypotheses=_HYPOTHESES), models)
+        lax = _CONSISTENCY * association.consistency_sigmas
+        association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
+        self._localizer = Localizer(self._rig, association, models)
 
     @one_blas_thread
     def update(
@@ -109,7 +113,7 @@ class LoopCloser:
         kept = new if self._shelf is None else self._shelf.put(new)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
         best = self._best_sighting(atlas, candidates, step.features, step.index)
-        return (atlas, None) if best is None else self._close(atlas, *best, step.common.scale, path)
+        return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, seed: int) -> Found | None:
@@ -207,10 +211,12 @@ class LoopCloser:
         Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
         it knows by itself.
         """
-        possible = self._within_reach(atlas, new, step.estimate.covariance)
+        poses, here = atlas.poses_in_map(), atlas.T_map_odom @ new.T_odom_left
+        possible = self._within_reach(atlas, new, poses, here, step.estimate.covariance)
         if not possible.any():
             return np.zeros(0, np.intp)
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
+        likely = np.unique(np.concatenate([likely, _nearest(poses, here, new.depth, possible)]))
         known = landmark_of[landmark_of >= 0]
         rows = [k for k in likely.tolist() if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
         return self._ranked(atlas, np.array(rows, np.intp), step.features)
@@ -228,14 +234,10 @@ class LoopCloser:
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
         return likely[order[number[order] >= self._config.inliers]]
 
-    def _within_reach(self, atlas: Atlas, new: Keyframe, covariance: Array) -> BoolArray:
-        """Which keyframes (K,) the camera has left, but may be back at, as far as its path is known."""
-        if not len(atlas):
-            return np.zeros(0, bool)
+    def _within_reach(self, atlas: Atlas, new: Keyframe, poses: Array, here: Array, covariance: Array) -> BoolArray:
+        """Which keyframes (K,), at poses (K, 4, 4), the camera has left, but may be back at by what its path says."""
         c, length = self._config, np.array([new.travelled - k.travelled for k in atlas.keyframes])
-        positions = atlas.positions()
-        here = atlas.T_map_odom[:3, :3] @ new.T_odom_left[:3, 3] + atlas.T_map_odom[:3, 3]
-        far = np.linalg.norm(positions - here, axis=1)
+        far = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
@@ -270,14 +272,15 @@ class LoopCloser:
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
-        self, atlas: Atlas, loop: Loop, seen: Sighting, scale: Array, path: Callable[[], Trajectory]
+        self, atlas: Atlas, loop: Loop, seen: Sighting, rig: CommonError, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
-        from slam.mapping.atlas.pose_graph import relative_pose, solve
+        from slam.mapping.atlas.pose_graph import PoseGraph
 
-        chain = atlas.chain(scale, path())
-        start = atlas.in_map(chain)
-        T, P = relative_pose(chain, atlas.loops, start, loop.first, loop.second)
+        chain = atlas.chain(rig, path())
+        common = None if atlas.anchor is None else atlas.anchor.common_as(rig)
+        graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
+        T, P = graph.relative_pose(loop.first, loop.second)
         limit = self._config.gate_sigmas**2
         if _distance(T, loop.T_first_second, P + loop.covariance) > limit:
             return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second))), None
@@ -287,15 +290,15 @@ class LoopCloser:
         atlas = replace(atlas, confirmed=True)
         if atlas.loops and not self._says_more(chain, atlas.loops[-1], loop):
             return atlas, None
-        loops = (*atlas.loops, loop)
-        solution = solve(chain, loops, start)
-        if (solution.disagreement > limit).any():
+        graph = graph.with_loop(loop)
+        if (graph.disagreement() > limit).any():
             return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second)), pending=None), None
+        solution = graph.solution()
         atlas = replace(
             atlas,
-            loops=loops,
+            loops=(*atlas.loops, loop),
             corrected=solution.poses,
-            anchor=Anchor(solution.covariance, solution.common, scale),
+            anchor=Anchor(solution.covariance, solution.common, rig),
             T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
         )
         return atlas, self._returned(atlas.keyframes[loop.first], seen) if self._config.give_back else None
@@ -326,6 +329,22 @@ class LoopCloser:
         P = X[:3, :3] @ (P + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
         symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
+
+
+def _nearest(poses: Array, here: Array, depth: float, possible: BoolArray) -> NDArray[np.intp]:
+    """Numbers of the possible keyframes (K,) that the path has nearest: their places, and what they look at.
+
+    Args:
+        poses: of the keyframes (K, 4, 4).
+        here: of the camera (4, 4).
+        depth: of what it looks at [m].
+        possible: which of them may be chosen (K,).
+    """
+    places = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
+    views = np.linalg.norm(poses[:, :3, 3] + depth * poses[:, :3, 2] - here[:3, 3] - depth * here[:3, 2], axis=1)
+    distance = np.where(possible, places + views, np.inf)
+    best = np.argsort(distance, kind="stable")[:_NEARBY]
+    return np.asarray(best[np.isfinite(distance[best])])
 
 
 def _distance(expected: Array, found: Array, covariance: Array) -> float:

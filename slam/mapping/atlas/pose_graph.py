@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
-from slam.mapping.atlas.chain import Chain, adjoints, spread
+from slam.mapping.atlas.chain import Carried, Chain, adjoints, spread
 from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _ROUNDS = 30  # of least squares, at most
 _CONVERGED = 1e-3  # decrease of χ² that is none any more
+_FAST = 0.1  # of the decrease of χ² in the step before, below which the normal equations are good enough
 _HALVINGS = 8  # of a step that makes χ² larger
 
 
@@ -45,40 +46,69 @@ class Solution:
     disagreement: Array
 
 
+@dataclass(frozen=True)
+class PoseGraph:
+    """Path and loops, and the poses and common errors of least χ².
+
+    Attributes:
+        chain: the path.
+        problem: the equations.
+        poses: of the keyframes that are variables (M, 4, 4).
+        common: the common errors (m,).
+        normal: the normal equations there, to first order.
+    """
+
+    chain: Chain
+    problem: _Problem
+    poses: Array
+    common: Array
+    normal: _Normal
+
+    @classmethod
+    def solved(
+        cls, chain: Chain, loops: Sequence[Loop], start: Array, also: Sequence[int] = (), common: Array | None = None
+    ) -> PoseGraph:
+        """Of a path and of loops.
+
+        Args:
+            chain: the path.
+            loops: what is known already.
+            start: poses (K, 4, 4) of all keyframes to linearise at first.
+            also: keyframes whose poses are variables too, besides those at which loops end.
+            common: the common errors (m,) to start from; zero by default.
+        """
+        problem = _Problem.of(chain, loops, also)
+        common = np.zeros(chain.common.shape[2]) if common is None else common
+        return cls(chain, problem, *problem.optimised(start[problem.ends], common))
+
+    def with_loop(self, loop: Loop) -> PoseGraph:
+        """With one loop more, between keyframes that are variables."""
+        problem = self.problem.with_loop(loop)
+        return PoseGraph(self.chain, problem, *problem.optimised(self.poses, self.common))
+
+    def relative_pose(self, first: int, second: int) -> tuple[Array, Array]:
+        """Pose (4, 4) of a keyframe in another one's coordinates, and its covariance (6, 6); both are variables."""
+        rows = np.searchsorted(self.problem.ends, [first, second])
+        T = inverse(self.poses[rows[0]]) @ self.poses[rows[1]]
+        P = self.normal.covariance(rows.tolist())[:12, :12]
+        J = np.concatenate([-adjoint(inverse(T)), np.eye(6)], axis=1)
+        return T, J @ P @ J.T
+
+    def disagreement(self) -> Array:
+        """Of each loop with the whole, as a χ² of 6 degrees of freedom (L,)."""
+        p = self.problem
+        return np.square(p.whitened(p.residuals(self.poses, self.common))).sum(axis=1)[len(p.ends) - 1 :]
+
+    def solution(self) -> Solution:
+        """What it says of all keyframes."""
+        p, P = self.problem, self.normal.covariance([len(self.poses) - 1])
+        moved = spread(self.chain, p.ends, p.carried, self.poses, self.common)
+        return Solution(moved, P, self.common, self.disagreement())
+
+
 def solve(chain: Chain, loops: Sequence[Loop], start: Array) -> Solution:
-    """Poses of all keyframes, given the path and the loops.
-
-    Args:
-        chain: the path.
-        loops: at least one.
-        start: poses (K, 4, 4) to linearise at first.
-    """
-    problem = _Problem.of(chain, loops, ())
-    poses, common = problem.optimised(start[problem.ends])
-    r = problem.residuals(poses, common)
-    last = len(poses) - 1
-    P = problem.normal(poses, common).covariance([last])
-    disagreement = np.square(problem.whitened(r)).sum(axis=1)[len(r) - len(loops) :]
-    return Solution(spread(chain, problem.ends, problem.carried, poses, common), P, common, disagreement)
-
-
-def relative_pose(chain: Chain, loops: Sequence[Loop], start: Array, first: int, second: int) -> tuple[Array, Array]:
-    """Pose (4, 4) of a keyframe in another one's coordinates, as path and loops say, and its covariance (6, 6).
-
-    Args:
-        chain: the path.
-        loops: what is known already.
-        start: poses (K, 4, 4) that they have led to.
-        first: number of the one keyframe.
-        second: number of the other one.
-    """
-    problem = _Problem.of(chain, loops, (first, second))
-    poses, common = problem.optimised(start[problem.ends])
-    rows = np.searchsorted(problem.ends, [first, second])
-    T = inverse(poses[rows[0]]) @ poses[rows[1]]
-    P = problem.normal(poses, common).covariance(rows.tolist())[:12, :12]
-    J = np.concatenate([-adjoint(inverse(T)), np.eye(6)], axis=1)
-    return T, J @ P @ J.T
+    """Poses of all keyframes, given the path and at least one loop; see `PoseGraph.solved`."""
+    return PoseGraph.solved(chain, loops, start).solution()
 
 
 @dataclass(frozen=True)
@@ -91,6 +121,7 @@ class _Problem:
         motions: measured (E, 4, 4).
         roots: of their information (E, 6, 6): a residual r weighs |root r|².
         common: derivative of the motions by the common errors (E, 6, m).
+        known: by what they are known to be off (E, 6).
         carried: of all keyframes, see `slam.mapping.atlas.chain.Chain.carried`.
     """
 
@@ -100,15 +131,17 @@ class _Problem:
     motions: Array
     roots: Array
     common: Array
-    carried: tuple[Array, Array]
+    known: Array
+    carried: Carried
 
     @classmethod
     def of(cls, chain: Chain, loops: Sequence[Loop], also: Sequence[int]) -> _Problem:
         last = len(chain.poses) - 1
         ends = np.unique([0, last, *also, *(k for loop in loops for k in (loop.first, loop.second))]).astype(np.intp)
-        noise, common = chain.carried(ends)
+        carried = chain.carried(ends)
         begin, end = ends[:-1], ends[1:]
-        covariances = np.concatenate([noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
+        common, known = carried.common[end], carried.known[end]
+        covariances = np.concatenate([carried.noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
         motions = inverse(chain.poses[begin]) @ chain.poses[end]
         return cls(
             ends,
@@ -116,13 +149,31 @@ class _Problem:
             np.searchsorted(ends, [*end, *(x.second for x in loops)]),
             np.concatenate([motions, np.array([x.T_first_second for x in loops]).reshape(-1, 4, 4)]),
             _root_of_information(covariances),
-            np.concatenate([common[end], np.zeros((len(loops), *common.shape[1:]))]),
-            (noise, common),
+            np.concatenate([common, np.zeros((len(loops), *common.shape[1:]))]),
+            np.concatenate([known, np.zeros((len(loops), 6))]),
+            carried,
         )
+
+    def with_loop(self, loop: Loop) -> _Problem:
+        """With one equation more, for a loop between keyframes that are variables."""
+        return _Problem(
+            self.ends,
+            np.append(self.a, np.searchsorted(self.ends, loop.first)),
+            np.append(self.b, np.searchsorted(self.ends, loop.second)),
+            np.concatenate([self.motions, loop.T_first_second[None]]),
+            np.concatenate([self.roots, _root_of_information(loop.covariance[None])]),
+            np.concatenate([self.common, np.zeros((1, *self.common.shape[1:]))]),
+            np.concatenate([self.known, np.zeros((1, 6))]),
+            self.carried,
+        )
+
+    def expected(self, common: Array) -> Array:
+        """By what the motions (E, 6) are off, as far as the common errors (m,) and what is known say it."""
+        return np.asarray(self.common @ common + self.known)
 
     def residuals(self, poses: Array, common: Array) -> Array:
         """What the motions (E, 6) of poses (M, 4, 4) differ by from the measured ones."""
-        return log(inverse(self.motions) @ inverse(poses[self.a]) @ poses[self.b]) - self.common @ common
+        return log(inverse(self.motions) @ inverse(poses[self.a]) @ poses[self.b]) - self.expected(common)
 
     def whitened(self, r: Array) -> Array:
         """Residuals (E, 6) of unit variance."""
@@ -132,31 +183,48 @@ class _Problem:
         """The χ² of poses (M, 4, 4) and common errors (m,)."""
         return float(np.square(self.whitened(self.residuals(poses, common))).sum() + common @ common)
 
+    def derivatives(self, poses: Array, common: Array) -> tuple[Array, Array, Array]:
+        """Residuals (E, 6) at poses (M, 4, 4) and common errors (m,); derivatives (E, 6, 6) by the poses of a and b."""
+        r = self.residuals(poses, common)
+        back = _by_perturbation(r + self.expected(common))
+        return r, -back @ adjoints(inverse(poses[self.b]) @ poses[self.a]), back
+
+    def gradient(self, poses: Array, common: Array) -> tuple[Array, Array]:
+        """Right sides of the normal equations: of the poses but the first (6 (M − 1),), of the common errors (m,)."""
+        r, A, B = self.derivatives(poses, common)
+        Wr = np.swapaxes(self.roots, 1, 2) @ (self.roots @ r[:, :, None])
+        right = np.zeros((len(poses), 6))
+        for rows, X in ((self.a, A), (self.b, B)):
+            np.add.at(right, rows, -(np.swapaxes(X, 1, 2) @ Wr)[:, :, 0])
+        return right[1:].ravel(), np.tensordot(self.common, Wr[:, :, 0], axes=((0, 1), (0, 1))) - common
+
     def normal(self, poses: Array, common: Array) -> _Normal:
         """The normal equations about poses (M, 4, 4) and common errors (m,)."""
-        r = self.residuals(poses, common)
-        back = _by_perturbation(r + self.common @ common)
+        _, A, B = self.derivatives(poses, common)
         W = np.swapaxes(self.roots, 1, 2) @ self.roots
-        A = -back @ adjoints(inverse(poses[self.b]) @ poses[self.a])
-        return _Normal.of(len(poses), self.a, self.b, A, back, -self.common, W, r, common)
+        return _Normal.of(len(poses), self.a, self.b, A, B, -self.common, W)
 
-    def optimised(self, poses: Array) -> tuple[Array, Array]:
-        """Poses (M, 4, 4) and common errors (m,) of least χ², from poses (M, 4, 4)."""
-        common = np.zeros(self.common.shape[2])
-        cost = self.cost(poses, common)
+    def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
+        """Poses (M, 4, 4) and common errors (m,) of least χ², and normal equations near there.
+
+        Steps use the normal equations of earlier ones while they converge fast: the gradient alone is made anew.
+        """
+        cost, gain = self.cost(poses, common), np.inf
+        normal, fresh = self.normal(poses, common), True
         for _ in range(_ROUNDS):
-            step, change = self.normal(poses, common).step()
+            step, change = normal.step(*self.gradient(poses, common))
+            before, less = gain, np.inf
             for half in 0.5 ** np.arange(_HALVINGS):
                 moved = np.concatenate([poses[:1], poses[1:] @ exp(half * step)])
                 less = self.cost(moved, common + half * change)
                 if less <= cost:
+                    poses, common, gain, cost = moved, common + half * change, cost - less, less
                     break
-            else:
+            if gain < _CONVERGED or (less > cost and fresh):
                 break
-            poses, common, gain, cost = moved, common + half * change, cost - less, less
-            if gain < _CONVERGED:
-                break
-        return poses, common
+            fresh = less > cost or gain > _FAST * before
+            normal = self.normal(poses, common) if fresh else normal
+        return poses, common, normal
 
 
 @dataclass(frozen=True)
@@ -168,16 +236,12 @@ class _Normal:
         border: the part between poses and common errors (6 (M − 1), m).
         through: that part, solved for the poses.
         inner: covariance of the common errors (m, m).
-        right: right side of the poses (6 (M − 1),).
-        right_common: right side of the common errors (m,).
     """
 
     solver: SuperLU
     border: Array
     through: Array
     inner: Array
-    right: Array
-    right_common: Array
 
     @classmethod
     def of(
@@ -189,10 +253,10 @@ class _Normal:
         B: Array,
         C: Array,
         W: Array,
-        r: Array,
-        common: Array,
     ) -> _Normal:
-        """Of residuals r (E, 6) with information W, by poses a and b (E,) of `count`, and by the common errors.
+        """Of residuals (E, 6) with information W, by poses a and b (E,) of `count`, and by the common errors.
+
+        The common errors have unit information of their own.
 
         Args:
             count: number of poses, the fixed first one included.
@@ -202,19 +266,16 @@ class _Normal:
             B: by the second poses (E, 6, 6).
             C: by the common errors (E, 6, m).
             W: information (E, 6, 6).
-            r: residuals (E, 6).
-            common: the common errors (m,), with unit information about zero.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.linalg import splu
 
         m, size = C.shape[2], 6 * (count - 1)
         rows, columns, values = [], [], []
-        border, right = np.zeros((count, 6, m)), np.zeros((count, 6))
+        border = np.zeros((count, 6, m))
         for i, X in ((a, A), (b, B)):
             XW = np.swapaxes(X, 1, 2) @ W
             np.add.at(border, i, XW @ C)
-            np.add.at(right, i, -(XW @ r[:, :, None])[:, :, 0])
             for j, Y in ((a, A), (b, B)):
                 both = (i > 0) & (j > 0)
                 rows.append(np.repeat(6 * (i[both, None] - 1) + np.arange(6), 6, axis=1).ravel())
@@ -226,18 +287,17 @@ class _Normal:
         through = solver.solve(flat) if m else flat
         CW = np.swapaxes(C, 1, 2) @ W
         inner = np.linalg.inv(np.eye(m) + (CW @ C).sum(axis=0) - flat.T @ through)
-        right_common = -(CW @ r[:, :, None]).sum(axis=0)[:, 0] - common
-        return cls(solver, flat, through, inner, right[1:].ravel(), right_common)
+        return cls(solver, flat, through, inner)
 
-    def step(self) -> tuple[Array, Array]:
-        """Steps of the poses but the first (M − 1, 6), and of the common errors (m,)."""
-        alone = self.solver.solve(self.right)
-        change = self.inner @ (self.right_common - self.border.T @ alone)
+    def step(self, right: Array, right_common: Array) -> tuple[Array, Array]:
+        """Steps of the poses but the first (M − 1, 6), and of the common errors (m,), from their right sides."""
+        alone = self.solver.solve(right)
+        change = self.inner @ (right_common - self.border.T @ alone)
         return (alone - self.through @ change).reshape(-1, 6), change
 
     def covariance(self, poses: Sequence[int]) -> Array:
         """Joint covariance (6 n + m, 6 n + m) of n poses, by their rows, and of the common errors."""
-        size, m, n = len(self.right), len(self.inner), 6 * len(poses)
+        size, m, n = len(self.border), len(self.inner), 6 * len(poses)
         picked = np.zeros((size, n))
         for i, row in enumerate(poses):
             if row > 0:  # the first one is fixed

@@ -163,6 +163,17 @@ def test_a_change_that_does_not_count_is_not_applied():
     assert calibration.apply() is None
 
 
+def test_a_focal_length_that_counts_is_applied_though_far_points_do_not_show_it():
+    calibration = drive(seed=2, frames=10)
+    calibration.apply()
+    assert calibration.apply(least=0.5) is None
+    known, zoom = calibration._solution, parameters(left_f=1.0, right_f=1.0)
+    sigma = np.sqrt(zoom @ known.inner @ zoom) / 2
+    for share, applied in ((0.4, False), (0.6, True)):
+        calibration._solution = replace(known, mean=known.mean + share * sigma * zoom)
+        assert (calibration.apply(least=0.5) is not None) == applied
+
+
 def test_disabled_means_untouched():
     calibration = drive(TURNED, frames=6, settings={"enabled": False})
     features = Street().features(0.0, np.eye(4))

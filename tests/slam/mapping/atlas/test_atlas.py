@@ -14,6 +14,7 @@ from slam.data import Estimate, FrameResult, Observations, Prediction, StereoFea
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.atlas import landmarks_by_pose
 
 LAP = 100  # frames
 BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
@@ -147,6 +148,23 @@ def test_the_pose_is_surer_after_the_loop(closed):
     before, after = (np.trace(results[k].estimate.covariance[3:, 3:]) for k in (first - 1, first))
     assert after < 0.5 * before
     assert np.trace(results[-1].estimate.covariance[3:, 3:]) < before
+
+
+def test_landmarks_are_as_sure_as_the_pose_that_a_loop_gives():
+    """Landmarks before a camera whose pose has drifted by much, and is known well after the loop."""
+    rng = np.random.default_rng(0)
+    T = exp(rng.normal(size=6))
+    local = np.array([[2.0, -1.0, 9.0], [-4.0, 0.5, 20.0], [0.3, 1.0, 5.0]])
+    own = np.diag([0.02, 0.02, 0.3]) ** 2
+    drifted, corrected = (np.diag(np.repeat(sigmas, 3) ** 2) for sigmas in ([0.02, 0.5], [0.004, 0.1]))
+    # The points move with the pose: T exp(ξ) p.
+    J = T[:3, :3] @ np.concatenate([-np.array([adjoint(exp(np.r_[0, 0, 0, p]))[3:, :3] for p in local]),
+                                    np.tile(np.eye(3), (3, 1, 1))], axis=2)  # fmt: skip
+    P = J @ drifted @ np.swapaxes(J, 1, 2) + T[:3, :3] @ own @ T[:3, :3].T
+    estimate = Estimate(0.0, T, drifted, np.arange(3), transform(T, local), P)
+    after = landmarks_by_pose(estimate, corrected)
+    np.testing.assert_allclose(after, J @ corrected @ np.swapaxes(J, 1, 2) + T[:3, :3] @ own @ T[:3, :3].T, rtol=1e-6)
+    np.testing.assert_array_equal(landmarks_by_pose(replace(estimate, covariances=1e-6 * P), corrected), 1e-6 * P)
 
 
 def test_a_loop_that_contradicts_the_path_is_refused(sequence):

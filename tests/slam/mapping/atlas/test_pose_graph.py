@@ -11,7 +11,7 @@ import pytest
 from slam.geometry.se3 import adjoint, exp, inverse, log
 from slam.mapping.atlas.chain import Chain, shared_out
 from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.pose_graph import relative_pose, solve
+from slam.mapping.atlas.pose_graph import PoseGraph, solve
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
 
@@ -96,7 +96,7 @@ def test_a_false_loop_disagrees():
 
 def test_relative_pose_without_loops_is_that_of_the_path():
     _, chain, _ = problem(1)
-    T, P = relative_pose(chain, (), chain.poses, 10, 25)
+    T, P = PoseGraph.solved(chain, (), chain.poses, (10, 25)).relative_pose(10, 25)
     direct, expected = chain.motion(10, 25)
     np.testing.assert_allclose(T, direct, atol=1e-9)
     np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
@@ -153,7 +153,7 @@ def test_poses_between_the_ends_are_those_of_the_whole_problem_with_common_error
 
 def test_a_motion_has_the_common_errors_in_its_covariance():
     _, chain, _, _ = problem_with_common_errors(0)
-    _, P = relative_pose(chain, (), chain.poses, 10, 25)
+    _, P = PoseGraph.solved(chain, (), chain.poses, (10, 25)).relative_pose(10, 25)
     _, expected = chain.motion(10, 25)
     np.testing.assert_allclose(P, expected, atol=1e-3 * np.abs(expected).max())
     short = chain.motion(10, 11)[1] - chain.steps[11]
@@ -178,3 +178,32 @@ def test_shared_out_keeps_the_ends(share: float):
     out = shared_out(begin, motion, rest, share * change)
     end = out @ rest
     np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
+
+
+def test_what_is_known_is_taken_off_each_step():
+    _, chain, loops, errors = problem_with_common_errors(5)
+    known = chain.common @ errors
+    of_steps = [inverse(a) @ b @ exp(k) for a, b, k in zip(chain.poses, chain.poses[1:], known[1:])]
+    mended = [chain.poses[0]]
+    for step in of_steps:
+        mended.append(mended[-1] @ step)
+    told = Chain(chain.poses, chain.steps, chain.common, known)
+    at_once = Chain(np.array(mended), chain.steps, chain.common)
+    moved = np.linalg.norm(at_once.poses[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
+    difference = solve(told, loops, told.poses).poses - solve(at_once, loops, at_once.poses).poses
+    assert np.abs(difference).max() < 0.05 * moved
+    T, P = told.motion(10, 25)
+    expected, Q = at_once.motion(10, 25)
+    assert np.linalg.norm(log(inverse(expected) @ T)) < 0.05 * np.linalg.norm(
+        log(inverse(expected) @ chain.motion(10, 25)[0])
+    )
+    np.testing.assert_allclose(P, Q, atol=0.1 * np.abs(Q).max())
+
+
+def test_one_loop_more_is_the_same_as_all_at_once():
+    _, chain, loops, _ = problem_with_common_errors(6)
+    last = loops[-1]
+    graph = PoseGraph.solved(chain, loops[:-1], chain.poses, (last.first, last.second)).with_loop(last)
+    one, all_at_once = graph.solution(), solve(chain, loops, chain.poses)
+    np.testing.assert_allclose(one.poses, all_at_once.poses, atol=1e-4)
+    np.testing.assert_allclose(one.covariance, all_at_once.covariance, atol=1e-3 * np.abs(one.covariance).max())
