@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,16 +21,17 @@ _PATIENCE = 5.0  # for the end of the second process [s]
 
 @contextmanager
 def compiled_beside(backend: str) -> Iterator[None]:
-    """The second process, where it is of use: it ends at the end of the block at the latest."""
+    """The second process, where it is of use: it ends with the block, or when this process is killed."""
     if _processors() < 2 or not _cold():
         yield
         return
     command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
     modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen(
-        command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True, env={**os.environ, **modules}
-    )
+    process = subprocess.Popen(  # its standard input ends with this process, however that ends
+        command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, start_new_session=True,
+        env={**os.environ, **modules},
+    )  # fmt: skip
     try:
         yield
     finally:
@@ -39,6 +41,8 @@ def compiled_beside(backend: str) -> Iterator[None]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
 
 
 def compile_objects(backend: str) -> None:
@@ -65,5 +69,12 @@ def _cold() -> bool:
     return folder is not None and not any(Path(folder).glob("scene_kernels.window_tests-*.nbi"))
 
 
+def _end_with_parent() -> None:
+    """End this process as soon as nobody holds the other end of its standard input."""
+    os.read(0, 1)
+    os._exit(1)
+
+
 if __name__ == "__main__":
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     compile_objects(sys.argv[1])
