@@ -60,7 +60,9 @@ class Linear(NamedTuple):
     @classmethod
     def empty(cls, n: int) -> Linear:
         """Of n points, to be filled in."""
-        return cls(np.empty((n, 3)), np.empty((n, 3, 3)), *np.empty((2, n, 3, 6)), np.empty((n, 3, 3)), np.empty((n, 3)))
+        return cls(
+            np.empty((n, 3)), np.empty((n, 3, 3)), *np.empty((2, n, 3, 6)), np.empty((n, 3, 3)), np.empty((n, 3))
+        )
 
 
 @dataclass(frozen=True)
