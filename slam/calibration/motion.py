@@ -60,9 +60,8 @@ class Linear(NamedTuple):
     @classmethod
     def empty(cls, n: int) -> Linear:
         """Of n points, to be filled in."""
-        return cls(
-            np.empty((n, 3)), np.empty((n, 3, 3)), *np.empty((2, n, 3, 6)), np.empty((n, 3, 3)), np.empty((n, 3))
-        )
+        J_motion, motion = np.empty((2, n, 3, 6))
+        return cls(np.empty((n, 3)), np.empty((n, 3, 3)), J_motion, motion, np.empty((n, 3, 3)), np.empty((n, 3)))
 
 
 @dataclass(frozen=True)
