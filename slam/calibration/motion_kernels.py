@@ -15,8 +15,8 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
     arguments from `moved` on, which are filled in.
     """
     C, B, W = np.zeros((3, 9)), np.empty((3, 3)), np.zeros((3, 3))
-    C[:, :2] = R[:, :2]
-    C[:, 2] = t
+    for i in range(3):  # slices take seconds to compile
+        C[i, 0], C[i, 1], C[i, 2] = R[i, 0], R[i, 1], t[i]
     r = np.empty(3)
     for n in range(len(points)):
         x, y, d = points[n, 0], points[n, 1], points[n, 2]
@@ -58,8 +58,10 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
         white[n, 1, 0], white[n, 2, 1], white[n, 2, 0] = -b * a * e, -g * e * h, (b * g * e - c) * a * h
         white[n, 0, 1] = white[n, 0, 2] = white[n, 1, 2] = 0.0
         for i in range(3):
-            residual[n, i], motion[n, i] = 0.0, 0.0
+            residual[n, i] = 0.0
             for j in range(i + 1):
                 residual[n, i] += white[n, i, j] * r[j]
-                for k in range(6):
+            for k in range(6):
+                motion[n, i, k] = 0.0
+                for j in range(i + 1):
                     motion[n, i, k] += white[n, i, j] * J_motion[n, j, k]
