@@ -234,8 +234,10 @@ def _scan(
                 continue
             a, b = margin, columns - margin
             here, rival = ring[layer - 1, slots[1]], ring[layer if layer < inner else layer - 2, slots[1], a:b]
-            mask[:a] = 0
-            mask[b:] = 0
+            for j in range(a):  # a slice would take longer to compile
+                mask[j] = 0
+            for j in range(b, mask.size):
+                mask[j] = 0
             _mark_peaks(
                 ring[layer - 1, slots[0], a:b], here[a - 1 :], here[a:b], here[a + 1 :], ring[layer - 1, slots[2], a:b],
                 rival, threshold, mask[a:b],
