@@ -17,29 +17,22 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 #: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
 COLUMNS = 6
 
-#: The boxes' numbers, from an array because Numba compiles a helper anew for each literal number it is called with.
-_N = np.arange(8)
+#: What the sum of each box, see `filters.BOXES`, counts in Dxx, Dyy and Dxy.
+_SHARES = np.array([(1, -3, 0, 0, 0, 0, 0, 0), (0, 0, 1, -3, 0, 0, 0, 0), (0, 0, 0, 0, 1, 1, -1, -1)])
 #: The nine places of a layer above or below, those first that most often rival a peak.
 _CENTRE_FIRST = np.array([4, 1, 3, 5, 7, 0, 2, 6, 8])
 
 
 @helper
-def _box(pixels, at, offsets, layer, box):
-    """Sum of the pixels of a numbered box, see `filters.BOXES`, of the filter with its top left at `at`."""
-    n = 4 * box
-    a, b = pixels[at + offsets[layer, n]], pixels[at + offsets[layer, n + 1]]
-    c, d = pixels[at + offsets[layer, n + 2]], pixels[at + offsets[layer, n + 3]]
-    return np.int32(np.int32(d - c) - np.int32(b - a))
-
-
-@helper
-def _response_at(pixels, at, o, weights, layer):
+def _response_at(pixels, at, offsets, weights, layer):
     """The determinant ``Dxx Dyy − 0.81 Dxy²`` and the sign of ``Dxx + Dyy`` of the filter with its top left at `at`."""
-    n = _N
-    dxx = _box(pixels, at, o, layer, n[0]) - 3 * _box(pixels, at, o, layer, n[1])
-    dyy = _box(pixels, at, o, layer, n[2]) - 3 * _box(pixels, at, o, layer, n[3])
-    dxy = _box(pixels, at, o, layer, n[4]) + _box(pixels, at, o, layer, n[5])
-    dxy -= _box(pixels, at, o, layer, n[6]) + _box(pixels, at, o, layer, n[7])
+    dxx, dyy, dxy = 0, 0, 0
+    for box in range(_SHARES.shape[1]):
+        n = 4 * box
+        a, b = pixels[at + offsets[layer, n]], pixels[at + offsets[layer, n + 1]]
+        c, d = pixels[at + offsets[layer, n + 2]], pixels[at + offsets[layer, n + 3]]
+        s = np.int32(np.int32(d - c) - np.int32(b - a))
+        dxx, dyy, dxy = dxx + _SHARES[0, box] * s, dyy + _SHARES[1, box] * s, dxy + _SHARES[2, box] * s
     xx, yy, xy = np.float32(dxx), np.float32(dyy), np.float32(dxy)
     return xx * yy * weights[layer, 0] - xy * xy * weights[layer, 1], np.sign(dxx + dyy)
 
@@ -241,8 +234,10 @@ def _scan(
                 continue
             a, b = margin, columns - margin
             here, rival = ring[layer - 1, slots[1]], ring[layer if layer < inner else layer - 2, slots[1], a:b]
-            mask[:a] = 0
-            mask[b:] = 0
+            for j in range(a):  # a slice would take longer to compile
+                mask[j] = 0
+            for j in range(b, mask.size):
+                mask[j] = 0
             _mark_peaks(
                 ring[layer - 1, slots[0], a:b], here[a - 1 :], here[a:b], here[a + 1 :], ring[layer - 1, slots[2], a:b],
                 rival, threshold, mask[a:b],

@@ -193,15 +193,25 @@ def _search_rows(
         x, y = int(np.rint(px)), int(np.rint(py))
         if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left_weight[y, x] == 0.0:
             continue
-        first, last = max(_HALF, int(np.floor(x - high))), min(width - 1 - _HALF, int(np.ceil(x - low)))
-        if last <= first:
-            continue
-        _zero_mean_patch(left, x, y, patch)
-        found, row, score, rival = _search(b, bw, width, height, band, y, first, last, patch, left_weight[y, x], scores)
-        if score < min_correlation or 1.0 - score > uniqueness * (1.0 - rival):
-            continue
-        _zero_mean_patch(right, found, row, patch)
-        first, last = max(_HALF, int(np.floor(found + low))), min(width - 1 - _HALF, int(np.ceil(found + high)))
-        back, _, _, _ = _search(a, aw, width, height, band, row, first, last, patch, right_weight[row, found], scores)
-        if abs(back - x) <= 1:
-            out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5
+        found, row = x, y
+        for back in range(2):  # to the right image, and from there to the left one again
+            if back:
+                image, own, pixels, weights = right, right_weight[row, found], a, aw
+                from_, to = np.floor(found + low), np.ceil(found + high)
+            else:
+                image, own, pixels, weights = left, left_weight[row, found], b, bw
+                from_, to = np.floor(found - high), np.ceil(found - low)
+            first, last = max(_HALF, int(from_)), min(width - 1 - _HALF, int(to))
+            if last <= first and not back:
+                break
+            _zero_mean_patch(image, found, row, patch)
+            place, line, score, rival = _search(
+                pixels, weights, width, height, band, row, first, last, patch, own, scores
+            )
+            if back:
+                if abs(place - x) <= 1:
+                    out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5
+            elif score < min_correlation or 1.0 - score > uniqueness * (1.0 - rival):
+                break
+            else:
+                found, row = place, line

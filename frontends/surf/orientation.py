@@ -100,7 +100,8 @@ def _strongest_window(gx, gy, degrees, n, bins, sums):
     A window holds the whole degrees less than 30 from its centre. Gradients are summed by bins first; a window is
     then the difference of two running sums, which go on beyond the full circle by a window's width.
     """
-    sums[:] = 0.0
+    for k in range(sums.shape[1]):  # a slice would take longer to compile
+        sums[0, k] = sums[1, k] = 0.0
     for i in range(n):
         k = bins[degrees[i]] + np.uint64(1)
         sums[0, k] += gx[i]

@@ -19,7 +19,7 @@ from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
-from frontends.surf.workers import SHARES, Workers
+from frontends.surf.workers import Workers
 from slam.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ class Surf:
         """Searches of an octave, in stripes of rows: one, or some for each thread."""
         rows = (integral.shape[0] - 1) >> octave
         threads = self.workers.threads
-        count = 1 if threads == 1 else max(1, min(SHARES * threads, rows // _SMALLEST_STRIPE))
+        count = 1 if threads == 1 else max(1, min(threads, rows // _SMALLEST_STRIPE))
         edges = [rows * k // count for k in range(count + 1)]
         return [partial(detect_octave, integral, filters, octave, limit, a, b) for a, b in pairwise(edges)]
 

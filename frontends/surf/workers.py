@@ -8,8 +8,6 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-#: Tasks for each thread: whoever is done early takes over some of the others' work.
-SHARES = 2
 _SMALLEST_SHARE = 32  # items that are worth a task
 
 
@@ -42,6 +40,6 @@ class Workers:
 
     def over(self, count: int, function: Callable[[int, int], Any]) -> list[Any]:
         """Results of ``function(first, last)`` on consecutive shares of `count` items."""
-        shares = 1 if self.threads == 1 else max(1, min(SHARES * self.threads, count // _SMALLEST_SHARE))
+        shares = 1 if self.threads == 1 else max(1, min(self.threads, count // _SMALLEST_SHARE))
         edges = [count * k // shares for k in range(shares + 1)]
         return self.run([partial(function, a, b) for a, b in pairwise(edges)])

@@ -32,6 +32,7 @@ from slam.geometry.se3 import Array
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: times over which errors are surely correlated
 _SPACING = 0.5  # a view waits from when the last one has lost this part of what it loses until it is compared
 _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
+_LATER = 1.25  # after so many times the frames such a pair is solved anew: its parallax has grown as much at most
 _MOST_ROWS = 250  # of a frame: more say little more
 _MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
@@ -83,6 +84,7 @@ class SelfCalibration:
         self._scattered = _CONFIGURED
         self._waiting: list[View] = []
         self._open: Evidence | None = None  # of a pair that is not complete
+        self._frames, self._solved = 0, 0  # frames that such a pair has had, and had when it was last solved
         self._seen = 0
         self._looked: Array | None = None  # pose of the last frame that was looked at
         self.unsolved = 0
@@ -168,7 +170,7 @@ class SelfCalibration:
 
     def _compare(self, view: View) -> None:
         """Compare a view with the earlier ones that wait for a partner, the oldest first, until one goes on waiting."""
-        c, self._open = self.config, None
+        c = self.config
         waiting = self._waiting
         newest = match(waiting[-1], view) if waiting else NO_MATCHES
         common = len(newest[0])
@@ -184,7 +186,11 @@ class SelfCalibration:
             if evidence is not None:
                 self._motion.add(evidence)
         if waiting and not ended and self.pairs < _FEW:
-            self._open = self._evidence(waiting[0], view, matched)
+            self._frames += 1
+            if self._frames >= _LATER * self._solved:
+                self._open, self._solved = self._evidence(waiting[0], view, matched), self._frames
+        else:
+            self._open, self._frames, self._solved = None, 0, 0
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
     def evidence(self) -> Evidence | None:

@@ -140,6 +140,17 @@ class RigModel:
         out[:, 2, 2 * n : 3 * n] = -self.focal * self._polynomials(x - d, y)
         return out
 
+    def residual_products(self, factors: Array, points: Array) -> Array:
+        """Sum over points (N, 3) of factors (N, 3, n) times `residual_field`: (n, m)."""
+        x, y, d = points.T / self.focal
+        n = len(RESIDUAL)
+        out = np.zeros((factors.shape[2], 4 * n))
+        left, right = (self.focal * self._polynomials(v, y) for v in (x, x - d))
+        out[:, :n] = (factors[:, 0] + factors[:, 2]).T @ left
+        out[:, n : 2 * n] = factors[:, 1].T @ left
+        out[:, 2 * n : 3 * n] = -(factors[:, 2].T @ right)
+        return out
+
     def residual_vertical(self, points: Array) -> Array:
         """As `vertical`, by the residual fields (N, m)."""
         x, y, d = points.T / self.focal

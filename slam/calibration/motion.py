@@ -7,13 +7,14 @@ way of its own for each parameter, whatever the motion was.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
-from slam.calibration.robust import chi_square_median, student_weights
-from slam.geometry.se3 import Array, hat, so3_exp
+from slam.calibration.robust import chi_square_median, median, student_weights
+from slam.geometry.se3 import Array, so3_exp
 
 _ITERATIONS = 20  # of Gauss-Newton at most
 _CONVERGED = 1e-3  # largest last change of a predicted point [px]; 0.02 let focal lengths be wrong by percents
@@ -37,6 +38,32 @@ class Pair:
     t: Array
 
 
+class Linear(NamedTuple):
+    """A motion at some points, linearised.
+
+    Attributes:
+        moved: where the motion takes the points (N, 3) [px].
+        J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``.
+        motion: `J_motion`, whitened.
+        white: what makes unit variances of the residuals (N, 3, 3), lower triangular; NaN where their covariance is
+            none.
+        residual: second view less its prediction from the first (N, 3), whitened.
+    """
+
+    moved: Array
+    J_point: Array
+    J_motion: Array
+    motion: Array
+    white: Array
+    residual: Array
+
+    @classmethod
+    def empty(cls, n: int) -> Linear:
+        """Of n points, to be filled in."""
+        J_motion, motion = np.empty((2, n, 3, 6))
+        return cls(np.empty((n, 3)), np.empty((n, 3, 3)), J_motion, motion, np.empty((n, 3, 3)), np.empty((n, 3)))
+
+
 @dataclass(frozen=True)
 class Fit:
     """The motion that takes one view's points to the other's, and the linear problem about it.
@@ -44,19 +71,14 @@ class Fit:
     Attributes:
         R, t: the motion.
         points: the first view's, estimated from both views (N, 3) [px].
-        moved: where they are in the second view (N, 3) [px].
-        J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6).
-        residual: second view less its prediction from the first (N, 3) [px].
-        weights: information of the residuals (N, 3, 3).
+        linear: the problem of the last step.
+        weights: of the points (N,).
     """
 
     R: Array
     t: Array
     points: Array
-    moved: Array
-    J_point: Array
-    J_motion: Array
-    residual: Array
+    linear: Linear
     weights: Array
 
 
@@ -73,30 +95,29 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         focal: focal length [px].
         noise: covariance of a point (3, 3) [px²]; only its form matters.
     """
-    points = first
+    first, second = (np.ascontiguousarray(a, float) for a in (first, second))
+    points, at = first, Linear.empty(len(first))
     for _ in range(_ITERATIONS):
-        moved, J_point, J_motion = move(points, R, t, focal)
-        # The second view less its prediction from the first, the points' own corrections carried to first order.
-        residual = second - moved - (J_point @ (first - points)[..., None])[..., 0]
-        back = noise @ np.swapaxes(J_point, 1, 2)
-        covariance = noise + J_point @ back
-        if not np.isfinite(covariance).all():
+        _linearise(first, second, points, R, t, focal, noise, at)
+        distance = np.einsum("ni,ni->n", at.residual, at.residual)
+        if not np.isfinite(distance).all():
             return None
-        W = np.linalg.inv(covariance)
-        weighted = W * _weights(residual, W)[:, None, None]
-        WJ = weighted @ J_motion
-        normal = np.tensordot(J_motion, WJ, axes=((0, 1), (0, 1)))
+        weights = student_weights(distance, 3, _LEAST_NOISE)
+        root = np.sqrt(weights)[:, None]
+        A, b = (root[..., None] * at.motion).reshape(-1, 6), (root * at.residual).ravel()
+        normal = A.T @ A
         normal += 1e-12 * np.trace(normal) * np.eye(6)
-        step = np.linalg.solve(normal, np.tensordot(WJ, residual, axes=((0, 1), (0, 1))))
+        step = np.linalg.solve(normal, A.T @ b)
         if not np.isfinite(step).all():
             return None
-        change = J_motion @ step
+        change = at.J_motion.reshape(-1, 6) @ step
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        points = first + (back @ W @ (residual - change)[..., None])[..., 0]
-        fit, last = Fit(R, t, points, moved, J_point, J_motion, residual, weighted), float(np.abs(change).max())
+        left = np.einsum("nij,ni->nj", at.white, at.residual - (at.motion.reshape(-1, 6) @ step).reshape(-1, 3))
+        points = first + np.einsum("nij,ni->nj", at.J_point, left) @ noise
+        last = float(np.abs(change).max())
         if last < _CONVERGED:
             break
-    return fit if last < _NEARLY else None
+    return Fit(R, t, points, at, weights) if last < _NEARLY else None
 
 
 def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) -> Evidence | None:
@@ -117,9 +138,7 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
     fit = fit_motion(first, second, pair.R, pair.t, model.focal, noise)
     if fit is None:
         return None
-    fields = (model.field, model.residual_field)
-    J_rig, J_residual = (field(fit.moved) - fit.J_point @ field(fit.points) for field in fields)
-    return _eliminated(fit.J_motion, -J_rig, -J_residual, fit.weights, fit.residual, parameters)
+    return _eliminated(model, fit, parameters)
 
 
 def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
@@ -128,14 +147,8 @@ def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: flo
     The error of a near point's disparity grows with the motion. A limit of so many pixels would keep those points alone
     whose errors happen to be small, and favour what was believed of the motion before.
     """
-    with np.errstate(all="ignore"):
-        moved, J, _ = move(first, R, t, focal)
-        covariance = noise + J @ noise @ np.swapaxes(J, 1, 2)
-        off = second - moved
-        good = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
-        out = np.full(len(first), np.nan)
-        out[good] = np.einsum("ni,ni->n", off[good], np.linalg.solve(covariance[good], off[good][..., None])[..., 0])
-        return out
+    residual = linearised(first, second, first, R, t, focal, noise).residual
+    return np.asarray(np.einsum("ni,ni->n", residual, residual))
 
 
 def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
@@ -149,7 +162,7 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
     growth = 1 + np.square(J) @ np.diag(noise) / np.diag(noise)
     squares = np.square(pair.second - moved) / growth
     squares = squares[np.isfinite(squares).all(axis=1)]
-    found = np.array([np.median(squares[:, :2]), np.median(squares[:, 2])]) / chi_square_median(1)
+    found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / chi_square_median(1)
     return np.maximum(found, _EXACT**2)
 
 
@@ -160,18 +173,22 @@ def parallax(model: RigModel, pair: Pair) -> float:
     return float(np.median(np.linalg.norm((there - turned)[:, :2], axis=1)))
 
 
-def _eliminated(
-    J_motion: Array, J_rig: Array, J_residual: Array, weights: Array, residual: Array, parameters: Array
-) -> Evidence:
-    """The likelihood of the parameters with the motion marginalised out (Schur complement)."""
-    root = np.swapaxes(np.linalg.cholesky(weights), 1, 2)
-    n = 6 + J_rig.shape[2]
-    J = (root @ np.concatenate([J_motion, J_rig, J_residual], axis=2)).reshape(-1, n + J_residual.shape[2])
-    normal, gradient = J[:, :n].T @ J, J[:, :n].T @ (root @ residual[..., None]).ravel()
-    motion = np.linalg.solve(normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6), normal[:6, 6:n])
-    reduced = normal[6:] - motion.T @ normal[:6]
-    S = reduced[:, 6:n]
-    return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], reduced[:, n:])
+def _eliminated(model: RigModel, fit: Fit, parameters: Array) -> Evidence:
+    """The likelihood of the parameters (n,) with the motion marginalised out (Schur complement)."""
+    at, n = fit.linear, 6 + len(parameters)
+    root = np.sqrt(fit.weights)[:, None]
+    white = root[..., None] * at.white
+    by_rig = at.J_point @ model.field(fit.points) - model.field(at.moved)
+    J = np.concatenate([root[..., None] * at.motion, white @ by_rig], axis=2)
+    rows = J.reshape(-1, n)
+    normal = rows.T @ rows
+    gradient = rows.T @ (root * at.residual).ravel()
+    by_moved = np.swapaxes(white, 1, 2) @ J
+    by_point = np.swapaxes(at.J_point, 1, 2) @ by_moved
+    cross = model.residual_products(by_point, fit.points) - model.residual_products(by_moved, at.moved)
+    motion = np.linalg.solve(normal[:6, :6] + 1e-12 * np.trace(normal[:6, :6]) * np.eye(6), normal[:6, 6:])
+    S = normal[6:, 6:] - motion.T @ normal[:6, 6:]
+    return Evidence(S, S @ parameters + gradient[6:] - motion.T @ gradient[:6], cross[6:] - motion.T @ cross[:6])
 
 
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:
@@ -183,20 +200,25 @@ def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array,
     Returns:
         Moved points (N, 3), Jacobians by the points (N, 3, 3), and by ``[rotation (left), t]`` (N, 3, 6).
     """
-    turned = np.column_stack([points[:, :2], np.full(len(points), focal)]) @ R.T
-    q = turned + points[:, 2:] * t
-    scale = focal / q[:, 2]
-    moved = np.column_stack([q[:, :2], points[:, 2]]) * scale[:, None]
-    J_q = np.zeros((len(points), 3, 3))
-    J_q[:, 0, 0] = J_q[:, 1, 1] = scale
-    J_q[:, :, 2] -= moved / q[:, 2:]
-    J_point = J_q @ np.column_stack([R[:, :2], t])
-    J_point[:, 2, 2] += scale
-    J_motion = J_q @ np.concatenate([-hat(turned), points[:, 2, None, None] * np.eye(3)], axis=2)
-    return moved, J_point, J_motion
+    at = linearised(points, points, points, R, t, focal, np.eye(3))
+    return at.moved, at.J_point, at.J_motion
 
 
-def _weights(residual: Array, W: Array) -> Array:
-    """Weights (N,) of residuals (N, 3) with information W (N, 3, 3) for a noise whose scale is estimated."""
-    distance = np.einsum("ni,nij,nj->n", residual, W, residual)
-    return student_weights(distance, 3, _LEAST_NOISE)
+def linearised(first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array) -> Linear:
+    """A motion linearised at estimates of the first view's points, as `fit_motion` needs it.
+
+    The residuals carry the points' own corrections to first order.
+    """
+    first, second, points = (np.ascontiguousarray(a, float) for a in (first, second, points))
+    out = Linear.empty(len(points))
+    _linearise(first, second, points, R, t, focal, noise, out)
+    return out
+
+
+def _linearise(
+    first: Array, second: Array, points: Array, R: Array, t: Array, focal: float, noise: Array, out: Linear
+) -> None:
+    """`linearised` into `out`."""
+    from slam.calibration.motion_kernels import linearise
+
+    linearise(first, second, points, np.ascontiguousarray(R), np.ascontiguousarray(t), focal, noise, *out)

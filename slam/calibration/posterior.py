@@ -105,12 +105,11 @@ def solve(
         evidence: of the data.
         known: the same with each recording's own error in it; the prior's scales follow from `evidence` all the same.
     """
-    information = np.linalg.inv(prior.covariances)  # (K, n, n)
-    whole, covariances, steps, logs = _by_scale(prior, information, evidence)
+    whole, covariances, steps, logs = _by_scale(prior, evidence)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     if known is not None:
-        whole, covariances, steps, _ = _by_scale(prior, information, known)
+        whole, covariances, steps, _ = _by_scale(prior, known)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
@@ -118,14 +117,14 @@ def solve(
     return Solution(prior.mean + step, inner, inner + residual * moved @ moved.T, float(weights @ prior.residual))
 
 
-def _by_scale(prior: Prior, information: Array, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:
+def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:
     """All evidence together; by scale of the prior (K): covariances, changes of the mean, log marginal likelihoods."""
     whole = evidence[0]
     for more in evidence[1:]:
         whole += more
-    total = information + whole.S
+    total = prior.information + whole.S
     covariances = np.linalg.inv(total)
     e = whole.e - whole.S @ prior.mean
     steps = covariances @ e
-    logs = 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1] + steps @ e)
+    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(total)[1] + steps @ e)
     return whole, covariances, steps, logs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -64,6 +65,16 @@ class Prior:
     mean: Array
     covariances: Array
     residual: Array
+
+    @cached_property
+    def information(self) -> Array:
+        """Inverses of the covariances (K, n, n)."""
+        return np.linalg.inv(self.covariances)
+
+    @cached_property
+    def log_determinants(self) -> Array:
+        """Of the information (K,)."""
+        return np.asarray(np.linalg.slogdet(self.information)[1])
 
 
 def as_delivered(model: RigModel) -> Prior:

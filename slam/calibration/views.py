@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, fit_motion, move, squared_distance
-from slam.calibration.robust import chi_square_median
+from slam.calibration.robust import chi_square_median, median
 from slam.data import StereoFeatures
 from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
@@ -152,5 +152,5 @@ def pair_of(
             break
         R, t = fitted.R, fitted.t
         distance = squared_distance(ideal[0], ideal[1], R, t, model.focal, noise)
-        agree = distance <= _FARTHEST * np.median(distance[agree]) / chi_square_median(3)
+        agree = distance <= _FARTHEST * median(distance[agree]) / chi_square_median(3)
     return Pair(one[agree], two[agree], R, t)

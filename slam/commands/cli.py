@@ -149,7 +149,8 @@ def run_command(
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
-        stack.enter_context(compiled_beside(options.backend))
+        if options.config.objects.mode != "off":
+            stack.enter_context(compiled_beside(options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
         watches = []

@@ -50,7 +50,10 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
     normal, step, local = np.empty((6, 6)), np.empty(6), np.empty(3)
     for h in range(len(poses)):
         for _ in range(most):
-            normal[:], step[:] = 0.0, 0.0
+            for i in range(6):  # slices take seconds to compile
+                step[i] = 0.0
+                for j in range(6):
+                    normal[i, j] = 0.0
             for k in range(rows.shape[1]):
                 m = rows[h, k]
                 _transform(poses[h], points[m], local)

@@ -9,7 +9,7 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.rig import StereoRig
 from slam.mapping.config import MapConfig
-from slam.tracking.association import crowded
+from slam.tracking.association import crowded, pairs_in_boxes
 
 
 def new_landmarks(
@@ -54,6 +54,8 @@ def _spread(
     uv: Array, rows: NDArray[np.intp], occupied: Array, wanted: int, rig: StereoRig, config: MapConfig
 ) -> NDArray[np.intp]:
     """Pick rows (best first) so that the grid fills evenly and no two lie closer than the separation."""
+    if not len(rows):
+        return np.zeros(0, np.intp)
     columns, lines = config.grid
     size = np.array([rig.width / columns, rig.height / lines])
 
@@ -69,13 +71,17 @@ def _spread(
     rank = np.empty(len(rows), int)
     rank[order] = np.arange(len(rows)) - starts[cells[order]]
     queue = rows[np.argsort(rank + load[cells], kind="stable")]
+    # Those near each other, by ascending place in the queue.
+    first, second = pairs_in_boxes(uv[queue], np.full((len(queue), 2), config.separation), uv[queue])
+    gap = uv[queue[first]] - uv[queue[second]]
+    near = np.einsum("ij,ij->i", gap, gap) < config.separation**2
+    begin, second = np.searchsorted(first[near], np.arange(len(queue) + 1)).tolist(), second[near]
     chosen: list[int] = []
-    taken = np.full((wanted, 2), np.inf)
-    for row in queue:
+    free = np.ones(len(queue), bool)
+    for place in range(len(queue)):
         if len(chosen) == wanted:
             break
-        gap = taken[: len(chosen)] - uv[row]
-        if not (np.einsum("ij,ij->i", gap, gap) < config.separation**2).any():
-            taken[len(chosen)] = uv[row]
-            chosen.append(int(row))
+        if free[place]:
+            free[second[begin[place] : begin[place + 1]]] = False
+            chosen.append(int(queue[place]))
     return np.array(chosen, np.intp)

@@ -38,8 +38,8 @@ def match_near(
     pixels = features.uv_left[order]
     first = np.searchsorted(pixels[:, 1], uv[:, 1] - radius)
     best = best_in_windows(
-        uv, radius, first, descriptors, laplacian, pixels, features.descriptors[order], features.laplacian[order],
-        _NEIGHBOURS, d_match, ratio,
+        np.ascontiguousarray(uv), radius, first, descriptors, laplacian, pixels, features.descriptors[order],
+        features.laplacian[order], _NEIGHBOURS, d_match, ratio,
     )  # fmt: skip
     rows = np.flatnonzero(best >= 0)
     return rows, order[best[rows]]

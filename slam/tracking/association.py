@@ -398,5 +398,8 @@ def crowded(uv: Array, others: Array, radius: float) -> BoolArray:
     """Which pixels (N, 2) lie within `radius` [px] of any of `others` (M, 2)."""
     if not len(others):
         return np.zeros(len(uv), bool)
-    gap = (uv[:, None] - others[None]).astype(np.float32)
-    return np.asarray(((gap**2).sum(axis=2) < radius * radius).any(axis=1))
+    rows, columns = pairs_in_boxes(uv, np.full((len(uv), 2), radius), others)
+    gap = (uv[rows] - others[columns]).astype(np.float32)
+    out = np.zeros(len(uv), bool)
+    out[rows[np.square(gap).sum(axis=1) < radius * radius]] = True
+    return out

@@ -72,6 +72,14 @@ def test_a_shift_of_the_left_image_does_not_turn_the_rig(name):
     assert np.abs(change.mean(axis=0)).max() < 0.05 * 0.01 * F  # the image as a whole stays where it is
 
 
+def test_sums_of_residual_fields_need_not_build_them():
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-400, 400, 9), rng.uniform(-150, 150, 9), rng.uniform(0, 40, 9)])
+    factors = rng.standard_normal((9, 3, 5))
+    expected = np.einsum("kin,kim->nm", factors, MODEL.residual_field(points))
+    np.testing.assert_allclose(MODEL.residual_products(factors, points), expected, rtol=1e-10, atol=1e-10)
+
+
 def test_the_residual_fields_have_a_mean_square_of_one():
     far = MODEL.far(201, 151)
     columns = MODEL.residual_field(far)[:, 0] / F
