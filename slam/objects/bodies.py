@@ -54,6 +54,7 @@ class Body:
         refused: number of frames running in which the back end did not use what was measured of it.
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
+        apart_from: id of the body as whose part it was found, which moves otherwise; None where there is none.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -86,6 +87,7 @@ class Body:
     measured_at: float = float("nan")
     reported: int = 0
     reported_unmeasured: int = 0
+    apart_from: int | None = None
     estimate: ObjectEstimate | None = field(default=None, repr=False)
 
     @property
