@@ -18,6 +18,7 @@ from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
+CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
@@ -237,7 +238,7 @@ def with_extent(body: Body, local: Array) -> Body:
 def outermost(points: Array) -> tuple[Array, Array]:
     """The 5th and 95th percentiles (3,) of points (K, 3), at least two: as NumPy's, without their cost for a few."""
     ordered = np.sort(points, axis=0)
-    place = 0.05 * (len(points) - 1)
+    place = CUT * (len(points) - 1)
     k = int(place)
     share = place - k
     return (1 - share) * ordered[k] + share * ordered[k + 1], (1 - share) * ordered[-1 - k] + share * ordered[-2 - k]
