@@ -203,7 +203,11 @@ class MovingObjectDetector:
             alike[members] = True
         fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
         tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
-        for whole, members in [(None, rows[group.members]) for group in scene.groups] + parts:
+        of_parts = np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)])
+        alone = [rows[group.members] for group in scene.groups]
+        alone = [members for members in alone if 2 * np.isin(members, of_parts).sum() <= len(members)]
+        for whole, members in [*parts, *((None, members) for members in alone)]:
+            members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
                 self._perhaps_found(members[tracks.streak[members] > 0], times, whole)
         suspected = np.concatenate(suspects)

@@ -161,7 +161,10 @@ def regroup(
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
-        enter(body, tracks, free[whose == body.id])
+        mine = free[whose == body.id]
+        streak = tracks.streak[mine]
+        enter(body, tracks, mine)
+        tracks.streak[mine] = streak  # they may be of a part that is about to be found
     return gains
 
 
