@@ -3,8 +3,8 @@
     [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--only PART,…] [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
-paired (both back ends on identical measurements), boxes, occlusion (its id after it was hidden), still (no false movers), street, people (cyclists, walkers),
-kitti (two overtaking cars).
+paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
+movers), street, people (cyclists, walkers), kitti (two overtaking cars).
 Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
 they give noisy observations without images.
 """
@@ -47,7 +47,7 @@ from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother")
 PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti")
-HIDDEN_AT, HIDDEN_FOR = 85, (15, 30, 60)  # frame in which the box vanishes, while it moves, and for how many
+HIDDEN_AT, HIDDEN_FOR = 185, (15, 30, 60)  # frame in which the box vanishes, while it moves, and for how many
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
 KITTI = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 MOVING_CARS = (0, 1, 5)  # two that overtake, and a van that comes towards the camera
@@ -188,24 +188,24 @@ def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box is hidden for up to 2 s while it moves and comes to rest: in how many runs it keeps its id."""
     rows = []
-    for backend, hidden in [(b, h) for b in BACKENDS for h in HIDDEN_FOR][: 1 if quick else None]:
+    for backend, frames in [(b, h) for b in BACKENDS for h in HIDDEN_FOR][: 1 if quick else None]:
         kept, others, delays = 0, 0, []
         seeds = range(1 if quick else 10)
         for seed in seeds:
-            before, after, delay = ids_about(seed, backend, hidden, images)
+            before, after, delay = ids_about(seed, backend, frames, images)
             kept += before == after and len(before) == 1
             others += len(after - before)
             delays.append(delay)
         rows.append({
-            "back end": backend, "hidden [s]": hidden / 30, "runs": len(seeds), "one id": kept, "other ids": others,
+            "back end": backend, "hidden [s]": frames / 30, "runs": len(seeds), "one id": kept, "other ids": others,
             "frames until measured again, median": float(np.median(delays)),
         })  # fmt: skip
     return rows
 
 
-def ids_about(seed: int, backend: str, hidden: int, images: bool) -> tuple[set[int], set[int], int]:
-    """Ids measured before the box is hidden for so many frames and in the second after, and frames until it is found."""
-    name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + hidden
+def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[int], set[int], int]:
+    """Ids measured before the box is hidden for so many frames, and in the second after; frames until it is found."""
+    name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + frames
     sequence = slam.open_sequence(f"synthetic:{name}")
     system = system_for(sequence, backend, images, [])
     before, after, delay = set(), set(), 30
