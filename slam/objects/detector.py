@@ -227,7 +227,8 @@ class MovingObjectDetector:
         self, tracks: Tracks, ages: NDArray[np.intp], T_world_left: Array
     ) -> list[tuple[int | None, NDArray[np.intp]]]:  # fmt: skip
         """Groups of tracks on known bodies that move otherwise than these: ids of the bodies, and the groups' rows."""
-        c, found = self.config, []
+        c = self.config
+        found: list[tuple[int | None, NDArray[np.intp]]] = []
         dt = self._dt(self._stamps - self._stamps[self.slot])
         for body in self.bodies.values():
             if not (body.measured and body.proved):

@@ -112,8 +112,7 @@ def _draw_object(
         state = f"{speed:.2f} m/s" if thing.moving else "at rest"
         text = f"{thing.id}  {state if measured else 'not seen'}"
         at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
-        left, top, right, bottom = labels[-1]
-        cv2.rectangle(picture, (left, top), (right, bottom), _RING, cv2.FILLED)
+        cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
         cv2.putText(picture, text, at, _FONT, _TEXT, colour, 1, cv2.LINE_AA)
 
 
