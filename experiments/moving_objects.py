@@ -3,8 +3,8 @@
     [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--only PART,…] [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
-paired (both back ends on identical measurements), boxes, still (no false movers), street, people (cyclists, walkers),
-kitti (two overtaking cars).
+paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
+movers), street, people (cyclists, walkers), kitti (two overtaking cars).
 Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
 they give noisy observations without images.
 """
@@ -46,7 +46,8 @@ from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignme
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother")
-PARTS = ("table1", "moving", "paired", "boxes", "still", "street", "people", "kitti")
+PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti")
+HIDDEN_AT, HIDDEN_FOR = 185, (15, 30, 60)  # frame in which the box vanishes, while it moves, and for how many
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
 KITTI = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 MOVING_CARS = (0, 1, 5)  # two that overtake, and a van that comes towards the camera
@@ -184,6 +185,40 @@ def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     return [scored_run("boxes?density=300", backend, images, frames)[0] for backend in BACKENDS]
 
 
+def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
+    """The box is hidden for up to 2 s while it moves and comes to rest: in how many runs it keeps its id."""
+    rows = []
+    for backend, frames in [(b, h) for b in BACKENDS for h in HIDDEN_FOR][: 1 if quick else None]:
+        kept, others, delays = 0, 0, []
+        seeds = range(1 if quick else 10)
+        for seed in seeds:
+            before, after, delay = ids_about(seed, backend, frames, images)
+            kept += before == after and len(before) == 1
+            others += len(after - before)
+            delays.append(delay)
+        rows.append({
+            "back end": backend, "hidden [s]": frames / 30, "runs": len(seeds), "one id": kept, "other ids": others,
+            "frames until measured again, median": float(np.median(delays)),
+        })  # fmt: skip
+    return rows
+
+
+def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[int], set[int], int]:
+    """Ids measured before the box is hidden for so many frames, and in the second after; frames until it is found."""
+    name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + frames
+    sequence = slam.open_sequence(f"synthetic:{name}")
+    system = system_for(sequence, backend, images, [])
+    before, after, delay = set(), set(), 30
+    for k, (features, labels) in enumerate(seen_in(name, images, back + 30)):
+        shown = features_where(features, labels == 0) if HIDDEN_AT <= k < back else features
+        ids = {thing.id for thing in system.process_features(shown).objects if thing.estimate.measured}
+        if k < HIDDEN_AT:
+            before |= ids
+        elif k >= back and ids:
+            after, delay = after | ids, min(delay, k - back)
+    return before, after, delay
+
+
 def still(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Nothing moves."""
     seeds, frames = (1, 15) if quick else (10, 100)
@@ -308,6 +343,7 @@ def main() -> int:
         "moving": moving,
         "paired": paired,
         "boxes": boxes,
+        "occlusion": occlusion,
         "still": still,
         "street": street,
         "people": people,

@@ -8,7 +8,7 @@ from typing import Any
 from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
 from slam.files import write_png
-from slam.run.drawing import draw_objects
+from slam.run.drawing import draw_objects, with_legend
 from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
 from slam.run.outputs import write_json
 from slam.run.runner import RunOptions, run
@@ -49,7 +49,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         draw_errors(runs, truth, out / "errors.png")
     if last is not None:
         frame = next(iter(open_sequence(world).frames(frames - 1)))
-        write_png(out / "frame.png", draw_objects(frame.left, last, open_sequence(world).rig))
+        write_png(out / "frame.png", with_legend(draw_objects(frame.left, last, open_sequence(world).rig)))
     if not quiet:
         print_summary(summaries, out)
     return summaries

@@ -18,6 +18,7 @@ from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
 _SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
+CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
@@ -54,6 +55,7 @@ class Body:
         refused: number of frames running in which the back end did not use what was measured of it.
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
+        apart_from: id of the body as whose part it was found, which moves otherwise; None where there is none.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -86,6 +88,7 @@ class Body:
     measured_at: float = float("nan")
     reported: int = 0
     reported_unmeasured: int = 0
+    apart_from: int | None = None
     estimate: ObjectEstimate | None = field(default=None, repr=False)
 
     @property
@@ -235,7 +238,7 @@ def with_extent(body: Body, local: Array) -> Body:
 def outermost(points: Array) -> tuple[Array, Array]:
     """The 5th and 95th percentiles (3,) of points (K, 3), at least two: as NumPy's, without their cost for a few."""
     ordered = np.sort(points, axis=0)
-    place = 0.05 * (len(points) - 1)
+    place = CUT * (len(points) - 1)
     k = int(place)
     share = place - k
     return (1 - share) * ordered[k] + share * ordered[k + 1], (1 - share) * ordered[-1 - k] + share * ordered[-2 - k]

@@ -6,6 +6,7 @@ becomes a landmark; `update` gives the bodies' observations to the back end and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -34,6 +35,7 @@ from slam.objects.displacements import displacements
 from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
+from slam.objects.parts import parts_of
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene, limit
 from slam.objects.revision import Mend, revise_tracks
@@ -181,15 +183,11 @@ class MovingObjectDetector:
         """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
-        rows = rows[tracks.count(rows) >= c.min_frames]
-        local = transform(inverse(T_world_left), tracks.position[rows])
-        deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
-        rows, local = rows[local[:, 2] > _FARTHEST * deviation], local[local[:, 2] > _FARTHEST * deviation]
+        rows, place = self._judged(tracks, np.flatnonzero(tracks.seen & (tracks.body < 0)), T_world_left)
         ages = (self.slot - np.arange(c.window)) % c.window
         moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
-        place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
         scene = classify_scene(moved, place, c.suspect, c.min_support)
+        parts = self._parts(tracks, ages, T_world_left)
         tracks.doubtful[:] = False
         tracks.doubtful[rows] = scene.alone > c.doubtful
         alike = np.zeros(len(tracks), bool)
@@ -200,17 +198,52 @@ class MovingObjectDetector:
             suspects.append(tracks.landmark[members])
             far = group.away > _LAG * self._dt(times) * c.min_speed
             alike[members] = far and group.test > limit(c.group_test, len(members))
+        for _, members in parts:
+            alike[members] = True
         fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
         tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
-        for group in scene.groups:
-            members = rows[group.members]
+        of_parts = np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)])
+        alone = [rows[group.members] for group in scene.groups]
+        alone = [members for members in alone if 2 * np.isin(members, of_parts).sum() <= len(members)]
+        for whole, members in [*parts, *((None, members) for members in alone)]:
+            members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
-                self._perhaps_found(members[tracks.streak[members] > 0], times)
+                self._perhaps_found(members[tracks.streak[members] > 0], times, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
 
-    def _perhaps_found(self, members: NDArray[np.intp], times: Array) -> None:
-        """Make a body of tracks that have moved alike for long enough, if they lie together."""
+    def _judged(
+        self, tracks: Tracks, rows: NDArray[np.intp], T_world_left: Array
+    ) -> tuple[NDArray[np.intp], Array]:  # fmt: skip
+        """Those of the tracks that are known well enough to be judged, and where they are seen: x/z, y/z, log z."""
+        rows = rows[tracks.count(rows) >= self.config.min_frames]
+        local = transform(inverse(T_world_left), tracks.position[rows])
+        deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
+        near = local[:, 2] > _FARTHEST * deviation
+        return rows[near], np.column_stack([local[near, :2] / local[near, 2:], np.log(local[near, 2])])
+
+    def _parts(
+        self, tracks: Tracks, ages: NDArray[np.intp], T_world_left: Array
+    ) -> list[tuple[int | None, NDArray[np.intp]]]:  # fmt: skip
+        """Groups of tracks on known bodies that move otherwise than these: ids of the bodies, and the groups' rows."""
+        c = self.config
+        found: list[tuple[int | None, NDArray[np.intp]]] = []
+        dt = self._dt(self._stamps - self._stamps[self.slot])
+        for body in self.bodies.values():
+            if not (body.measured and body.proved):
+                continue
+            rows, place = self._judged(tracks, membership.tracks_on(body, tracks, c.margin), T_world_left)
+            for group in parts_of(body, tracks, rows, ages, place, c.suspect, c.min_support):
+                members = rows[group.members]
+                if group.away > _LAG * dt * c.min_speed and group.test > limit(c.group_test, len(members)):
+                    found.append((body.id, members))
+        return found
+
+    def _perhaps_found(self, members: NDArray[np.intp], times: Array, whole: int | None = None) -> None:
+        """Make a body of tracks that have moved alike for long enough, if they lie together.
+
+        They may be a part of the body `whole` that moves otherwise.
+        """
         c, tracks = self.config, self.tracks
         assert tracks is not None
         members = members[membership.compact(tracks.position[members])]
@@ -224,13 +257,13 @@ class MovingObjectDetector:
             body = membership.fitted(body, tracks, members, self.slot)
             moves = membership.verdict(body, tracks, members).gain > 0
             if moves.all():
-                self._found(members, centre, twist, uncertainty, times)
+                self._found(members, centre, twist, uncertainty, times, whole)
                 return
             members = members[moves]  # what lies among them and rather stands still slows them down
             if len(members) < c.min_support:
                 return
         twist, uncertainty, centre = self._common_motion(members, times)
-        self._found(members, centre, twist, uncertainty, times)
+        self._found(members, centre, twist, uncertainty, times, whole)
 
     def _is_resolved(self, centre: Array) -> bool:
         """Whether the noise of a depth is less than the region that a body at this place may fill."""
@@ -253,36 +286,47 @@ class MovingObjectDetector:
         return twist, uncertainty + np.diag([angular] * 3 + [linear] * 3), centre
 
     def _found(
-        self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array
+        self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array,
+        whole: int | None = None,
     ) -> None:  # fmt: skip
-        """Make a body of tracks with a common twist, or let them join the one that they belong to."""
+        """Make a body of tracks with a common twist, or let them join the one that they belong to.
+
+        That is not the body `whole`, of which they have just been told.
+        """
         c, tracks = self.config, self.tracks
         assert tracks is not None
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
         body = membership.fitted(body, tracks, members, self.slot)
-        known = membership.overlapped(self.bodies, tracks, members, body) or self._whole(members)
+        others = {id: other for id, other in self.bodies.items() if id != whole}
+        known = membership.overlapped(others, tracks, members, body) or self._whole(members, others)
         if known is None:
-            body = self._again(self._grown(body, members))
+            body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
             self.bodies[body.id] = body
             self._next_body = max(self._next_body, body.id + 1)
-        membership.enter(known or body, tracks, members, sure=True)
+        else:
+            body = self.bodies[known.id] = membership.reaching(known, tracks, members)
+        membership.enter(body, tracks, members, sure=True)
 
-    def _whole(self, members: NDArray[np.intp]) -> Body | None:
+    def _whole(self, members: NDArray[np.intp], bodies: Mapping[int, Body]) -> Body | None:
         """The measured body of which tracks are a part, if it has more of them."""
         tracks = self.tracks
         assert tracks is not None
-        for body in self.bodies.values():
+        for body in bodies.values():
             seen = int((tracks.seen & (tracks.body == body.id)).sum())
             if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
                 return body
         return None
 
-    def _again(self, body: Body) -> Body:
-        """A new body, or in its place the one out of view that it is: that keeps its id, but not its points."""
+    def _again(self, body: Body, whole: int | None) -> Body:
+        """A new body, or in its place the one out of view that it is: that keeps its id, but not its points.
+
+        A part of the body `whole` can only be what was a part of that before.
+        """
         tracks, known = self.tracks, None
         assert tracks is not None
         if body.id not in self.bodies:
-            known = membership.returned(self.bodies, body)
+            parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
+            known = membership.returned(parts, body)
         if known is None:
             return body
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
@@ -368,7 +412,9 @@ class MovingObjectDetector:
                 alike = body.alike + 1 if whole is not None else 0
                 if alike != body.alike:
                     self.bodies[body.id] = replace(body, alike=alike)
-                if whole is not None and (body.seen < _MERGES or alike > _MERGES):
+                young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
+                if whole is not None and (young or alike > _MERGES):
+                    whole = self.bodies[whole.id] = membership.reaching(whole, tracks, mine)
                     membership.enter(whole, tracks, mine, sure=True)
                     self._forget(body.id)
 

@@ -11,7 +11,7 @@ from slam.geometry.se3 import Array
 from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks
 
-_RECENT = 5  # frames
+RECENT = 5  #: frames that are recent, at most
 
 
 @dataclass(frozen=True)
@@ -44,5 +44,5 @@ def displacements(tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp]
         camera: position (3,) of the left camera.
     """
     t = tracks
-    d, W, lag = displaced(t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, rows, ages, _RECENT)
+    d, W, lag = displaced(t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, rows, ages, RECENT)
     return Displacements(t.position[rows] - camera, d, W, lag)

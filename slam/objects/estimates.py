@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import StereoFeatures
-from slam.geometry.se3 import inverse, transform
+from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import ObjectBackend
 from slam.object_data import MovingObject, ObjectEstimate, ObjectObservations
 from slam.object_models import ObjectModels
 from slam.objects import membership
-from slam.objects.bodies import Body, counted, from_estimate, outermost
+from slam.objects.bodies import CUT, Body, counted, from_estimate, outermost
 from slam.objects.config import ObjectsConfig
 from slam.objects.tracks import Tracks
 
@@ -117,12 +117,22 @@ def _observations(body: Body, tracks: Tracks, features: StereoFeatures) -> Objec
     )
 
 
+def _enclosing(points: Array) -> Array:
+    """Lower and upper corner (2, 3) of a box about points (K, 3), false ones among them left out.
+
+    What the outermost percentiles cut off points that are spread evenly is added again, up to the last point.
+    """
+    lower, upper = outermost(points)
+    more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)
+    return np.stack([np.maximum(lower - more, points.min(axis=0)), np.minimum(upper + more, points.max(axis=0))])
+
+
 def _report(body: Body, estimate: ObjectEstimate, tracks: Tracks) -> MovingObject:
     mine = tracks.body == body.id
     rows = tracks.row[mine & tracks.seen]
     T = estimate.T_world_object
     points = transform(inverse(body.T_body_estimate), tracks.local[mine & tracks.sure])
-    extent = np.stack(outermost(points)) if len(points) > 1 else np.zeros((2, 3))
+    extent = _enclosing(points) if len(points) > 1 else np.zeros((2, 3))
     return MovingObject(
         body.id, np.sort(rows), estimate, T @ inverse(body.T_reported), T @ inverse(body.T_found),
         extent, body.moving, body.found_at, body.measured_at, body.existence,

@@ -24,7 +24,7 @@ from slam.objects.track_kernels import (
     squares_of_both,
     weighted_means,
 )
-from slam.objects.tracks import Tracks, median, times_vectors
+from slam.objects.tracks import Tracks, fit_positions, median, times_vectors
 from slam.tracking.gating import chi_square_limits
 
 _MISFITS = 3  # times that a track may disagree with its body before it leaves
@@ -129,6 +129,12 @@ def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.missed[rows] = 1
 
 
+def _go_their_own_way(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+    """Make seen members free tracks, in place, that are judged by what they have measured so far."""
+    tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
+    fit_positions(tracks, rows)
+
+
 def regroup(
     bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
 ) -> dict[int, Array]:
@@ -155,7 +161,10 @@ def regroup(
         better = gain > best[near]
         best[near[better]], whose[near[better]] = gain[better], body.id
     for body in bodies.values():
-        enter(body, tracks, free[whose == body.id])
+        mine = free[whose == body.id]
+        streak = tracks.streak[mine]
+        enter(body, tracks, mine)
+        tracks.streak[mine] = streak  # they may be of a part that is about to be found
     return gains
 
 
@@ -184,8 +193,9 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     wrong = (tracks.misfit[mine] >= _MISFITS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
-        leave(tracks, mine[wrong], body)
+        leave(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
+        _go_their_own_way(tracks, mine[wrong & seen])
         mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
@@ -222,6 +232,13 @@ def on_bodies(bodies: Mapping[int, Body], tracks: Tracks, margin: float) -> tupl
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
+def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
+    """Rows of the seen tracks that belong to a body, or lie on or near it and belong to none."""
+    free = np.flatnonzero(tracks.seen & (tracks.body < 0))
+    near = free[_distances(body, tracks, free, margin) < _NEAR]
+    return np.concatenate([np.flatnonzero(tracks.seen & (tracks.body == body.id)), near])
+
+
 def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
     """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
 
@@ -232,7 +249,8 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         own: a body made of them alone.
     """
     for body in bodies.values():
-        if not body.measured or 2 * (_distances(body, tracks, rows, _MERGED) < _NEAR).sum() <= len(rows):
+        near = _distances(replace(body, reach=np.inf), tracks, rows, _MERGED) < _NEAR
+        if not body.measured or 2 * near.sum() <= len(rows):
             continue
         alone = float(_squares(*in_body_axes(own, tracks, rows)[:2]).sum())
         points, A, known = in_body_axes(body, tracks, rows)
@@ -264,6 +282,12 @@ def _spread_of_place(body: Body, y: Array) -> Array:
     return np.asarray(J @ body.covariance @ J.T + _WEAK * np.eye(3))
 
 
+def reaching(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+    """The body known to reach as far as tracks that have moved with it."""
+    away = np.linalg.norm(tracks.position[rows] - body.T[:3, 3], axis=1)
+    return replace(body, reach=max(body.reach, float(away.max(initial=0.0))))
+
+
 def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
     """The body out of view that a new one is by its place and its velocity, perhaps seen from another side; else None.
 
@@ -289,7 +313,8 @@ def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
 
     Much more is asked for than of `overlapped`: next to nothing of what the still world leaves unexplained may be left.
     """
-    if not len(rows) or 2 * (_distances(whole, tracks, rows, _PART) < _NEAR).sum() <= len(rows):
+    near = _distances(replace(whole, reach=np.inf), tracks, rows, _PART) < _NEAR
+    if not len(rows) or 2 * near.sum() <= len(rows):
         return False
     points, A, known = in_body_axes(whole, tracks, rows)
     still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
@@ -325,7 +350,7 @@ def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float
 
 def _improve(body: Body, tracks: Tracks, slot: int) -> None:
     """Take this frame's measurements into the members' points."""
-    mine = np.flatnonzero((tracks.body == body.id) & (tracks.dof[:, slot] > 0))
+    mine = np.flatnonzero((tracks.body == body.id) & (tracks.misfit == 0) & (tracks.dof[:, slot] > 0))
     t = tracks
     improve_members(t.A, t.p, t.anchor, mine, slot, body.T, t.local, t.local_information)
 

@@ -30,7 +30,8 @@ def locate(
 ) -> Array | None:  # fmt: skip
     """The body's pose T_world_object (4, 4) by a fit to its tracks that are seen, or found again.
 
-    Tracks that disagree are counted as misfits, in place.
+    Tracks that disagree are counted as misfits, in place; they are followed on, as they may lie on a part that moves
+    otherwise.
 
     Reprojection errors weigh the points by the noise of the stereo pair. None where too few points agree. `measured`
     are the features' points in camera coordinates (N, 3), NaN where there is no depth.
@@ -46,6 +47,7 @@ def locate(
         again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
         if again is not None and (found is None or again[1].sum() > found[1].sum()):
             found, mine, rows = again, wide, wide_rows
+    followed = tracks.row[members]
     tracks.row[members] = -1
     if found is None:
         return None
@@ -54,8 +56,11 @@ def locate(
     depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
     if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
         return None
+    tracks.row[members] = followed
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, looks = mine[agrees], rows[agrees]
+    tracks.row[members[np.isin(followed, looks)]] = -1
+    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.seen & np.isin(tracks.row, looks)))
     tracks.row[good], tracks.missed[good] = looks, 0
     tracks.descriptors[good] = features.descriptors[looks]
     return T
@@ -119,9 +124,12 @@ def _by_looks(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, measured: Array,
     T_world_left: Array, config: ObjectsConfig,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
-    """Members whose looks are seen, and the features' rows, no farther off than the body can have gone."""
+    """Members whose looks are seen, and the features' rows, no farther off than the body can have gone.
+
+    Free tracks have no claim to their features: where the body was out of view, they follow its points.
+    """
     taken = np.zeros(len(features), bool)
-    taken[tracks.row[tracks.seen & (tracks.body != body.id)]] = True
+    taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if len(mine) < _LEAST_ANEW or len(free) < _LEAST_ANEW:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

@@ -21,6 +21,9 @@ _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 2
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
 _BOXES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
+_FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
+_LEAST_RADIUS = 4  # of a feature's circle [px]
+_LEGEND = 24  # height of the bar with the legend [px]
 _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 
 
@@ -44,13 +47,39 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     moving = np.zeros(len(result.features), bool)
     moving[result.moving_features] = True
     beacons = result.matched_features[~moving[result.matched_features]]
+    radius = max(2 * scale, _LEAST_RADIUS)
     for rows, colour in ((beacons, _BEACON), (result.added_features, _NEW)):
         for u, v in result.features.uv_left[rows]:
-            cv2.circle(picture, _pixel(u, v, scale), 2 * scale, colour, 1, cv2.LINE_AA)
+            cv2.circle(picture, _pixel(u, v, scale), radius, colour, 1, cv2.LINE_AA)
     for u, v in result.features.uv_left[moving]:
-        cv2.circle(picture, _pixel(u, v, scale), 2 * scale + 1, _RING, 1, cv2.LINE_AA)
-        cv2.circle(picture, _pixel(u, v, scale), 2 * scale, _MOVING, 2, cv2.LINE_AA)
+        cv2.circle(picture, _pixel(u, v, scale), radius + 1, _RING, 1, cv2.LINE_AA)
+        cv2.circle(picture, _pixel(u, v, scale), radius, _MOVING, 2, cv2.LINE_AA)
     return picture
+
+
+def with_legend(picture: np.ndarray) -> np.ndarray:
+    """A picture of `draw_objects` with a bar below it that says what is drawn, as far as there is room for it."""
+    import cv2
+
+    bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
+    at, middle = 12, _LEGEND // 2
+    marks = [(_BEACON, "landmark"), (_NEW, "new landmark"), (_MOVING, "feature that moves"), (None, "body"),
+             (False, "body, not seen")]  # fmt: skip
+    for colour, text in marks:
+        (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
+        if at + 20 + width > bar.shape[1]:
+            break
+        if colour:
+            cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
+        else:
+            for left, right in ((-6, 6),) if colour is None else ((-6, -1), (2, 7)):
+                for edge in (-5, 5):
+                    cv2.line(
+                        bar, (at + left, middle + edge), (at + right, middle + edge), _BOXES[0], 2 - (colour is False)
+                    )
+        cv2.putText(bar, text, (at + 12, middle + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
+        at += width + 36
+    return np.concatenate([picture, bar])
 
 
 def _draw_object(
@@ -83,8 +112,8 @@ def _draw_object(
         state = f"{speed:.2f} m/s" if thing.moving else "at rest"
         text = f"{thing.id}  {state if measured else 'not seen'}"
         at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, _RING, 3, cv2.LINE_AA)
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
+        cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
+        cv2.putText(picture, text, at, _FONT, _TEXT, colour, 1, cv2.LINE_AA)
 
 
 def _clear_place(
@@ -93,7 +122,7 @@ def _clear_place(
     """Where a label's lower left corner goes: inside the picture, below the labels that it would cover [px]."""
     import cv2
 
-    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 3)
+    (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
     u = min(max(at[0], 0), max(shape[1] - width, 0))
     v = min(max(at[1], height), shape[0] - base)
     for left, top, right, bottom in sorted(labels, key=lambda label: label[1]):
@@ -157,7 +186,7 @@ class FramePictures:
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.run.runner.Watch`."""
-        self.add(frame.index, frame.stamp, draw_objects(frame.left, result, system.rig))
+        self.add(frame.index, frame.stamp, with_legend(draw_objects(frame.left, result, system.rig)))
 
     def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
         """Append one picture, `number` in its sequence, taken at `stamp` [s]."""

@@ -58,3 +58,26 @@ def test_points_that_do_not_agree_with_the_motion_say_nothing():
     features.uv_left[1] -= 40.0
     local = RIG.triangulate(features.uv_left, features.uv_right)
     assert locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=25.0), 0) is None
+
+
+def test_a_point_that_disagrees_is_followed_on_and_counted():
+    body, tracks, features, _ = scene(4, np.zeros(6), np.random.default_rng(5))
+    features.uv_left[3] += 9.0
+    features.uv_right[3] += 9.0
+    tracks.row[:4] = np.arange(4)
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    assert locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=25.0), 0) is not None
+    assert tracks.row[:4].tolist() == [0, 1, 2, 3]
+    assert tracks.misfit[:4].tolist() == [0, 0, 0, 1]
+
+
+def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
+    off = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])  # farther than its prediction may be off
+    body, tracks, features, truth = scene(4, off, np.random.default_rng(6))
+    tracks.row[:4] = -1
+    followers = tracks.begin(np.arange(10, 14), features, np.arange(4), transform(truth, POINTS))
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    T = locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=40.0), 0)
+    assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
+    assert tracks.row[:4].tolist() == [0, 1, 2, 3]
+    assert (tracks.ids[followers] == -1).all()

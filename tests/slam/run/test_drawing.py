@@ -10,7 +10,7 @@ import slam
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.object_data import MovingObject, ObjectEstimate
-from slam.run.drawing import FramePictures, _clear_place, draw_objects
+from slam.run.drawing import FramePictures, _clear_place, draw_objects, with_legend
 from tests.fuzz.runs import disk_of
 
 
@@ -110,3 +110,14 @@ def test_a_body_that_is_not_seen_is_drawn_otherwise(steps):
     )
     assert (seen != empty).any() and (unseen != empty).any()
     assert 0 < (unseen != empty).sum() < 0.7 * (seen != empty).sum()
+
+
+def test_the_legend_stands_below_the_picture(steps):
+    system, ((frame, result), _) = steps
+    picture = draw_objects(frame.left, result, system.rig)
+    whole = with_legend(picture)
+    assert whole.shape[0] > picture.shape[0] and whole.shape[1:] == picture.shape[1:]
+    np.testing.assert_array_equal(whole[: len(picture)], picture)
+    bar = whole[len(picture) :]
+    assert 0.01 < (bar != 255).any(axis=2).mean() < 0.5
+    assert (with_legend(picture[:, :10])[len(picture) :] == 255).all()  # no room

@@ -1,0 +1,44 @@
+"""Parts of a body that move on their own, such as a lid on its hinge.
+
+The test by which bodies are found in a still world (`slam.objects.regions`), with a body in the world's place: what its
+tracks measured is taken to its axes, and tracks that lie together and went otherwise than the rest of them are a part.
+Without it a part's tracks join the body before anything is known of them, leave it one by one, and never come together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.objects.bodies import Body, in_body_axes
+from slam.objects.displacements import RECENT, Displacements
+from slam.objects.regions import Group, judge_scene
+from slam.objects.track_kernels import displaced
+from slam.objects.tracks import Tracks
+
+
+def parts_of(
+    body: Body, tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp], place: NDArray, test: float,
+    support: int,
+) -> list[Group]:  # fmt: skip
+    """Groups of tracks on a body that moved otherwise than the rest of them; their members are indices into `rows`.
+
+    Args:
+        body: the body.
+        tracks: all tracks.
+        rows: those on the body (N,).
+        ages: of the window's slots in frames (W,).
+        place: where each is seen (N, 3): x/z, y/z, and log z.
+        test: χ²(6) from which a large group moved, and
+        support: least number of tracks in a group, as in `judge_scene`.
+    """
+    if len(rows) < 3 * support:
+        return []
+    points, A, known = in_body_axes(body, tracks, rows)
+    n = len(rows)
+    d, W, lag = displaced(
+        A, np.where(known[..., None], points, 0.0), np.where(known, tracks.dof[rows], 0).astype(np.int8),
+        np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.arange(n), ages, RECENT,
+    )  # fmt: skip
+    middle = (tracks.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
+    return judge_scene(Displacements(middle, d, W, lag), place, test, support).groups
