@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.objects.bodies import Body, in_body_axes
 from slam.objects.displacements import RECENT, Displacements
-from slam.objects.regions import Group, judge_scene
+from slam.objects.regions import Group, classify_scene
 from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks
 
@@ -30,7 +30,7 @@ def parts_of(
         ages: of the window's slots in frames (W,).
         place: where each is seen (N, 3): x/z, y/z, and log z.
         test: χ²(6) from which a large group moved, and
-        support: least number of tracks in a group, as in `judge_scene`.
+        support: least number of tracks in a group, as in `classify_scene`.
     """
     if len(rows) < 3 * support:
         return []
@@ -41,4 +41,4 @@ def parts_of(
         np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.arange(n), ages, RECENT,
     )  # fmt: skip
     middle = (tracks.position[rows] - body.T[:3, 3]) @ body.T[:3, :3]
-    return judge_scene(Displacements(middle, d, W, lag), place, test, support).groups
+    return classify_scene(Displacements(middle, d, W, lag), place, test, support).groups
