@@ -16,7 +16,7 @@ from backends.smoother.landmarks import Known
 from backends.smoother.marginal import Held, reference_prior
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.positions import linearise, place
-from backends.smoother.rebuild import optimise, pose_factor, whole_problem
+from backends.smoother.rebuild import optimise, pose_factor, stepped, whole_problem
 from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray, IndexArray
@@ -232,7 +232,10 @@ class FactorGraph:
         """Correct all measurements by `mend` and solve anew."""
         marks = self.log.landmarks
         self.log.revise(mend, self._make.point)
-        self.recover()
+        try:
+            self._rebuild(near=True)
+        except SolverError:
+            self.recover()
         with suppress(SolverError):  # of a problem that could not be solved: the landmarks stay where they were
             for _ in range(_REFINED):
                 self._place(marks.used())
@@ -387,18 +390,19 @@ class FactorGraph:
                 self._rebuild(solved)
                 return
 
-    def _rebuild(self, solved: bool = True) -> None:
-        """A new solver for all that is on record, solved as a whole first.
+    def _rebuild(self, solved: bool = True, near: bool = False) -> None:
+        """A new solver for all that is on record, solved as a whole first; by a single step where that is `near`.
 
         Raises:
             SolverError: that cannot be solved either.
         """
         self.rebuilds += 1
         change, places = whole_problem(self._make, self.log)
+        self._factor_builder.eliminate_late(change)
         start = time.process_time()
         try:
             if solved:
-                change.values = optimise(change)
+                change.values = stepped(change) if near else optimise(change)
             prior = self.log.history.prior
             held = None if prior is None else held_pose(self.log, prior, change.values)
         finally:

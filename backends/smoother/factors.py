@@ -78,13 +78,11 @@ class FactorMaker:
 
         def error(_this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
             poses = [values.atPose3(key) for key in keys]
-            R = tuple(pose.rotation().matrix() for pose in poses)
-            t = tuple(pose.translation() for pose in poses)
-            residual, J = motion.velocity_change(R, t, dt01, dt12)  # type: ignore[arg-type]
+            R = [pose.rotation().matrix() for pose in poses]
             if jacobians is not None:
-                for i, Ji in enumerate(J):
-                    jacobians[i] = Ji
-            return residual
+                for i, J in enumerate(motion.velocity_change_jacobians(R, dt01, dt12)):
+                    jacobians[i] = J
+            return motion.velocity_change(R, [pose.translation() for pose in poses], dt01, dt12)
 
         noise = gtsam.noiseModel.Diagonal.Sigmas(motion.motion_sigmas(self.models, dt12))
         return gtsam.CustomFactor(noise, list(keys), error)

@@ -11,6 +11,8 @@ Poses are ``T_world_left``; perturbations are on the right, [rotation, translati
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -67,12 +69,15 @@ def predict_from_rest(T0: Array, dt: float) -> tuple[Array, Array, Array]:
     return T0.copy(), np.eye(6), Jw
 
 
-def velocity_change(
-    R: tuple[Array, Array, Array], t: tuple[Array, Array, Array], dt01: float, dt12: float
-) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Residual (6,) = [ω12 − ω01, v12 − v01] of three successive poses, and its Jacobians (6, 6) by each."""
+def velocity_change(R: Sequence[Array], t: Sequence[Array], dt01: float, dt12: float) -> Array:
+    """Residual (6,) = [ω12 − ω01, v12 − v01] of three successive poses."""
     a, b = _log(R[0].T @ R[1]), _log(R[1].T @ R[2])
-    residual = np.concatenate([b / dt12 - a / dt01, (t[2] - t[1]) / dt12 - (t[1] - t[0]) / dt01])
+    return np.concatenate([b / dt12 - a / dt01, (t[2] - t[1]) / dt12 - (t[1] - t[0]) / dt01])
+
+
+def velocity_change_jacobians(R: Sequence[Array], dt01: float, dt12: float) -> Array:
+    """Derivatives (3, 6, 6) of `velocity_change` by each pose."""
+    a, b = _log(R[0].T @ R[1]), _log(R[1].T @ R[2])
     J = np.zeros((3, 6, 6))
     J[0, :3, :3] = _inverse_right(-a) / dt01
     J[1, :3, :3] = -_inverse_right(a) / dt01 - _inverse_right(-b) / dt12
@@ -80,7 +85,7 @@ def velocity_change(
     J[0, 3:, 3:] = R[0] / dt01
     J[1, 3:, 3:] = -R[1] * (1 / dt01 + 1 / dt12)
     J[2, 3:, 3:] = R[2] / dt12
-    return residual, (J[0], J[1], J[2])
+    return J
 
 
 def _log(R: Array) -> Array:

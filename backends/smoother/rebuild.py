@@ -1,4 +1,4 @@
-"""The whole problem set up again from the measurement log and solved by Levenberg-Marquardt, where ISAM2 has failed."""
+"""The whole problem set up again from the measurement log and solved: where ISAM2 has failed, or all has changed."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from slam.data import IndexArray
 from slam.geometry.se3 import Array, inverse
 
 _ITERATIONS = 30  # of Levenberg-Marquardt at most
+_AS_FORETOLD = 0.75  # of the gain that the linear problem promises: with less, a step was not a small one
 
 
 def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:
@@ -85,6 +86,25 @@ def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:
     if not np.isfinite(after) or after > before:
         raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
     return values
+
+
+def stepped(change: Change) -> gtsam.Values:
+    """The values after one step of Gauss-Newton, where they were near the solution before a small change.
+
+    Raises:
+        SolverError: gtsam failed, or the step gains less than the linear problem promises.
+    """
+    graph, values = change.factors, change.values
+    try:
+        linear = graph.linearize(values)
+        step = linear.optimize()
+        better = values.retract(step)
+        before, foretold, after = graph.error(values), linear.error(step), graph.error(better)
+    except FAILURES as error:
+        raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
+    if not before - after >= _AS_FORETOLD * (before - foretold) >= 0:
+        raise SolverError(f"the step was not a small one (error {before:.6g} to {after:.6g}, not {foretold:.6g})")
+    return better
 
 
 def pose_keys(log: MeasurementLog, rows: IndexArray) -> list[int]:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import gtsam
@@ -175,8 +176,9 @@ class Solver:
         """All factors but those of the ballast, with their slots."""
         graph = self._isam.getFactorsUnsafe()
         for slot in range(self._ballast, graph.size()):
-            if graph.exists(slot):
-                yield slot, graph.at(slot)
+            factor = graph.at(slot)
+            if factor is not None:
+                yield slot, factor
 
     def _guarded(self, call: Callable[[], _T]) -> _T:
         start = time.process_time()
@@ -230,8 +232,9 @@ def _covariance_in(variables: list[int], R: Array, keys: list[int]) -> Array:
     return half.T @ half
 
 
+@cache
 def _ballast(count: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Variables that nothing depends on, with their factors."""
+    """Variables that nothing depends on, with their factors; gtsam changes neither."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
     for i in range(count):

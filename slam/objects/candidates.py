@@ -32,6 +32,7 @@ _EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may le
 _SHARE = 0.6  # of the tracks inside that must agree with it
 _PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
+_ALL = slice(None)
 _RADIUS = 0.05  # of a region where bodies have no least size, as a share of the depth
 
 
@@ -93,6 +94,22 @@ class MovingTracks:
         """Covariances (N, 3, 3) of the points in a region about each: as of a ball's."""
         return np.eye(3) * (self.radius**2 / 3.0)[:, None, None]
 
+    @cached_property
+    def said(self) -> tuple[Array, Array, Array, Array]:
+        """What those that move say of a region: information (N, 3, 3) on its place and on its velocity, and vectors.
+
+        The vectors (N, 3) are these times place and velocity. All are NaN for those that do not move.
+        """
+        m, rows = self.motion, np.flatnonzero(self.moves)
+        out = []
+        for covariances, means in ((self.places, m.position), (m.velocity_covariance, m.velocity)):
+            information, vectors = np.full_like(covariances, np.nan), np.full_like(means, np.nan)
+            information[rows] = np.linalg.inv(covariances[rows])
+            vectors[rows] = (information[rows] @ means[rows][:, :, None])[:, :, 0]
+            out.append((information, vectors))
+        (places, at), (velocities, towards) = out
+        return places, velocities, at, towards
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -129,23 +146,32 @@ class Candidate:
         P[3:, 3:] = self.covariance[3:, 3:]
         return np.concatenate([np.zeros(3), self.state[3:]]), P
 
+    def may_be_body(self, min_speed: float) -> bool:
+        """Whether the region has moved far enough, and is seen well enough in this frame, to found a body.
+
+        Args:
+            min_speed: of bodies [m/s].
+        """
+        enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
+        if not (enough and self.agreeing > _SHARE * (self.agreeing + self.contradicting)):
+            return False
+        length = float(np.linalg.norm(self.state[:3] - self.start))
+        return bool(length > max(2.0 * self.radius, 1e-9) and np.linalg.norm(self.state[3:]) > min_speed)
+
     def is_body(self, min_speed: float, camera: Array) -> bool:
-        """Whether the region has moved for certain, and is seen well enough in this frame to found a body.
+        """Whether the region may be a body, and has moved for certain.
 
         Args:
             min_speed: of bodies [m/s].
             camera: covariance (3, 3) of where the region is, given that of the camera's pose: all that is seen shares
                 its error, so it does not fall with the number of tracks.
         """
+        if not self.may_be_body(min_speed):
+            return False
         moved = self.state[:3] - self.start
         length = float(np.linalg.norm(moved))
-        if length <= max(2.0 * self.radius, 1e-9) or np.linalg.norm(self.state[3:]) <= min_speed:
-            return False
         covariance = self.covariance[:3, :3] + self.start_covariance + 2.0 * camera
-        deviation = np.sqrt(moved @ covariance @ moved) / length
-        enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
-        agree = self.agreeing > _SHARE * (self.agreeing + self.contradicting)
-        return bool(enough and agree and length > 3.0 * deviation)
+        return bool(length > 3.0 * np.sqrt(moved @ covariance @ moved) / length)
 
 
 def follow_candidates(
@@ -159,71 +185,108 @@ def follow_candidates(
         dt: time since then [s].
         acceleration: density of the noise of a body's velocity [m/s / √s].
     """
+    ordered = sorted(candidates, key=lambda c: -c.frames)
+    moving = np.flatnonzero(tracks.moves)
     free = tracks.moves.copy()
-    followed = []
-    for candidate in sorted(candidates, key=lambda c: -c.frames):
-        candidate = _advanced(candidate, dt, acceleration)
-        mine = free & _near(candidate, tracks, tracks.places) & _agrees(candidate, tracks)
-        free &= ~mine
-        if mine.any():
-            followed.append(_supported(candidate, tracks, mine))
-        elif candidate.unseen < _PATIENCE:
-            followed.append(replace(candidate, unseen=candidate.unseen + 1, members=np.zeros(0, np.intp)))
-    return followed + _new_candidates(tracks, free)
+    followed: list[Candidate | None] = [None] * len(ordered)
+    if ordered:
+        before = _advanced(ordered, dt, acceleration)
+        mine = _claimed(before, tracks, moving)
+        free[moving[mine.any(axis=0)]] = False
+        some = np.flatnonzero(mine.any(axis=1))
+        for i, candidate in zip(some.tolist(), _supported(before.select(some), tracks, moving, mine[some])):
+            followed[i] = candidate
+        for i in np.flatnonzero(~mine.any(axis=1)).tolist():
+            if ordered[i].unseen < _PATIENCE:
+                followed[i] = before.candidate(i, unseen=ordered[i].unseen + 1, members=np.zeros(0, np.intp))
+    return [candidate for candidate in followed if candidate is not None] + _new_candidates(tracks, free)
 
 
-def _advanced(candidate: Candidate, dt: float, acceleration: float) -> Candidate:
-    state, P = candidate.state.copy(), candidate.covariance.copy()
-    state[:3] += dt * state[3:]
-    P[:3] += dt * P[3:]
+@dataclass(frozen=True)
+class _Regions:
+    """Candidates whose states (C, 6) with covariances (C, 6, 6) are others now."""
+
+    candidates: list[Candidate]
+    state: Array
+    covariance: Array
+
+    def select(self, rows: NDArray[np.intp]) -> _Regions:
+        """Some of them."""
+        return _Regions([self.candidates[i] for i in rows.tolist()], self.state[rows], self.covariance[rows])
+
+    def candidate(self, i: int, **changes: Any) -> Candidate:
+        """One of them, with other changes."""
+        return replace(self.candidates[i], state=self.state[i], covariance=self.covariance[i], **changes)
+
+    def near(self, tracks: MovingTracks, rows: NDArray[np.intp] | slice, places: Array) -> BoolArray:
+        """Which tracks lie in each region (C, M), given the covariances (N, 3, 3) of its middle as each sees it."""
+        gaps = tracks.motion.position[rows] - self.state[:, None, :3]
+        return _squares(gaps, places[rows] + self.covariance[:, None, :3, :3]) < _NEAR
+
+    def unexplained(self, tracks: MovingTracks, regions: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
+        """χ²(3) of the velocities of tracks (K,), each less that of one of the regions (K,)."""
+        gaps = tracks.motion.velocity[rows] - self.state[regions, 3:]
+        return _squares(gaps, tracks.motion.velocity_covariance[rows] + self.covariance[regions, 3:, 3:])
+
+
+def _advanced(candidates: list[Candidate], dt: float, acceleration: float) -> _Regions:
+    state = np.array([candidate.state for candidate in candidates])
+    P = np.array([candidate.covariance for candidate in candidates])
+    state[:, :3] += dt * state[:, 3:]
     P[:, :3] += dt * P[:, 3:]
-    P.reshape(-1)[21::7] += acceleration**2 * dt
-    return replace(candidate, state=state, covariance=P)
+    P[:, :, :3] += dt * P[:, :, 3:]
+    P.reshape(-1, 36)[:, 21::7] += acceleration**2 * dt
+    return _Regions(candidates, state, P)
 
 
-def _near(candidate: Candidate, tracks: MovingTracks, places: Array) -> BoolArray:
-    """Which tracks lie in the region (N,), given the covariances (N, 3, 3) of its middle as each sees it."""
-    gap = tracks.motion.position - candidate.state[:3]
-    return _squares(gap, places + candidate.covariance[:3, :3]) < _NEAR
+def _claimed(regions: _Regions, tracks: MovingTracks, moving: NDArray[np.intp]) -> BoolArray:
+    """Which of the tracks `moving` (M,) lie in each region and move as it does (C, M): the first region has it."""
+    fits = regions.near(tracks, moving, tracks.places)
+    which, track = np.nonzero(fits)
+    fits[which, track] = regions.unexplained(tracks, which, moving[track]) <= _AGREES
+    return np.asarray(fits & (fits.cumsum(axis=0) == 1))
 
 
-def _agrees(candidate: Candidate, tracks: MovingTracks) -> BoolArray:
-    """Which tracks move as the region does (N,)."""
-    return np.asarray(_unexplained(candidate, tracks) <= _AGREES)
-
-
-def _unexplained(candidate: Candidate, tracks: MovingTracks) -> Array:
-    """χ²(3) of the tracks' velocities, less the region's (N,)."""
-    gap = tracks.motion.velocity - candidate.state[3:]
-    return _squares(gap, tracks.motion.velocity_covariance + candidate.covariance[3:, 3:])
-
-
-def _supported(candidate: Candidate, tracks: MovingTracks, mine: BoolArray) -> Candidate:
-    """The region after the tracks `mine` (N,) have corrected it, with what those inside it say counted."""
-    m, rows = tracks.motion, np.flatnonzero(mine)
-    places, velocities = np.linalg.inv(tracks.places[rows]), _velocity_information(m.velocity_covariance[rows])
-    information = np.linalg.inv(candidate.covariance)
-    vector = information @ candidate.state
-    information[:3, :3] += places.sum(axis=0)
-    information[3:, 3:] += velocities.sum(axis=0)
-    vector[:3] += (places @ m.position[rows][:, :, None]).sum(axis=0)[:, 0]
-    vector[3:] += (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
-    P = np.linalg.inv(information)
-    after = replace(candidate, state=P @ vector, covariance=P)
-    inside, left = _near(after, tracks, tracks.spread), _unexplained(after, tracks)
-    rows = rows[inside[rows]]  # where the region's place was hardly known, they may come from everywhere
+def _supported(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp], mine: BoolArray) -> list[Candidate]:
+    """The regions after tracks, of each a row of `mine` (C, M), have corrected them, and those inside are counted."""
+    after = _corrected(before, tracks, moving, mine)
+    inside = after.near(tracks, _ALL, tracks.spread)
+    which, within = np.nonzero(inside)
+    left = after.unexplained(tracks, which, within)
     agrees = left <= _AGREES
-    contradicts = ~agrees & (left > _EXPLAINED * m.test)
-    return replace(
-        after,
-        supporters=candidate.supporters | frozenset(tracks.ids[rows].tolist()),
-        frames=candidate.frames + (len(rows) >= _SUPPORT),
-        agreeing=candidate.agreeing + int((inside & agrees & tracks.moves).sum()),
-        contradicting=candidate.contradicting + int((inside & contradicts).sum()),
-        unseen=0,
-        members=tracks.rows[rows],
-        radius=float(tracks.radius[mine].mean()),
-    )
+    contradicts = ~agrees & (left > _EXPLAINED * tracks.motion.test[within])
+    agreeing = np.bincount(which[agrees & tracks.moves[within]], minlength=len(mine)).tolist()
+    contradicting = np.bincount(which[contradicts], minlength=len(mine)).tolist()
+    followed = []
+    for i, candidate in enumerate(before.candidates):
+        supporters = moving[mine[i]]
+        rows = supporters[inside[i, supporters]]  # where its place was hardly known, they may come from everywhere
+        followed.append(after.candidate(
+            i,
+            supporters=candidate.supporters | frozenset(tracks.ids[rows].tolist()),
+            frames=candidate.frames + (len(rows) >= _SUPPORT),
+            agreeing=candidate.agreeing + agreeing[i],
+            contradicting=candidate.contradicting + contradicting[i],
+            unseen=0,
+            members=tracks.rows[rows],
+            radius=float(tracks.radius[supporters].mean()),
+        ))  # fmt: skip
+    return followed
+
+
+def _corrected(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp], mine: BoolArray) -> _Regions:
+    """The regions after tracks have corrected them; see `_supported`."""
+    weight = mine.astype(float)
+    share = 1 / _share(mine.sum(axis=1))
+    places, velocities, at, towards = (part[moving] for part in tracks.said)
+    information = np.linalg.inv(before.covariance)
+    vector = (information @ before.state[:, :, None])[:, :, 0]
+    information[:, :3, :3] += (weight @ places.reshape(-1, 9)).reshape(-1, 3, 3)
+    information[:, 3:, 3:] += share[:, None, None] * (weight @ velocities.reshape(-1, 9)).reshape(-1, 3, 3)
+    vector[:, :3] += weight @ at
+    vector[:, 3:] += share[:, None] * (weight @ towards)
+    P = np.linalg.inv(information)
+    return _Regions(before.candidates, (P @ vector[:, :, None])[:, :, 0], P)
 
 
 def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
@@ -247,20 +310,21 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
 
 
 def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
-    m, P = tracks.motion, np.zeros((6, 6))
-    places, velocities = np.linalg.inv(tracks.places[rows]), _velocity_information(m.velocity_covariance[rows])
-    P[:3, :3], P[3:, 3:] = np.linalg.inv(places.sum(axis=0)), np.linalg.inv(velocities.sum(axis=0))
-    place = P[:3, :3] @ (places @ m.position[rows][:, :, None]).sum(axis=0)[:, 0]
-    velocity = P[3:, 3:] @ (velocities @ m.velocity[rows][:, :, None]).sum(axis=0)[:, 0]
+    P = np.zeros((6, 6))
+    places, velocities, at, towards = (part[rows] for part in tracks.said)
+    share = _share(len(rows))
+    P[:3, :3], P[3:, 3:] = np.linalg.inv(places.sum(axis=0)), np.linalg.inv((velocities / share).sum(axis=0))
+    place = P[:3, :3] @ at.sum(axis=0)
+    velocity = P[3:, 3:] @ (towards / share).sum(axis=0)
     return Candidate(
         np.concatenate([place, velocity]), P, place, P[:3, :3].copy(), frozenset(tracks.ids[rows].tolist()),
         frames=int(len(rows) >= _SUPPORT), members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
     )  # fmt: skip
 
 
-def _velocity_information(covariances: Array) -> Array:
-    """Information (N, 3, 3) that velocities bring: they share a window with the last frame's, and a camera's error."""
-    return np.asarray(np.linalg.inv(covariances) / (_OVERLAP * np.sqrt(len(covariances))))
+def _share(count: Any) -> Any:
+    """By how much less velocities, so many, say together: they share a window with the last frame's, and a camera's."""
+    return _OVERLAP * np.sqrt(count)
 
 
 def _squares(gaps: Array, covariances: Array) -> Array:

@@ -360,7 +360,9 @@ class MovingObjectDetector:
         followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
         self._candidates = []
         for candidate in followed:
-            if not candidate.is_body(c.min_speed, self._shared_error(candidate.state[:3], T_world_left)):
+            if not candidate.may_be_body(c.min_speed) or not candidate.is_body(
+                c.min_speed, self._shared_error(candidate.state[:3], T_world_left)
+            ):
                 self._candidates.append(candidate)
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)

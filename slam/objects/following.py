@@ -114,11 +114,14 @@ def _carried_along(
         ahead = transform(body.T, local[on])
         _look_at(tracks, young[on], ahead, R @ body.covariance[3:, 3:] @ R.T, T_world_left, features, dt, config, rig,
                  sigma)  # fmt: skip
-    for candidate in candidates:
-        radius = region_radius(np.linalg.norm(candidate.state[:3] - T_world_left[:3, 3]), config.size)
-        on = np.linalg.norm(places - candidate.state[:3], axis=1) < radius
-        ahead = places[on] + dt * candidate.state[3:]
-        _look_at(tracks, young[on], ahead, dt**2 * candidate.covariance[3:, 3:], T_world_left, features, dt, config,
+    if not len(young) or not candidates:
+        return
+    middles = np.array([candidate.state[:3] for candidate in candidates])
+    radius = region_radius(np.linalg.norm(middles - T_world_left[:3, 3], axis=1), config.size)
+    inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
+    for i in np.flatnonzero(inside.any(axis=1)).tolist():
+        on, state, P = inside[i], candidates[i].state, candidates[i].covariance
+        _look_at(tracks, young[on], places[on] + dt * state[3:], dt**2 * P[3:, 3:], T_world_left, features, dt, config,
                  rig, sigma)  # fmt: skip
 
 

@@ -6,7 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from backends.smoother import SmootherBackend, factor_builder
+from backends.smoother import SmootherBackend, factor_builder, factor_graph, rebuild
+from backends.smoother.solver import SolverError
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
@@ -261,6 +262,25 @@ def test_right_pixels_are_mended_afterwards(options):
     off = np.linalg.norm(ours.positions - theirs.positions, axis=1)
     deviations = np.sqrt(np.trace(theirs.covariances, axis1=1, axis2=2))
     assert np.median(off / deviations) < 0.05
+
+
+def test_a_small_change_of_all_measurements_takes_one_step(monkeypatch):
+    def no_small_step(_):
+        raise SolverError("none")
+
+    data, solved, poses = drive(20, points=150), [], []
+    monkeypatch.setattr(factor_graph, "optimise", lambda change: solved.append(1) or rebuild.optimise(change))
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(factor_graph, "stepped", no_small_step)
+        backend = SmootherBackend(RIG, MODELS)
+        run(backend, data)
+        before = backend.trajectory().poses
+        backend.revise(lambda z: z + np.array([0.0, 0.0, 0.2]))
+        assert len(solved) == whole
+        poses.append(backend.measurement_log.path.poses.copy())
+    moved, apart = errors(poses[0], before)[0].max(), errors(*poses)[0].max()
+    assert moved > 0.01 and apart < 0.01 * moved
 
 
 def test_mending_needs_nothing_to_mend():
