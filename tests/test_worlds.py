@@ -19,15 +19,15 @@ from slam.system import StereoSlam
 
 #: World, and about twice the online ATE [m] measured with either back end.
 OBSERVED = {
-    "aisle?frames=80&sigma=0.7": 0.008,
-    "aisle?frames=40&sigma=0.7&rig=toedin": 0.010,
-    "desk?frames=60&sigma=0.7": 0.010,
-    "field?frames=50&sigma=0.7": 0.010,
-    "startup?frames=60&sigma=0.7": 0.016,
-    "box?frames=80&sigma=0.7": 0.030,
-    "boxes?frames=80&sigma=0.7": 0.040,
-    "street?frames=30&sigma=0.7": 0.060,
-    "town?frames=30&sigma=0.7": 0.060,
+    "aisle?frames=40&sigma=0.7": 0.007,
+    "aisle?frames=30&sigma=0.7&rig=toedin": 0.008,
+    "desk?frames=40&sigma=0.7": 0.006,
+    "field?frames=30&sigma=0.7": 0.008,
+    "startup?frames=40&sigma=0.7": 0.010,
+    "box?frames=40&sigma=0.7": 0.010,
+    "boxes?frames=40&sigma=0.7": 0.020,
+    "street?frames=20&sigma=0.7": 0.025,
+    "town?frames=20&sigma=0.7": 0.040,
 }
 RENDERED = {"aisle?frames=20": 0.005, "desk?frames=20": 0.005, "box?frames=20": 0.015, "street?frames=8": 0.06}
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.smoother.objects_factors import FRAME, VelocityPrior, velocities
+from backends.smoother.objects_factors import VelocityPrior, velocities
+from backends.smoother.objects_kernels import FRAME
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
     CameraWindow,

@@ -16,8 +16,6 @@ from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.object_models import ObjectModels
 
-FRAME = 12  #: unknowns of a frame: body pose (6), camera pose (6)
-
 
 @dataclass
 class System:

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_FRAME = 12  # numbers of a frame's state: pose and velocity
+FRAME = 12  #: unknowns of a frame: body pose (6), camera pose (6)
 _NEAREST = 1e-6  # no depth below this [m] is projected
 _SMALL = 1e-6  # sine of an angle below which series are exact
 
@@ -68,9 +68,9 @@ def add_measurements(H, g, camera, R_left, sigma, z, Y, points, first_point):
     """
     f, u0, v0, baseline = camera
     h, q, r = np.empty(3), np.empty(3), np.empty(3)
-    J, G = np.empty((3, 3)), np.empty((3, _FRAME))
+    J, G = np.empty((3, 3)), np.empty((3, FRAME))
     for i in range(len(z)):
-        R, start = Y[i], _FRAME * i
+        R, start = Y[i], FRAME * i
         for j in range(len(points)):
             if np.isnan(z[i, j, 0]) and np.isnan(z[i, j, 1]) and np.isnan(z[i, j, 2]):
                 continue
@@ -118,9 +118,9 @@ def _derivatives(J, R, point, h, out):
 @helper
 def _add(H, g, G, r, start, own):
     """Three residuals r with derivatives G (3, 12) by a frame's unknowns at `start`, and by a point's at `own`."""
-    for a in range(_FRAME):
+    for a in range(FRAME):
         g[start + a] += G[0, a] * r[0] + G[1, a] * r[1] + G[2, a] * r[2]
-        for b in range(_FRAME):
+        for b in range(FRAME):
             H[start + a, start + b] += G[0, a] * G[0, b] + G[1, a] * G[1, b] + G[2, a] * G[2, b]
         for b in range(3):
             cross = G[0, a] * G[0, 3 + b] + G[1, a] * G[1, 3 + b] + G[2, a] * G[2, 3 + b]
@@ -190,10 +190,10 @@ def add_motion(H, g, velocity, before, after, mean, sigmas, first, last):
             for a in range(0 if m > 0 else 6, 18):
                 J[a] *= weight
             for a in range(0 if m > 0 else 6, 18):
-                row = _FRAME * (m - 1 + a // 6) + a % 6
+                row = FRAME * (m - 1 + a // 6) + a % 6
                 g[row] -= J[a] * weight * change
                 for b in range(0 if m > 0 else 6, 18):
-                    H[row, _FRAME * (m - 1 + b // 6) + b % 6] += J[a] * J[b]
+                    H[row, FRAME * (m - 1 + b // 6) + b % 6] += J[a] * J[b]
 
 
 # ---------------------------------------------------------------------------------------------- prior
@@ -207,14 +207,14 @@ def relinearised(H, g, T0, X0, points0, T, X, points):
 
     Returns the information (U, U) and the vector (U,).
     """
-    n, first = len(T), _FRAME * len(T)
+    n, first = len(T), FRAME * len(T)
     delta = np.empty(len(g))
     D, w, inverse_J = np.empty((3, 4)), np.empty(3), np.empty((3, 3))
     for m in range(n):
         for at, (A, B) in enumerate(((T0[m], T[m]), (X0[m], X[m]))):
             _between(A, B, D)
             _turn(D, w, inverse_J)
-            start = _FRAME * m + 6 * at
+            start = FRAME * m + 6 * at
             for i in range(3):
                 delta[start + i] = w[i]
                 delta[start + 3 + i] = inverse_J[i, 0] * D[0, 3] + inverse_J[i, 1] * D[1, 3] + inverse_J[i, 2] * D[2, 3]

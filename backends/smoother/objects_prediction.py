@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from backends.smoother import pose_only
-from backends.smoother.objects_factors import FRAME, first_sigmas, impulse_sigmas, velocities
+from backends.smoother.objects_factors import first_sigmas, impulse_sigmas, velocities
+from backends.smoother.objects_kernels import FRAME
 from backends.smoother.objects_window import CameraWindow, Window
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IndexArray

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.objects_factors import FRAME, System, VelocityPrior, add_measurements, add_motion
+from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion
+from backends.smoother.objects_kernels import FRAME
 from backends.smoother.pose_kernels import moved
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray

@@ -17,7 +17,7 @@ import numpy as np
 
 from slam.geometry.arrays import Array as Array
 
-#: Variance [rad², m²] that is added to a pose's covariance to keep it invertible.
+#: Variance [rad², m²] that a covariance has at least, or that is added to it, to keep it invertible.
 LEAST_VARIANCE = 1e-12
 
 _SMALL = 1e-5  # below this angle [rad] series are exact to double precision

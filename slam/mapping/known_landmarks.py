@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.checks import FARTHEST_POSITION
 from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
-_FARTHEST = 1e9  # position [m]: beyond, pixels have no digits left
 _LARGEST = 1e18  # variance [m²]; those of a landmark that is hardly known at all are far smaller
 _SYMMETRIC = 1e-6  # largest share by which a covariance may differ from its transpose
 
@@ -35,9 +35,9 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
     bad = ~np.isfinite(positions).all(axis=1)
     if bad.any():
         raise MeasurementError(f"{backend}: the position of landmark {ids[bad][0]} is not finite")
-    bad = (np.abs(positions) > _FARTHEST).any(axis=1)
+    bad = (np.abs(positions) > FARTHEST_POSITION).any(axis=1)
     if bad.any():
-        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} lies more than {_FARTHEST:g} m off")
+        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} lies more than {FARTHEST_POSITION:g} m off")
     bad = ~_positive_definite(covariances)
     if bad.any():
         raise MeasurementError(

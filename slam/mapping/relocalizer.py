@@ -15,7 +15,7 @@ from slam import registry
 from slam.data import Estimate, FrameResult, FrameStatus, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import LEAST_VARIANCE, Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
 from slam.mapping.map_io import SavedMap
@@ -27,8 +27,6 @@ from slam.tracking.localizer import Localizer
 POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
 
 REASON = "the camera has not been found in the map yet"
-
-_LEAST_VARIANCE = 1e-12  # of a landmark's position along any direction [m²], against rounding
 
 
 class Relocalizer:
@@ -94,7 +92,7 @@ class Relocalizer:
         assert isinstance(new, MapBackend)
         whole = old.estimate()
         covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
-        short = np.maximum(_LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
+        short = np.maximum(LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
         new.insert(whole.ids, whole.positions, covariances + short[:, None, None] * np.eye(3))
         return new, old.trajectory().select(slice(None, -1))
 

@@ -16,11 +16,10 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far, match_near
 from slam.objects.pixel_kernels import pixel_deviations
 from slam.objects.track_kernels import members_ahead
-from slam.objects.tracks import Tracks
+from slam.objects.tracks import LEAST_INFORMATION, Tracks
 
 _SIGMAS = 3.0  # standard deviations of the predicted pixel: half size of the window
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
-_LEAST = 1e-6  # information on a member's point that has none yet [1/m²]
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
 
@@ -70,7 +69,7 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
     for body in bodies.values():
         mine = np.flatnonzero(tracks.body == body.id)
         tracks.position[mine], tracks.covariance[mine] = members_ahead(
-            tracks.local, tracks.local_information, mine, body.T, body.covariance, _LEAST
+            tracks.local, tracks.local_information, mine, body.T, body.covariance, LEAST_INFORMATION
         )
 
 

@@ -12,7 +12,7 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.tracks import Tracks, times_vectors
+from slam.objects.tracks import LEAST_INFORMATION, Tracks, times_vectors
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # poses tried for a body that is found again
@@ -20,7 +20,6 @@ _LEAST = 4  # points that fix a pose: three agree with it whatever they are
 _LEAST_ANEW = 4  # points that must agree where a body is found again
 _LEAST_PREDICTED = 2  # points that must agree with the predicted motion
 _FITS = 11.3  # χ²(3) at 99 %
-_WEAK = 1e-6  # information on a member's point that has none yet [1/m²]
 _DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
@@ -97,7 +96,7 @@ def _predicted(
     axes = R.T @ T_world_left[:3, :3]
     gaps = transform(inverse(body.T) @ T_world_left, local[deep]) - y
     noise = axes @ rig.triangulation_covariance(local[deep], sigma) @ axes.T
-    noise += np.linalg.inv(tracks.local_information[mine[deep]] + _WEAK * np.eye(3))
+    noise += np.linalg.inv(tracks.local_information[mine[deep]] + LEAST_INFORMATION * np.eye(3))
     information, J = np.linalg.inv(noise), -points_by_pose(y)
     spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
     agrees = _squares(gaps, np.linalg.inv(spread)) < _FITS

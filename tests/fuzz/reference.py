@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from slam.data import Observations
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
+from slam.runtime.blas import one_blas_thread
 
 Array = np.ndarray
 
@@ -111,6 +112,7 @@ class Reference:
         for i in ids.tolist():
             del self.known[i]
 
+    @one_blas_thread
     def solve(self) -> tuple[Array, Array, Array, Array]:
         """The newest pose (4, 4) and its covariance (6, 6), and those of the map's landmarks by ascending id."""
         T, X, J = np.array(self.poses), np.array(self.points).reshape(-1, 3), np.zeros((0, 0))

@@ -9,8 +9,10 @@ import pytest
 
 import backends
 from slam.data import Observations
+from slam.models import EstimatorModels
 from tests.fuzz import agreement
 from tests.fuzz.harness import Broken
+from tests.fuzz.reference import difference
 
 
 class Wrong:
@@ -45,3 +47,16 @@ def test_a_back_end_with_a_fault_is_noticed(fault):
 
 def test_the_same_without_the_fault_is_not():
     agreement.agree(np.random.default_rng(3), Wrong("none"), agreement.TOLERANCES["ekf"])
+
+
+def test_the_first_update_finds_the_most_likely_pose_where_the_velocity_is_hardly_known(monkeypatch):
+    monkeypatch.setattr(agreement, "MODELS", EstimatorModels())  # 1 m/s, 1 rad/s and 1 px
+    backend = backends.create("ekf", agreement.RIG, models=agreement.MODELS)
+    play = agreement.Play(np.random.default_rng([22, 6]), backend)
+    play.predict()
+    play.add(least=10)
+    play.predict()
+    play.update()
+    T, P, _, _ = play.reference.solve()
+    off = difference(T, backend.estimate().T_world_left)
+    assert off @ np.linalg.solve(P, off) < 6 * 0.3**2  # 0.6 with errors of one sign that each measurement permits

@@ -238,4 +238,4 @@ def test_the_aisle_gives_surf_what_paper_a_s_camera_gave(frame):
     counts = [len(Surf(threshold=t, octaves=2).detect(image)) for t in (0, 2550, 10000)]
     assert 600 < counts[0] < 1200
     assert 150 < counts[1] < 500
-    assert 20 < counts[2] < 100
+    assert 15 < counts[2] < 100  # the letters on the spines are OpenCV's, whose fonts changed in version 5
