@@ -65,9 +65,9 @@ RECORDING = (
     Option("width", 320, "image width [px]; the focal length grows with it", 64, 4096),
     Option("height", 240, "image height [px]", 48, 4096),
     Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
-    Option("focal_error", 0.0, "by what share the focal length that the system is told is too long", -0.2, 0.2),
+    Option("focal_error", 0.0, "relative error of the focal length in the calibration; positive: too long", -0.2, 0.2),
     Option(
-        "turn_error", 0.0, "turn of the right camera about each of its axes that the system is not told [mrad]", -50, 50
+        "turn_error", 0.0, "turn of the right camera about each of its axes that is not in the calibration [mrad]", -50, 50
     ),
 )
 

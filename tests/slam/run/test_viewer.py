@@ -57,12 +57,14 @@ def test_places_and_loops_are_shown(monkeypatch):
     monkeypatch.setattr("slam.run.viewer._rerun", lambda: shapes)
     monkeypatch.setattr("slam.run.viewer._open", lambda rr, target: recording)
     at = np.arange(12.0).reshape(4, 3)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, 3] = at
     atlas = SimpleNamespace(
-        positions=lambda: at, known=1, loops=(SimpleNamespace(first=0, second=3),), refused=((1, 2), (0, 2))
+        poses_in_map=lambda: poses, known=1, loops=(SimpleNamespace(first=0, second=3),), refused=((1, 2), (0, 2))
     )
     with Viewer("live") as viewer:
         viewer._draw_places(SimpleNamespace(atlas=atlas))
-    assert logged["world/places/keyframes"] is at
+    np.testing.assert_array_equal(logged["world/places/keyframes"], at)
     np.testing.assert_array_equal(logged["world/places/path"], [at[1:]])
     np.testing.assert_array_equal(logged["world/places/loops_closed"], at[[[0, 3]]])
     np.testing.assert_array_equal(logged["world/places/loops_refused"], at[[[1, 2], [0, 2]]])
