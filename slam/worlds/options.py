@@ -67,7 +67,11 @@ RECORDING = (
     Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
     Option("focal_error", 0.0, "relative error of the focal length in the calibration; positive: too long", -0.2, 0.2),
     Option(
-        "turn_error", 0.0, "turn of the right camera about each of its axes that is not in the calibration [mrad]", -50, 50
+        "turn_error",
+        0.0,
+        "turn of the right camera about each of its axes that is not in the calibration [mrad]",
+        -50,
+        50,
     ),
 )
 
