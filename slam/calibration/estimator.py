@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
-from slam.calibration.evidence import Accumulator, Evidence
+from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence
 from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
@@ -193,10 +193,13 @@ class SelfCalibration:
             self._open, self._frames, self._solved = None, 0, 0
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
-    def evidence(self) -> Evidence | None:
+    def evidence(self) -> RecordingEvidence | None:
         """What this recording alone says, without any prior; None where no motion was seen."""
-        parts = self._parts()
-        return sum(parts[1:], parts[0]) if self.pairs or self._open is not None else None
+        if not self.pairs and self._open is None:
+            return None
+        rows, *motion = self._parts()
+        moved = sum(motion[1:], motion[0])
+        return RecordingEvidence(rows + moved, moved)
 
     def _parts(self) -> list[Evidence]:
         """What rows and motion say, and the pair that is not complete."""
@@ -244,10 +247,12 @@ class SelfCalibration:
         """Bayes' rule with what all pairs of views and all rows so far say."""
         for part in (self._rows, self._motion):
             part.judge(self._solution.mean, self._solution.inner)
-        evidence = self._parts()
+        found = self.evidence()
+        assert found is not None  # as there are pairs
         if self._kept:
-            evidence = [sum(evidence[1:], evidence[0]).with_error(self._systematic)]
-        self._solution = solve(self._prior, residual_variance(), evidence)
+            self._solution = solve(self._prior, residual_variance(), [found.whole.with_error(self._systematic)])
+        else:
+            self._solution = solve(self._prior, residual_variance(), [found.motion], [found.whole])
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

@@ -42,6 +42,22 @@ class Evidence(NamedTuple):
         return Evidence(*(a + b for a, b in zip(self, other)))
 
 
+class RecordingEvidence(NamedTuple):
+    """What one recording says, without any prior.
+
+    Attributes:
+        whole: by its rows and its motion.
+        motion: by its motion alone, which says how large the calibration's errors are: rows have errors of their own.
+    """
+
+    whole: Evidence
+    motion: Evidence
+
+    def scaled(self, factor: float) -> RecordingEvidence:
+        """The same with `factor` times the information."""
+        return RecordingEvidence(self.whole.scaled(factor), self.motion.scaled(factor))
+
+
 class Accumulator:
     """The sum of many likelihoods whose errors may be correlated over time.
 

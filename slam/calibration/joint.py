@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.calibration.evidence import Evidence
+from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior, solve
@@ -21,11 +21,12 @@ _SAYS = 1.0  # of the prior's information on a parameter: a recording that adds 
 _DIFFERS = 3.0  # and do not where by more than so many; between the two, chance may do it in one of 21 parameters
 
 
-def joint_calibration(model: RigModel, evidence: Sequence[Evidence], systematic: float) -> KeptCalibration:
+def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> KeptCalibration:
     """What recordings say of the rig that they share.
 
     Each recording has a systematic error of its own, that does not average out within it but does over recordings: what
-    it says is off by that. One alone has its error added in the end, as in its own run.
+    it says is off by that. One alone has its error added in the end, and how large the calibration's errors are follows
+    from its motion, as in its own run.
 
     Args:
         model: the parameters' meaning.
@@ -38,8 +39,9 @@ def joint_calibration(model: RigModel, evidence: Sequence[Evidence], systematic:
     if not evidence:
         raise CalibrationError("calibration: in no recording was there a motion that shows the rig's errors")
     variance, alone = systematic_variance(model, systematic), len(evidence) == 1
-    known = None if alone else [part.with_error(variance) for part in evidence]
-    solution = solve(as_delivered(model), residual_variance(), evidence, known)
+    known = [part.whole if alone else part.whole.with_error(variance) for part in evidence]
+    scaled_by = [part.motion if alone else part.whole for part in evidence]
+    solution = solve(as_delivered(model), residual_variance(), scaled_by, known)
     covariance = solution.covariance + (np.diag(variance) if alone else 0.0)
     posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
     return KeptCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
@@ -77,7 +79,7 @@ class Agreement:
         return f"The recordings do not agree in {', '.join(differing)}: {least}. Is it one rig, and has it not changed?"
 
 
-def agreement(model: RigModel, evidence: Sequence[Evidence], systematic: float) -> Agreement | None:
+def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Agreement | None:
     """Differences of each two recordings; None of one alone.
 
     What they share, the prior, is no evidence of agreement. So the prior is taken away from each parameter's marginal
@@ -94,8 +96,8 @@ def agreement(model: RigModel, evidence: Sequence[Evidence], systematic: float) 
     prior, variance = as_delivered(model).covariances[-1], systematic_variance(model, systematic)
     before = 1 / np.diag(prior)
     means, informations = [], []
-    for part in evidence:
-        part = part.with_error(variance)
+    for recording in evidence:
+        part = recording.whole.with_error(variance)
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
         moved = covariance @ part.cross
         after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))

@@ -102,8 +102,8 @@ def solve(
     Args:
         prior: of the parameters.
         residual: variance of the residual fields' coefficients.
-        evidence: of the data.
-        known: the same with each recording's own error in it; the prior's scales follow from `evidence` all the same.
+        evidence: of the data, from which the prior's scales follow.
+        known: what the parameters follow from; None where that is the same.
     """
     whole, covariances, steps, logs = _by_scale(prior, evidence)
     weights = np.exp(logs - logs.max())

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam.calibration import KeptCalibration, RigModel, RigPosterior
 from slam.calibration.corrected import corrected_rig
-from slam.calibration.evidence import Evidence
+from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.joint import Agreement, agreement, joint_calibration
 from slam.calibration.kept import RigNumbers
 from slam.config import SystemConfig
@@ -82,7 +82,7 @@ class Found:
     frames: int
     pairs: int
     posterior: RigPosterior
-    evidence: Evidence | None
+    evidence: RecordingEvidence | None
 
 
 @dataclass(frozen=True)

@@ -113,8 +113,12 @@ def test_one_recording_jointly_is_that_recording(first):
 def test_recordings_together_are_surer_and_agree(first):
     drives = [first, *(drive(TURNED, seed=seed, frames=20) for seed in (2, 3))]
     joint = joint_calibration(first.model, [d.evidence() for d in drives], first.config.systematic).posterior
+    posteriors = [d.posterior for d in drives]
     assert np.abs((joint.mean - TURNED) / joint.sigma).max() < 3
-    assert np.linalg.slogdet(joint.covariance)[1] < min(np.linalg.slogdet(d.posterior.covariance)[1] for d in drives)
+    far = first.model.far()
+    pixels = np.concatenate([first.model.field(far)[:, 2], first.model.vertical(far)])
+    together, *alone = (np.einsum("ni,ij,nj->", pixels, p.covariance, pixels) for p in (joint, *posteriors))
+    assert together < 0.7 * min(alone)  # of what pixels of far points are off by
     found = agreement(first.model, [d.evidence() for d in drives], first.config.systematic)
     assert found.words.startswith("The recordings agree") and found.largest.shape == joint.mean.shape
     assert np.nanmax(found.largest) < 3
