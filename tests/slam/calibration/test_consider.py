@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.calibration import RigModel, RigUncertainty, SelfCalibrationConfig
+from slam.calibration import RigModel, SelfCalibrationConfig
+from slam.calibration.consider import RigUncertainty
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
@@ -60,7 +61,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size, share):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system._uncertainty._pose[:, : len(delta)] @ delta
+    predicted = system._rig_error.uncertainty._pose[:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < share * np.linalg.norm(actual)
 
@@ -75,7 +76,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
         features, ids = cloud.features(T, k / 30)
         result = system.process_features(with_error(features, delta))
         points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
-    marks = system._uncertainty._landmarks
+    marks = system._rig_error.uncertainty._landmarks
     estimated = system.backend.positions(marks.ids)
     actual = cloud.points[[points[i] for i in marks.ids.tolist()]] - estimated
     predicted = marks.by_rig[:, :, : len(delta)] @ delta
