@@ -235,7 +235,7 @@ class StereoSlam:
         index, stages = self._last.index + 1, self._stages
         if self._relocalizer.search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
-            return self._relocalizer.search.lost(index, features)
+            return self._relocalizer.search.lost(index, replace(features, images=None))
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
             prediction = self.backend.predict(features.stamp)
