@@ -123,7 +123,7 @@ class Aligner:
         similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
         left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
         left, right = frontend.align(features.images, matched.patches, warps, left, right)
-        found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | (features.images.right is None))
+        found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | ~features.has_stereo[rows])
         uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
         uv_left[rows[found]] = rectified.unrectify_left(left[found])
         uv_right[rows[found]] = rectified.unrectify_right(right[found])
