@@ -9,13 +9,13 @@ from typing import overload
 import numpy as np
 
 from slam import registry
-from slam.calibration import KeptCalibration, Revision, RigCorrection, RigUncertainty, SelfCalibration
+from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfCalibration
 from slam.config import SystemConfig
-from slam.data import CommonError, Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
+from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import AligningFrontend, Backend, Frontend, RevisingBackend
+from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.loop_closer import LoopCloser
@@ -29,14 +29,11 @@ from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.showing import count
-from slam.tracking.alignment import Aligned, Anchors, align, anchored
+from slam.tracking.alignment import Aligner, Anchors
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.state import TrackingState
-
-#: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
-_REVISION = 0.5
 
 #: How far from its row a front end looks for a feature's partner, where it does not say [px].
 _ROWS = 1.5
@@ -128,8 +125,9 @@ class StereoSlam:
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if known_map is None else known_map.world_frame
-        self._uncertainty = RigUncertainty(self.calibration.model, c.models.pixel_sigma)
+        self._rig_error = RemainingRigError(self.calibration, c.models.pixel_sigma)
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
+        self._aligner = Aligner(rig, c.association.align)
         self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
         self.atlas = Atlas()
         self._loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
@@ -140,8 +138,6 @@ class StereoSlam:
         self._input_warnings = InputWarnings(rig, c.models, rows)
         self._stepping, self._extracting = OneThread("this system"), OneThread("this system's front end")
         self._stamp = -np.inf  # that the back end was last advanced to [s]
-        self._given = self.calibration.applied  # the correction of all that the back end was given
-        self._accounted = self.calibration.applied  # the correction whose remains in the path are in the covariance
         if known_map is not None:
             known_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(known_map, self.backend)
@@ -239,7 +235,7 @@ class StereoSlam:
         index, stages = self._last.index + 1, self._stages
         if self._relocalizer.search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
-            return self._relocalizer.search.lost(index, features)
+            return self._relocalizer.search.lost(index, replace(features, images=None))
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
             prediction = self.backend.predict(features.stamp)
@@ -248,7 +244,8 @@ class StereoSlam:
             raw, features = features, self.calibration.correct(features)
             landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
-            aligned = self._align(raw, matches, landmarks)
+            anchors, places = self._last.anchors, self.backend.positions
+            aligned = self._aligner.align(self.frontend, anchors, raw, matches, landmarks, places)
             raw = replace(aligned.features, images=None)
             features = self.calibration.correct(raw)
             held = self.objects.suspects
@@ -262,42 +259,29 @@ class StereoSlam:
             self.calibration.observe(raw, pose)
         with stages.stage("estimate"):
             estimate = self.backend.estimate(landmarks=False)
-            self._uncertainty.observe(estimate.T_world_left, report.used, self.backend.positions(report.used))
+            used = report.used
+            self._rig_error.uncertainty.observe(estimate.T_world_left, used, self.backend.positions(used))
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(index, features, prediction, matches, held, held_rows, spared, report, state, estimate, labels)
             change = self._mapper.update(self.backend, landmarks, step)
-            anchors = self._anchored(aligned, matches, change.added, estimate.T_world_left)
+            T = estimate.T_world_left
+            anchors = self._aligner.anchored(self.frontend, aligned, matches, change.added, T)
             new = np.setdiff1d(change.added.ids, change.erased)
-            self._uncertainty.change(new, self.backend.positions(new), change.erased)
+            self._rig_error.uncertainty.change(new, self.backend.positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
-            step = replace(step, estimate=self._considered(estimate), common=self._common_error(self._accounted))
+            estimate = self._rig_error.added_to(estimate)
+            step = replace(step, estimate=estimate, common=self._rig_error.common(as_given=False))
             atlas, change = self._close_loops(step, change)
-        common = self._common_error(self.calibration.applied)
+        common = self._rig_error.common(as_given=True)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
             self._last.after(step, change, anchors), change.landmarks, atlas, Stages(),
         )  # fmt: skip
         return result
-
-    def _align(self, raw: StereoFeatures, matches: LandmarkMatches, landmarks: LandmarkRows) -> Aligned:
-        """Features as measured, those of landmarks where these were seen first, if the front end can do that."""
-        if not self.config.association.align or not isinstance(self.frontend, AligningFrontend):
-            return Aligned(raw, Anchors.none())
-        positions = self.backend.positions(landmarks.ids)
-        return align(self.frontend, self.rig, self._last.anchors, raw, matches, landmarks, positions)
-
-    def _anchored(
-        self, aligned: Aligned, matches: LandmarkMatches, added: LandmarkMatches, T_world_left: np.ndarray
-    ) -> Anchors:
-        """What landmarks looked like at first sight, with those of this frame."""
-        if not self.config.association.align or not isinstance(self.frontend, AligningFrontend):
-            return aligned.anchors
-        seen = LandmarkMatches(np.concatenate([matches.ids, added.ids]), np.concatenate([matches.rows, added.rows]))
-        return anchored(self.frontend, self.rig, aligned.anchors, aligned.features, seen, T_world_left)
 
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
         """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""
@@ -306,8 +290,7 @@ class StereoSlam:
         if seen_again is not None:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
-            self._uncertainty.change(back[:0], np.zeros((0, 3)), back)  # what they were before counts no more
-            self._uncertainty.change(back, self.backend.positions(back), back[:0])
+            self._rig_error.uncertainty.see_anew(back, self.backend.positions(back))
         return atlas, change
 
     def roll_back(self) -> None:
@@ -327,7 +310,7 @@ class StereoSlam:
             self.objects.restart()
         if stage not in (None, "predict"):
             self.landmarks = self._mapper.reconcile(self.backend, self.landmarks)
-            self._uncertainty.keep(np.zeros(0, np.int64) if self.landmarks is None else self.landmarks.ids)
+            self._rig_error.uncertainty.keep(np.zeros(0, np.int64) if self.landmarks is None else self.landmarks.ids)
         self._stages = Stages()
 
     @one_blas_thread
@@ -351,7 +334,8 @@ class StereoSlam:
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
-        return self.atlas.estimate(self._considered(self.backend.estimate()), self._common_error(self._accounted))
+        estimate = self._rig_error.added_to(self.backend.estimate())
+        return self.atlas.estimate(estimate, self._rig_error.common(as_given=False))
 
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.
@@ -385,45 +369,12 @@ class StereoSlam:
         """Indices of the frames in which another back end took over, as the camera had been kidnapped."""
         return self._relocalizer.restarted
 
-    def _considered(self, estimate: Estimate) -> Estimate:
-        """The back end's estimate with the rig's uncertainty, which it knows nothing of."""
-        if not self.calibration.config.enabled:
-            return estimate
-        return self._uncertainty.added_to(estimate, self.calibration.posterior.covariance)
-
-    def _common_error(self, made_with: RigCorrection) -> CommonError:
-        """The part of the pose's error that it shares with those of other frames.
-
-        Args:
-            made_with: the correction that the poses were made with: `_accounted` for the path as it is now, in which a
-                back end may have revised earlier poses; the applied one for poses as they were given.
-        """
-        if not self.calibration.config.enabled:
-            return CommonError()
-        covariance = self.calibration.posterior.covariance
-        return CommonError(*self._uncertainty.shared(covariance, made_with.parameters))
-
     def _revise(self) -> Revision | None:
-        """Apply what has become known of the rig's error, also to what a back end was given before, if it can do that.
-
-        As all its measurements are then weighed anew, that waits for a change that is significant.
-        """
-        revising = isinstance(self.backend, RevisingBackend)
-        change = self.calibration.apply(_REVISION if revising else 0.0)
+        """Apply what has become known of the rig's error, also to what was given before, if the back end can."""
+        change = self._rig_error.apply(self.backend)
         if change is not None:
             self.objects.revise(change.rows)
-        applied = self.calibration.applied
-        if not (isinstance(self.backend, RevisingBackend) and self.backend.revises_path):
-            step = applied.parameters - self._accounted.parameters
-            if step.any():
-                self._uncertainty.path_keeps(step, self.backend.positions, landmarks_follow=revising)
-                self._accounted = applied
-        if not isinstance(self.backend, RevisingBackend) or self.calibration.applied is self._given:
-            return None
-        revision = Revision(self._given, self.calibration.applied)
-        self.backend.revise(revision.rows)
-        self._given = revision.after
-        return revision
+        return self._rig_error.revise(self.backend)
 
     def _locate(self, features: StereoFeatures, index: int) -> bool:
         """Look for the camera in the map that the system was started with; where it is found, the back end starts."""
@@ -441,7 +392,7 @@ class StereoSlam:
         landmarks = self.landmarks
         if found is not None:
             landmarks = self._mapper.insert(new, search.known.rows, found.place)
-        self.landmarks, self.backend, self._given, self._relocalizer.search = (
+        self.landmarks, self.backend, self._rig_error.given, self._relocalizer.search = (
             landmarks, new, self.calibration.applied, None,
         )  # fmt: skip
         return True
@@ -467,7 +418,7 @@ class StereoSlam:
             landmarks = self._mapper.insert(new, landmarks, found.place)
             positions = new.positions(landmarks.ids)
         prediction, r = new.predict(features.stamp), self._relocalizer
-        self.backend, self._given, r.past, r.restarted = (
+        self.backend, self._rig_error.given, r.past, r.restarted = (
             new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
         self.objects.restart()

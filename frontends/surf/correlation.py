@@ -183,9 +183,9 @@ def cut_patches(image: NDArray[np.float32], uv: NDArray[np.float64]) -> tuple[ND
     """The image (H, W) around pixels (N, 2).
 
     Returns:
-        patches (N, S, S), NaN beyond the image, and the pixels in them (N, 2).
+        patches (N, S, S), NaN beyond the image and where a pixel is not finite, and the pixels in them (N, 2).
     """
-    whole = np.floor(uv).astype(np.intp)
+    whole = np.floor(np.where(np.isfinite(uv), uv, -2.0 * _MARGIN)).astype(np.intp)
     offsets = np.arange(-_MARGIN, _MARGIN + 1)
     x, y = whole[:, 0, None] + offsets, whole[:, 1, None] + offsets
     height, width = image.shape
@@ -214,7 +214,7 @@ def align_patches(
         centres: the pixels in them (N, 2), see `cut_patches`.
         warps: matrices (N, 2, 2) that take offsets in the image to offsets in the patch.
         size: of the features (N,) [px]; large ones are compared in large patches.
-        start: first guess of the pixels (N, 2).
+        start: first guess of the pixels (N, 2); nothing is found where it is outside of the image, or NaN.
         min_correlation: least normalised correlation.
         reach: largest shift along and across the rows [px].
         windows: see `patch_windows`.
@@ -235,6 +235,8 @@ def _align_patches(
 ):  # fmt: skip
     """The same into `out`, on a flat image and with work space."""
     for i in range(len(start)):
+        if not (0.0 <= start[i, 0] < shape[1] and 0.0 <= start[i, 1] < shape[0]):
+            continue
         k = 0 if size[i] < 24.0 else 1
         half = 7 if k == 0 else 11
         rows, lanes = 2 * half + 1, 2 * half + 2

@@ -117,6 +117,11 @@ class RigUncertainty:
         )
         self._landmarks = both.select(np.argsort(both.ids, kind="stable"))
 
+    def see_anew(self, ids: IdArray, positions: Array) -> None:
+        """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones: what they were before counts no more."""
+        self.change(ids[:0], positions[:0], ids)
+        self.change(ids, positions, ids[:0])
+
     def keep(self, ids: IdArray) -> None:
         """Forget all landmarks but these (M,)."""
         self._landmarks = self._landmarks.select(np.isin(self._landmarks.ids, ids))

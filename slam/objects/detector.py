@@ -6,7 +6,6 @@ becomes a landmark; `update` gives the bodies' observations to the back end and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -31,13 +30,13 @@ from slam.objects.bodies import (
 )
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
 from slam.objects.config import ObjectsConfig
-from slam.objects.displacements import displacements
+from slam.objects.displacements import LAG, displacements, known_well
 from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
-from slam.objects.parts import parts_of
+from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
-from slam.objects.regions import classify_scene, limit
+from slam.objects.regions import classify_scene
 from slam.objects.revision import Mend, revise_tracks
 from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
 from slam.objects.twists import fit_twist
@@ -46,8 +45,6 @@ _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _SETTLED = 30  # frames from which a body is remembered in any case
-_FARTHEST = 4.0  # a track's depth must be so many times its deviation
-_LAG = 4  # frames between the older and the recent measurements, about
 
 
 class MovingObjectDetector:
@@ -183,11 +180,12 @@ class MovingObjectDetector:
         """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        rows, place = self._judged(tracks, np.flatnonzero(tracks.seen & (tracks.body < 0)), T_world_left)
+        free = np.flatnonzero(tracks.seen & (tracks.body < 0))
+        rows, place = known_well(tracks, free, T_world_left, c.min_frames)
         ages = (self.slot - np.arange(c.window)) % c.window
         moved = displacements(tracks, rows, ages, T_world_left[:3, 3])
         scene = classify_scene(moved, place, c.suspect, c.min_support)
-        parts = self._parts(tracks, ages, T_world_left)
+        parts = moving_parts(self.bodies, tracks, ages, T_world_left, self._dt(times), c)
         tracks.doubtful[:] = False
         tracks.doubtful[rows] = scene.alone > c.doubtful
         alike = np.zeros(len(tracks), bool)
@@ -196,8 +194,7 @@ class MovingObjectDetector:
             members = rows[group.members]
             tracks.doubtful[members] = True
             suspects.append(tracks.landmark[members])
-            far = group.away > _LAG * self._dt(times) * c.min_speed
-            alike[members] = far and group.test > limit(c.group_test, len(members))
+            alike[members] = group.moves(c.group_test, LAG * self._dt(times) * c.min_speed)
         for _, members in parts:
             alike[members] = True
         fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
@@ -211,33 +208,6 @@ class MovingObjectDetector:
                 self._perhaps_found(members[tracks.streak[members] > 0], times, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
-
-    def _judged(
-        self, tracks: Tracks, rows: NDArray[np.intp], T_world_left: Array
-    ) -> tuple[NDArray[np.intp], Array]:  # fmt: skip
-        """Those of the tracks that are known well enough to be judged, and where they are seen: x/z, y/z, log z."""
-        rows = rows[tracks.count(rows) >= self.config.min_frames]
-        local = transform(inverse(T_world_left), tracks.position[rows])
-        deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
-        near = local[:, 2] > _FARTHEST * deviation
-        return rows[near], np.column_stack([local[near, :2] / local[near, 2:], np.log(local[near, 2])])
-
-    def _parts(
-        self, tracks: Tracks, ages: NDArray[np.intp], T_world_left: Array
-    ) -> list[tuple[int | None, NDArray[np.intp]]]:  # fmt: skip
-        """Groups of tracks on known bodies that move otherwise than these: ids of the bodies, and the groups' rows."""
-        c = self.config
-        found: list[tuple[int | None, NDArray[np.intp]]] = []
-        dt = self._dt(self._stamps - self._stamps[self.slot])
-        for body in self.bodies.values():
-            if not (body.measured and body.proved):
-                continue
-            rows, place = self._judged(tracks, membership.tracks_on(body, tracks, c.margin), T_world_left)
-            for group in parts_of(body, tracks, rows, ages, place, c.suspect, c.min_support):
-                members = rows[group.members]
-                if group.away > _LAG * dt * c.min_speed and group.test > limit(c.group_test, len(members)):
-                    found.append((body.id, members))
-        return found
 
     def _perhaps_found(self, members: NDArray[np.intp], times: Array, whole: int | None = None) -> None:
         """Make a body of tracks that have moved alike for long enough, if they lie together.
@@ -298,7 +268,8 @@ class MovingObjectDetector:
         body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
         body = membership.fitted(body, tracks, members, self.slot)
         others = {id: other for id, other in self.bodies.items() if id != whole}
-        known = membership.overlapped(others, tracks, members, body) or self._whole(members, others)
+        known = membership.overlapped(others, tracks, members, body)
+        known = known or membership.whole_of(others, tracks, members)
         if known is None:
             body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
             self.bodies[body.id] = body
@@ -306,16 +277,6 @@ class MovingObjectDetector:
         else:
             body = self.bodies[known.id] = membership.reaching(known, tracks, members)
         membership.enter(body, tracks, members, sure=True)
-
-    def _whole(self, members: NDArray[np.intp], bodies: Mapping[int, Body]) -> Body | None:
-        """The measured body of which tracks are a part, if it has more of them."""
-        tracks = self.tracks
-        assert tracks is not None
-        for body in bodies.values():
-            seen = int((tracks.seen & (tracks.body == body.id)).sum())
-            if body.measured and seen >= len(members) and membership.part_of(body, tracks, members):
-                return body
-        return None
 
     def _again(self, body: Body, whole: int | None) -> Body:
         """A new body, or in its place the one out of view that it is: that keeps its id, but not its points.

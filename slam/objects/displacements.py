@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks
 
 RECENT = 5  #: frames that are recent, at most
+LAG = 4  #: frames between the older and the recent measurements, about
+_FARTHEST = 4.0  # a track's depth must be so many times its deviation
 
 
 @dataclass(frozen=True)
@@ -46,3 +48,24 @@ def displacements(tracks: Tracks, rows: NDArray[np.intp], ages: NDArray[np.intp]
     t = tracks
     d, W, lag = displaced(t.A, t.p, t.dof, t.older_A, t.older_b, t.older_age, rows, ages, RECENT)
     return Displacements(t.position[rows] - camera, d, W, lag)
+
+
+def known_well(
+    tracks: Tracks, rows: NDArray[np.intp], T_world_left: Array, min_frames: int
+) -> tuple[NDArray[np.intp], Array]:
+    """Those of the tracks that were seen in enough frames and whose depth is known, and where they are seen.
+
+    Args:
+        tracks: all tracks.
+        rows: some of them.
+        T_world_left: the camera's pose (4, 4).
+        min_frames: in which a track must have been seen.
+
+    Returns:
+        rows (K,), and x/z, y/z, log z of each (K, 3).
+    """
+    rows = rows[tracks.count(rows) >= min_frames]
+    local = transform(inverse(T_world_left), tracks.position[rows])
+    deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
+    near = local[:, 2] > _FARTHEST * deviation
+    return rows[near], np.column_stack([local[near, :2] / local[near, 2:], np.log(local[near, 2])])

@@ -321,6 +321,15 @@ def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
+def whole_of(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp]) -> Body | None:
+    """The measured body of which tracks are a part, if it has more of them that are seen; else None."""
+    for body in bodies.values():
+        seen = int((tracks.seen & (tracks.body == body.id)).sum())
+        if body.measured and seen >= len(rows) and part_of(body, tracks, rows):
+            return body
+    return None
+
+
 def proved(body: Body, gain: Array) -> Body | None:
     """The body, known to have moved once its members say so; None where they say that it stands still and always did.
 

@@ -7,14 +7,44 @@ Without it a part's tracks join the body before anything is known of them, leave
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.objects import membership
 from slam.objects.bodies import Body, in_body_axes
-from slam.objects.displacements import RECENT, Displacements
+from slam.objects.config import ObjectsConfig
+from slam.objects.displacements import LAG, RECENT, Displacements, known_well
 from slam.objects.regions import Group, classify_scene
 from slam.objects.track_kernels import displaced
 from slam.objects.tracks import Tracks
+
+
+def moving_parts(
+    bodies: Mapping[int, Body], tracks: Tracks, ages: NDArray[np.intp], T_world_left: NDArray, dt: float,
+    config: ObjectsConfig,
+) -> list[tuple[int, NDArray[np.intp]]]:  # fmt: skip
+    """Groups of tracks on known bodies that move otherwise than these: ids of the bodies, and the groups' rows.
+
+    Args:
+        bodies: all bodies, by id.
+        tracks: all tracks.
+        ages: of the window's slots in frames (W,).
+        T_world_left: the camera's pose (4, 4).
+        dt: time between frames [s].
+        config: settings.
+    """
+    found = []
+    for body in bodies.values():
+        if not (body.measured and body.proved):
+            continue
+        on = membership.tracks_on(body, tracks, config.margin)
+        rows, place = known_well(tracks, on, T_world_left, config.min_frames)
+        for group in parts_of(body, tracks, rows, ages, place, config.suspect, config.min_support):
+            if group.moves(config.group_test, LAG * dt * config.min_speed):
+                found.append((body.id, rows[group.members]))
+    return found
 
 
 def parts_of(

@@ -55,6 +55,10 @@ class Group:
     test: float
     away: float
 
+    def moves(self, test: float, away: float) -> bool:
+        """Whether it went farther than `away` [m] and moved for certain: by a χ²(6) above `limit` of `test`."""
+        return bool(self.away > away and self.test > limit(test, len(self.members)))
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -7,6 +7,7 @@ taken anew where the view has changed by much, or where it fits no more.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
-from slam.interfaces import AligningFrontend, Patches
+from slam.interfaces import AligningFrontend, Frontend, Patches
 from slam.landmarks import LandmarkRows
 from slam.tracking.localizer import LandmarkMatches
 
@@ -78,62 +79,86 @@ class Aligned:
     anchors: Anchors
 
 
-def align(
-    frontend: AligningFrontend,
-    rig: StereoRig,
-    anchors: Anchors,
-    features: StereoFeatures,
-    matches: LandmarkMatches,
-    landmarks: LandmarkRows,
-    positions: Array,
-) -> Aligned:
-    """Move the features of landmarks to where the landmarks' patches are; without a patch they stay.
+class Aligner:
+    """Moves features of landmarks to where the landmarks were seen first, where the front end can do that.
 
     Args:
-        frontend: that the features are from.
         rig: the cameras.
-        anchors: of the landmarks.
-        features: of the frame, as measured.
-        matches: landmarks that were found, and the pose on which they agree; without one nothing is aligned.
-        landmarks: the map.
-        positions: of its landmarks (N, 3) in the world.
+        enabled: see `slam.tracking.association.AssociationConfig.align`; else features stay.
     """
-    anchors = anchors.known(landmarks)
-    known, order = np.isin(anchors.ids, matches.ids), np.isin(matches.ids, anchors.ids)
-    if matches.T_world_left is None or features.images is None or not known.any():
-        return Aligned(features, anchors)
-    rows, matched = matches.rows[order], anchors.select(known)  # both by ascending id
-    rectified, T = rig.rectified, matches.T_world_left
-    warps = warps_of(rectified, matched.poses, T, positions[landmarks.rows(matched.ids)])
-    growth = np.sqrt(np.abs(np.linalg.det(warps)))
-    similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
-    left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-    left, right = frontend.align(features.images, matched.patches, warps, left, right)
-    found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | (features.images.right is None))
-    uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
-    uv_left[rows[found]] = rectified.unrectify_left(left[found])
-    uv_right[rows[found]] = rectified.unrectify_right(right[found])
-    return Aligned(
-        replace(features, uv_left=uv_left, uv_right=uv_right),
-        anchors.select(~np.isin(anchors.ids, matched.ids[~found])),
-    )
 
+    def __init__(self, rig: StereoRig, enabled: bool) -> None:
+        self._rig = rig
+        self._enabled = enabled
 
-def anchored(
-    frontend: AligningFrontend,
-    rig: StereoRig,
-    anchors: Anchors,
-    features: StereoFeatures,
-    seen: LandmarkMatches,
-    T_world_left: Array,
-) -> Anchors:
-    """Anchors and those of the landmarks `seen` that have none, from a frame's features, as measured, and its pose."""
-    rows = np.flatnonzero(~np.isin(seen.ids, anchors.ids))
-    if features.images is None or not len(rows):
-        return anchors
-    uv = rig.rectified.rectify_left(features.uv_left[seen.rows[rows]])
-    patches = frontend.patches(features.images, uv, features.scale[seen.rows[rows]])
-    return anchors.with_new(seen.ids[rows], patches, T_world_left)
+    def align(
+        self,
+        frontend: Frontend | None,
+        anchors: Anchors,
+        features: StereoFeatures,
+        matches: LandmarkMatches,
+        landmarks: LandmarkRows,
+        positions: Callable[[IdArray], Array],
+    ) -> Aligned:
+        """Move the features of landmarks to where the landmarks' patches are; without a patch they stay.
+
+        Args:
+            frontend: that the features are from.
+            anchors: of the landmarks.
+            features: of the frame, as measured.
+            matches: landmarks that were found, and the pose on which they agree; without one nothing is aligned.
+            landmarks: the map.
+            positions: gives the positions (M, 3) in the world of landmarks by their ids (M,).
+        """
+        if not self._enabled or not isinstance(frontend, AligningFrontend):
+            return Aligned(features, Anchors.none())
+        anchors = anchors.known(landmarks)
+        known, order = np.isin(anchors.ids, matches.ids), np.isin(matches.ids, anchors.ids)
+        if matches.T_world_left is None or features.images is None or not known.any():
+            return Aligned(features, anchors)
+        rows, matched = matches.rows[order], anchors.select(known)  # both by ascending id
+        rectified = self._rig.rectified
+        warps = warps_of(rectified, matched.poses, matches.T_world_left, positions(matched.ids))
+        growth = np.sqrt(np.abs(np.linalg.det(warps)))
+        similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
+        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+        left, right = frontend.align(features.images, matched.patches, warps, left, right)
+        found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | ~features.has_stereo[rows])
+        uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
+        uv_left[rows[found]] = rectified.unrectify_left(left[found])
+        uv_right[rows[found]] = rectified.unrectify_right(right[found])
+        return Aligned(
+            replace(features, uv_left=uv_left, uv_right=uv_right),
+            anchors.select(~np.isin(anchors.ids, matched.ids[~found])),
+        )
+
+    def anchored(
+        self,
+        frontend: Frontend | None,
+        aligned: Aligned,
+        matches: LandmarkMatches,
+        added: LandmarkMatches,
+        T_world_left: Array,
+    ) -> Anchors:
+        """The anchors that hold after a frame, with new ones for its landmarks that have none.
+
+        Args:
+            frontend: that the features are from.
+            aligned: the frame.
+            matches: landmarks that were found in it.
+            added: those that are new.
+            T_world_left: its pose (4, 4).
+        """
+        anchors, features = aligned.anchors, aligned.features
+        if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
+            return anchors
+        ids, rows = np.concatenate([matches.ids, added.ids]), np.concatenate([matches.rows, added.rows])
+        new = ~np.isin(ids, anchors.ids)
+        if not new.any():
+            return anchors
+        uv = self._rig.rectified.rectify_left(features.uv_left[rows[new]])
+        patches = frontend.patches(features.images, uv, features.scale[rows[new]])
+        return anchors.with_new(ids[new], patches, T_world_left)
 
 
 def warps_of(rectified: RectifiedRig, poses: Array, T_world_left: Array, positions: Array) -> Array:

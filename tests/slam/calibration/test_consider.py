@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.calibration import RigModel, RigUncertainty, SelfCalibrationConfig
+from slam.calibration import RigModel, SelfCalibrationConfig
+from slam.calibration.consider import RigUncertainty
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.geometry.se3 import inverse, log
@@ -60,7 +61,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size, share):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system._uncertainty._pose[:, : len(delta)] @ delta
+    predicted = system._rig_error.uncertainty._pose[:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < share * np.linalg.norm(actual)
 
@@ -75,7 +76,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
         features, ids = cloud.features(T, k / 30)
         result = system.process_features(with_error(features, delta))
         points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
-    marks = system._uncertainty._landmarks
+    marks = system._rig_error.uncertainty._landmarks
     estimated = system.backend.positions(marks.ids)
     actual = cloud.points[[points[i] for i in marks.ids.tolist()]] - estimated
     predicted = marks.by_rig[:, :, : len(delta)] @ delta
@@ -108,6 +109,22 @@ def test_a_result_says_what_its_error_shares_with_other_frames(backend):
     apart = result.estimate.covariance - result.common.covariance
     np.testing.assert_allclose(apart, system.backend.estimate(landmarks=False).covariance, rtol=1e-6, atol=1e-12)
     assert np.trace(result.common.covariance) > 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(backend):
+    system, cloud, truth = StereoSlam(RIG, None, backend, config=CONFIG), Cloud(150), path(5)
+    for k, T in enumerate(truth):
+        if k == 4:
+            known = system.calibration._solution
+            mean = error_of("yaw", 1e-3)
+            system.calibration._solution = replace(known, mean=mean, inner=1e-4 * known.inner)
+            system.calibration._motion_agrees = lambda: True
+        result = system.process_features(cloud.features(T, k / 30)[0])
+    assert result.revision is not None
+    np.testing.assert_array_equal(result.common.known[:-2], mean)
+    in_path = system._rig_error.common(as_given=False).known[:-2]
+    np.testing.assert_array_equal(in_path, 0 * mean if system.backend.revises_path else mean)
 
 
 def test_a_known_error_stays_in_a_path_that_is_not_revised():

@@ -9,12 +9,13 @@ import pytest
 
 import slam
 from slam.config import SystemConfig
-from slam.data import IdArray
+from slam.data import IdArray, ImagePair
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Patches
 from slam.landmarks import LandmarkRows
-from slam.tracking.alignment import Anchors, warps_of
+from slam.tracking.alignment import Aligner, Anchors, warps_of
+from slam.tracking.localizer import LandmarkMatches
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 
@@ -57,6 +58,93 @@ def test_anchors_are_replaced_and_given_up():
     known = anchors.known(rows(np.array([3, 4, 7]), np.array([0, 0, 50])))
     assert known.ids.tolist() == [3]  # 5 is not in the map, 7 was not measured for long
     assert not len(anchors.known(LandmarkRows.empty(4)))
+
+
+SHIFT = np.array([1.0, 0.0])  # [px]
+
+
+class Shifting:
+    """Finds every patch a pixel to the right of where it is looked for, but for those of features without a size."""
+
+    def extract(self, frame: slam.StereoFrame) -> slam.StereoFeatures:
+        raise NotImplementedError
+
+    def patches(self, images, uv_left, size):
+        return Patches(np.zeros((len(size), 5, 5), np.float32), np.full((len(size), 2), 2.0), size)
+
+    def align(self, images, patches, warps, uv_left, uv_right):
+        found = np.where(patches.size > 0, 1.0, np.nan)[:, None] * SHIFT
+        return uv_left + found, uv_right + found
+
+
+IDS = np.array([2, 5, 8, 9])
+POINTS = np.array([[-1.0, 0.5, 6.0], [0.3, -0.4, 5.0], [0.8, 0.2, 7.0], [-0.2, -0.6, 4.0]])
+SEEN = LandmarkMatches(IDS, np.array([3, 0, 2, 1]), np.eye(4))
+
+
+def frame(right: bool = True) -> slam.StereoFeatures:
+    """The points as features, in the order of `SEEN`, with images of no content."""
+    uv = np.zeros((4, 2))
+    uv[SEEN.rows] = RIG.left.project(POINTS)
+    image = np.zeros((240, 320), np.float32)
+    uv_right = uv - [10.0, 0.0] if right else np.full((4, 2), np.nan)
+    pair = ImagePair(image, image if right else None)
+    return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
+
+
+def align(features: slam.StereoFeatures, anchors: Anchors, seen: LandmarkMatches = SEEN, enabled: bool = True):
+    landmarks = rows(IDS, np.zeros(4, np.int64))
+    places = dict(zip(IDS.tolist(), POINTS))
+    aligner = Aligner(RIG, enabled)
+    return aligner.align(
+        Shifting(), anchors, features, seen, landmarks, lambda ids: np.array([places[i] for i in ids.tolist()])
+    )
+
+
+def anchors_at(T: np.ndarray, size: float = 15.0) -> Anchors:
+    return Anchors.none().with_new(IDS, replace(patches(4), size=np.full(4, size)), T)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_features_move_to_their_patches_also_without_a_right_image(right):
+    features = frame(right)
+    aligned = align(features, anchors_at(np.eye(4)))
+    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
+    np.testing.assert_allclose(aligned.features.uv_right, features.uv_right + SHIFT)
+    assert aligned.anchors.ids.tolist() == IDS.tolist()
+
+
+def test_a_feature_that_has_no_right_pixel_is_aligned_in_the_left_image():
+    features = frame()
+    features.uv_right[2] = np.nan
+    aligned = align(features, anchors_at(np.eye(4)))
+    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
+    np.testing.assert_allclose(aligned.features.uv_right, features.uv_right + SHIFT)
+    assert aligned.anchors.ids.tolist() == IDS.tolist()
+
+
+@pytest.mark.parametrize("nearer,size", [(0.0, 0.0), (2.5, 15.0)])
+def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, size):
+    then, features = np.eye(4), frame()
+    then[2, 3] = nearer
+    aligned = align(features, anchors_at(then, size))
+    np.testing.assert_array_equal(aligned.features.uv_left, features.uv_left)
+    assert not len(aligned.anchors)
+    new = Aligner(RIG, True).anchored(Shifting(), aligned, SEEN, LandmarkMatches.nothing(), np.eye(4))
+    assert new.ids.tolist() == IDS.tolist() and (new.patches.size == 15.0).all()
+    np.testing.assert_array_equal(new.poses, np.tile(np.eye(4), (4, 1, 1)))
+
+
+def test_without_a_pose_or_images_nothing_moves_and_switched_off_nothing_is_kept():
+    features, anchors = frame(), anchors_at(np.eye(4))
+    for aligned in (
+        align(features, anchors, replace(SEEN, T_world_left=None)),
+        align(replace(features, images=None), anchors),
+    ):
+        np.testing.assert_array_equal(aligned.features.uv_left, features.uv_left)
+        assert len(aligned.anchors) == 4
+    aligned = align(features, anchors, enabled=False)
+    assert aligned.features is features and not len(aligned.anchors)
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
