@@ -11,7 +11,7 @@ import numpy as np
 from slam import registry
 from slam.calibration import KeptCalibration, Revision, RigCorrection, RigUncertainty, SelfCalibration
 from slam.config import SystemConfig
-from slam.data import CommonError, Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
+from slam.data import CommonError, Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -30,6 +30,7 @@ from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.showing import count
 from slam.tracking.alignment import Aligned, Anchors, align, anchored
+from slam.tracking.answer_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
@@ -226,7 +227,8 @@ class StereoSlam:
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
-            SlamError: another thread is using the system.
+            SlamError: another thread is using the system; or back end or front end give something else than their
+                protocols say.
         """
         with self._stepping:
             return self._step(features)
@@ -243,6 +245,7 @@ class StereoSlam:
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
             prediction = self.backend.predict(features.stamp)
+            require_prediction(prediction, self.backend)
             dt, self._stamp = features.stamp - self._stamp, features.stamp
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             raw, features = features, self.calibration.correct(features)
@@ -255,14 +258,16 @@ class StereoSlam:
             held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
-            asked, spared = self._localizer.informative(prediction, matches, self.backend.positions(matches.ids), dt)
+            asked, spared = self._localizer.informative(prediction, matches, self._positions(matches.ids), dt)
             report = self.backend.update(asked.observations(features), asked.T_world_left)
+            require_report(report, self.backend)
             state = self._localizer.state_after(self._last.state, prediction, features, asked, report)
             pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
             self.calibration.observe(raw, pose)
         with stages.stage("estimate"):
             estimate = self.backend.estimate(landmarks=False)
-            self._uncertainty.observe(estimate.T_world_left, report.used, self.backend.positions(report.used))
+            require_estimate(estimate, self.backend)
+            self._uncertainty.observe(estimate.T_world_left, report.used, self._positions(report.used))
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
@@ -271,7 +276,7 @@ class StereoSlam:
             change = self._mapper.update(self.backend, landmarks, step)
             anchors = self._anchored(aligned, matches, change.added, estimate.T_world_left)
             new = np.setdiff1d(change.added.ids, change.erased)
-            self._uncertainty.change(new, self.backend.positions(new), change.erased)
+            self._uncertainty.change(new, self._positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
             step = replace(step, estimate=self._considered(estimate), common=self._common_error(self._accounted))
             atlas, change = self._close_loops(step, change)
@@ -283,11 +288,15 @@ class StereoSlam:
         )  # fmt: skip
         return result
 
+    def _positions(self, ids: IdArray) -> np.ndarray:
+        """Where landmarks are in the world (N, 3)."""
+        return require_positions(self.backend.positions(ids), ids, self.backend)
+
     def _align(self, raw: StereoFeatures, matches: LandmarkMatches, landmarks: LandmarkRows) -> Aligned:
         """Features as measured, those of landmarks where these were seen first, if the front end can do that."""
         if not self.config.association.align or not isinstance(self.frontend, AligningFrontend):
             return Aligned(raw, Anchors.none())
-        positions = self.backend.positions(landmarks.ids)
+        positions = self._positions(landmarks.ids)
         return align(self.frontend, self.rig, self._last.anchors, raw, matches, landmarks, positions)
 
     def _anchored(
@@ -307,7 +316,7 @@ class StereoSlam:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
             self._uncertainty.change(back[:0], np.zeros((0, 3)), back)  # what they were before counts no more
-            self._uncertainty.change(back, self.backend.positions(back), back[:0])
+            self._uncertainty.change(back, self._positions(back), back[:0])
         return atlas, change
 
     def roll_back(self) -> None:
@@ -453,7 +462,7 @@ class StereoSlam:
 
         Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
-        positions, state = self.backend.positions(landmarks.ids), self._last.state
+        positions, state = self._positions(landmarks.ids), self._last.state
         found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
         elsewhere = None if found is None else found.T_odom_left
         matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)

@@ -17,6 +17,7 @@ from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import AligningFrontend, Patches
 from slam.landmarks import LandmarkRows
+from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches
 
 _LARGEST = 1.5  # factor by which a patch may have grown or shrunk before it is taken anew: `Patches` hold no more
@@ -97,6 +98,9 @@ def align(
         matches: landmarks that were found, and the pose on which they agree; without one nothing is aligned.
         landmarks: the map.
         positions: of its landmarks (N, 3) in the world.
+
+    Raises:
+        SlamError: the front end gives something else than pixels.
     """
     anchors = anchors.known(landmarks)
     known, order = np.isin(anchors.ids, matches.ids), np.isin(matches.ids, anchors.ids)
@@ -108,8 +112,11 @@ def align(
     growth = np.sqrt(np.abs(np.linalg.det(warps)))
     similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
     left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-    left, right = frontend.align(features.images, matched.patches, warps, left, right)
-    found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | (features.images.right is None))
+    answer = frontend.align(features.images, matched.patches, warps, left, right)
+    left, right = require_aligned(answer, len(rows), frontend)
+    found = similar & rectified.rig.left.in_image(left)
+    if features.images.right is not None:
+        found &= rectified.rig.right.in_image(right)
     uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
     uv_left[rows[found]] = rectified.unrectify_left(left[found])
     uv_right[rows[found]] = rectified.unrectify_right(right[found])
@@ -127,12 +134,17 @@ def anchored(
     seen: LandmarkMatches,
     T_world_left: Array,
 ) -> Anchors:
-    """Anchors and those of the landmarks `seen` that have none, from a frame's features, as measured, and its pose."""
+    """Anchors and those of the landmarks `seen` that have none, from a frame's features, as measured, and its pose.
+
+    Raises:
+        SlamError: the front end gives no patches, or not one for each.
+    """
     rows = np.flatnonzero(~np.isin(seen.ids, anchors.ids))
     if features.images is None or not len(rows):
         return anchors
     uv = rig.rectified.rectify_left(features.uv_left[seen.rows[rows]])
     patches = frontend.patches(features.images, uv, features.scale[seen.rows[rows]])
+    require_patches(patches, len(rows), anchors.patches, frontend)
     return anchors.with_new(seen.ids[rows], patches, T_world_left)
 
 
