@@ -25,6 +25,7 @@ from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject, require_line
 from tests.fuzz.hostile import VALUES, choose
 from tests.fuzz.library import _require_estimate, _require_sound
+from tests.slam.test_interrupted import Lines
 
 Array = np.ndarray
 
@@ -189,6 +190,52 @@ def front_ends(rng: np.random.Generator, folder: Path) -> None:
     _require_estimate(system.estimate())
 
 
+def interrupts(rng: np.random.Generator, folder: Path) -> None:
+    """An interrupt at any line of a step with images: the frames after it are taken."""
+    rig, frames, _ = _recording(choose(rng, ("rectified", "toedin")))
+    system = _aligning(rig, SurfFrontend(rig, features=150), choose(rng, _BACKENDS))
+    for frame in frames[:2]:
+        system.process(frame)
+    try:
+        with Lines(int(10 ** rng.uniform(0, 3.5))).watched():
+            system.process(frames[2])
+    except KeyboardInterrupt:
+        pass
+    if rng.random() < 0.5:
+        system = pickle.loads(pickle.dumps(system)) if rng.random() < 0.5 else copy.deepcopy(system)
+    for frame in frames[3:]:
+        result = system.process(frame)
+        _check(result)
+        if not result.status.measured:
+            raise Broken(f"a frame after an interrupt is {result.status}: {result.reason}")
+    _require_estimate(system.estimate())
+
+
+def same_bytes(rng: np.random.Generator, folder: Path) -> None:
+    """Frames, some of them dark or without a right image, by systems that must not differ."""
+    rig, frames, _ = _recording(choose(rng, ("rectified", "toedin", "fisheye")))
+    frames = tuple(_dimmed(rng, frame) for frame in frames)
+    backend, at = choose(rng, _BACKENDS), int(rng.integers(1, len(frames)))
+    system = _aligning(rig, SurfFrontend(rig, features=150, threads=1), backend)
+    start = b"".join(_bytes(system.process(frame)) for frame in frames[:at])
+    copies = [system, copy.deepcopy(system), pickle.loads(pickle.dumps(system))]
+    ends = [b"".join(_bytes(one.process(frame)) for frame in frames[at:]) for one in copies]
+    for threads, overlap in ((2, True), (2, False)):
+        other = _aligning(rig, SurfFrontend(rig, features=150, threads=threads), backend)
+        whole = b"".join(_bytes(result) for _, result in other.run(frames, overlap))
+        if whole != start + ends[0]:
+            raise Broken(f"two threads, overlap {overlap}: other bytes")
+    if len(set(ends)) > 1:
+        raise Broken("a copy goes on with other bytes")
+
+
+def _bytes(result: slam.FrameResult) -> bytes:
+    """All numbers of a step."""
+    e, f = result.estimate, result.features
+    arrays = (e.T_world_left, e.covariance, result.matched, result.added, f.uv_left, f.uv_right, f.descriptors)
+    return b"".join(array.tobytes() for array in arrays)
+
+
 def _dimmed(rng: np.random.Generator, frame: StereoFrame) -> StereoFrame:
     """A frame; now and then one that is black, without a right image, of 16 bits or in colour."""
     left, right = frame.left, frame.right
@@ -219,4 +266,8 @@ SUBJECTS = (
             "a sound result or one line", images_of_features, short=20),
     Subject("front ends", "front ends whose features, patches and aligned pixels are wrong, or that raise",
             "a sound result, one line, or their own exception; later frames are taken", front_ends, short=15),
+    Subject("interrupts", "interrupts at any line of a step with images, then copies", "the next frames are tracked",
+            interrupts, short=6),
+    Subject("same bytes", "images, some dark or without a right one; copies, one thread or two, overlap or none",
+            "the same bytes", same_bytes, short=4),
 )  # fmt: skip
