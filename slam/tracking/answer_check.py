@@ -60,8 +60,8 @@ def require_positions(positions: Any, ids: IdArray, owner: object) -> Array:
     return np.asarray(positions)
 
 
-def require_patches(patches: Any, count: int, known: Patches, owner: object) -> Patches:
-    """What `AligningFrontend.patches` of `owner` gave for so many pixels.
+def require_patches(patches: Any, count: int, known: Patches, owner: object) -> None:
+    """Check what `AligningFrontend.patches` of `owner` gave for so many pixels.
 
     Raises:
         SlamError: no `Patches` of that many rows, or of another size than the `known` ones.
@@ -74,7 +74,6 @@ def require_patches(patches: Any, count: int, known: Patches, owner: object) -> 
         raise SlamError(f"{what}: images must be {expected}, got {shape}")
     _require_shape(patches.centres, (count, 2), f"{what}: centres")
     _require_shape(patches.size, (count,), f"{what}: size")
-    return patches
 
 
 def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array]:
@@ -88,7 +87,7 @@ def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array
         raise SlamError(f"{what}: must give left and right pixels, got {type(found).__name__}")
     for side, uv in zip(("left", "right"), found):
         _require_shape(uv, (count, 2), f"{what}: {side} pixels")
-    return found
+    return found[0], found[1]
 
 
 def _require_belief(belief: Prediction | Estimate, what: str) -> None:
