@@ -89,8 +89,9 @@ class StereoFeatures:
 
     def __post_init__(self) -> None:
         for name in ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors"):
-            if np.ndim(getattr(self, name)) == 0:
-                kind = type(getattr(self, name)).__name__
+            value = getattr(self, name)
+            if not isinstance(value, (np.ndarray, list, tuple)) or (isinstance(value, np.ndarray) and not value.ndim):
+                kind = type(value).__name__
                 raise MeasurementError(f"features: {name} must be an array with a row for each feature, got {kind}")
         n = len(self.uv_left)
         for name in ("uv_right", "scale", "angle", "response", "laplacian", "descriptors"):

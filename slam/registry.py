@@ -15,9 +15,10 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
-from slam.errors import UnknownNameError
+from slam.errors import ConfigurationError, SlamError, UnknownNameError
 from slam.naming import unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
@@ -28,6 +29,12 @@ BUILT_IN = {
         "smoother": "backends.smoother:SmootherBackend",
     },
     "frontends": {"surf": "frontends.surf:SurfFrontend"},
+}
+
+#: What `slam.interfaces.Backend` and `slam.interfaces.Frontend` ask for.
+_METHODS = {
+    "backends": ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"),
+    "frontends": ("extract",),
 }
 
 
@@ -60,6 +67,8 @@ def resolve(role: str, name: str) -> Any:
         return getattr(import_module(module), attribute)
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {error}") from error
+    except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {_cause(error)}") from error
 
 
 def create(role: str, name: str, rig: Any, **options: Any) -> Any:
@@ -67,6 +76,24 @@ def create(role: str, name: str, rig: Any, **options: Any) -> Any:
 
     Raises:
         UnknownNameError: see `resolve`.
-        ConfigurationError: an option is unknown or out of its range.
+        ConfigurationError: an option is unknown or out of its range; or the class cannot be created like that, or lacks
+            methods of its protocol (they are named).
     """
-    return resolve(role, name)(rig, **options)
+    what = role[:-1].replace("end", " end")
+    made = resolve(role, name)
+    try:
+        created = made(rig, **options)
+    except SlamError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a foreign class does
+        raise ConfigurationError(f"{what} {name!r} cannot be created: {_cause(error)}") from error
+    missing = [method for method in _METHODS[role] if not callable(getattr(created, method, None))]
+    if missing:
+        raise ConfigurationError(f"{what} {name!r} is none: it lacks {', '.join(missing)}")
+    return created
+
+
+def _cause(error: BaseException) -> str:
+    """An exception in words, and the line that raised it."""
+    place = extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"

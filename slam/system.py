@@ -11,7 +11,7 @@ import numpy as np
 from slam import registry
 from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfCalibration
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
+from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -30,6 +30,7 @@ from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.showing import count
 from slam.tracking.alignment import Aligner, Anchors
+from slam.tracking.answer_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
@@ -222,7 +223,8 @@ class StereoSlam:
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
-            SlamError: another thread is using the system.
+            SlamError: another thread is using the system; or back end or front end give something else than their
+                protocols say.
         """
         with self._stepping:
             return self._step(features)
@@ -239,6 +241,7 @@ class StereoSlam:
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision = self._revise()
             prediction = self.backend.predict(features.stamp)
+            require_prediction(prediction, self.backend)
             dt, self._stamp = features.stamp - self._stamp, features.stamp
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             raw, features = features, self.calibration.correct(features)
@@ -252,15 +255,17 @@ class StereoSlam:
             held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
         with stages.stage("update"):  # the measurement of the landmarks
-            asked, spared = self._localizer.informative(prediction, matches, self.backend.positions(matches.ids), dt)
+            asked, spared = self._localizer.informative(prediction, matches, self._positions(matches.ids), dt)
             report = self.backend.update(asked.observations(features), asked.T_world_left)
+            require_report(report, self.backend)
             state = self._localizer.state_after(self._last.state, prediction, features, asked, report)
             pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
             self.calibration.observe(raw, pose)
         with stages.stage("estimate"):
             estimate = self.backend.estimate(landmarks=False)
+            require_estimate(estimate, self.backend)
             used = report.used
-            self._rig_error.uncertainty.observe(estimate.T_world_left, used, self.backend.positions(used))
+            self._rig_error.uncertainty.observe(estimate.T_world_left, used, self._positions(used))
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
             labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
             objects = self.objects.update(self.backend, features)
@@ -270,7 +275,7 @@ class StereoSlam:
             T = estimate.T_world_left
             anchors = self._aligner.anchored(self.frontend, aligned, matches, change.added, T)
             new = np.setdiff1d(change.added.ids, change.erased)
-            self._rig_error.uncertainty.change(new, self.backend.positions(new), change.erased)
+            self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
             estimate = self._rig_error.added_to(estimate)
             step = replace(step, estimate=estimate, common=self._rig_error.common(as_given=False))
@@ -283,6 +288,10 @@ class StereoSlam:
         )  # fmt: skip
         return result
 
+    def _positions(self, ids: IdArray) -> np.ndarray:
+        """Where landmarks are in the world (N, 3)."""
+        return require_positions(self.backend.positions(ids), ids, self.backend)
+
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
         """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""
         restarts = len(self.restarted)
@@ -290,7 +299,7 @@ class StereoSlam:
         if seen_again is not None:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
-            self._rig_error.uncertainty.see_anew(back, self.backend.positions(back))
+            self._rig_error.uncertainty.see_anew(back, self._positions(back))
         return atlas, change
 
     def roll_back(self) -> None:
@@ -404,7 +413,7 @@ class StereoSlam:
 
         Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
-        positions, state = self.backend.positions(landmarks.ids), self._last.state
+        positions, state = self._positions(landmarks.ids), self._last.state
         found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
         elsewhere = None if found is None else found.T_odom_left
         matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)

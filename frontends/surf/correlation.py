@@ -29,6 +29,8 @@ def patch_windows(spread: float) -> NDArray[np.float32]:
 @vector_helper
 def _sample(pixels, shape, x, y, half, rows, lanes, blend, out):
     """Bilinear samples (rows, lanes) with the first one at (x - half, y - half); False where they leave the image."""
+    if not (y >= half and x >= half and y < shape[0] and x < shape[1]):  # NaN, and more than an integer holds
+        return False
     top, left = int(np.floor(y)) - half, int(np.floor(x)) - half
     if top < 0 or left < 0 or top + rows + 1 > shape[0] or left + lanes + 1 > shape[1]:
         return False

@@ -61,7 +61,7 @@ class RigNumbers:
         """
         try:
             numbers = cls(**{field.name: float(tree[field.name]) for field in fields(cls)})
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CalibrationError("calibration: it does not say of which rig it is") from error
         if not np.isfinite(list(asdict(numbers).values())).all():
             raise CalibrationError("calibration: the numbers of its rig must be finite")

@@ -69,7 +69,7 @@ class RigPosterior:
             names, units = (tuple(str(row[key]) for row in rows) for key in ("name", "unit"))
             mean = np.array([row["mean"] for row in rows], float)
             covariance = np.array(tree["covariance"], float).reshape(len(rows), len(rows))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise CalibrationError(f"calibration: cannot be read: {' '.join(str(error).split())}") from error
         return cls(names, units, mean, covariance)
 

@@ -103,6 +103,8 @@ def _plain_rig(entries: Mapping[str, Any], size: Size, unit: float) -> StereoRig
     values, wrong = {}, []
     for name in _PLAIN:
         try:
+            if isinstance(entries[name], bool):
+                raise TypeError(name)
             values[name] = float(entries[name])
             require_possible(np.array([values[name]]), name)
         except KeyError:

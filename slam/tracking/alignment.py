@@ -18,6 +18,7 @@ from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import AligningFrontend, Frontend, Patches
 from slam.landmarks import LandmarkRows
+from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches
 
 _LARGEST = 1.5  # factor by which a patch may have grown or shrunk before it is taken anew: `Patches` hold no more
@@ -109,6 +110,9 @@ class Aligner:
             matches: landmarks that were found, and the pose on which they agree; without one nothing is aligned.
             landmarks: the map.
             positions: gives the positions (M, 3) in the world of landmarks by their ids (M,).
+
+        Raises:
+            SlamError: the front end gives something else than pixels.
         """
         if not self._enabled or not isinstance(frontend, AligningFrontend):
             return Aligned(features, Anchors.none())
@@ -122,8 +126,11 @@ class Aligner:
         growth = np.sqrt(np.abs(np.linalg.det(warps)))
         similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
         left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
-        left, right = frontend.align(features.images, matched.patches, warps, left, right)
-        found = similar & np.isfinite(left[:, 0]) & (np.isfinite(right[:, 0]) | ~features.has_stereo[rows])
+        answer = frontend.align(features.images, matched.patches, warps, left, right)
+        left, right = require_aligned(answer, len(rows), frontend)
+        stereo = features.has_stereo[rows]
+        found = similar & rectified.rig.left.in_image(left) & (rectified.rig.right.in_image(right) | ~stereo)
+        right[~stereo] = np.nan
         uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
         uv_left[rows[found]] = rectified.unrectify_left(left[found])
         uv_right[rows[found]] = rectified.unrectify_right(right[found])
@@ -148,6 +155,9 @@ class Aligner:
             matches: landmarks that were found in it.
             added: those that are new.
             T_world_left: its pose (4, 4).
+
+        Raises:
+            SlamError: the front end gives no patches, or not one for each.
         """
         anchors, features = aligned.anchors, aligned.features
         if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
@@ -158,6 +168,7 @@ class Aligner:
             return anchors
         uv = self._rig.rectified.rectify_left(features.uv_left[rows[new]])
         patches = frontend.patches(features.images, uv, features.scale[rows[new]])
+        require_patches(patches, len(uv), anchors.patches, frontend)
         return anchors.with_new(ids[new], patches, T_world_left)
 
 

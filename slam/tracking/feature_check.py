@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.checks import LATEST_STAMP
-from slam.data import StereoFeatures
+from slam.data import ImagePair, StereoFeatures
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -38,7 +38,7 @@ def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, aft
     Raises:
         MeasurementError: they are not as `StereoFeatures` says: a wrong type, shape or number of dimensions, a value
             that is not finite (but for NaN in `uv_right`), a pixel farther outside of the image than that is wide or
-            high, or a stamp that is no number or not later than the one before.
+            high, a stamp that is no number or not later than the one before, or images of another type or size.
     """
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
@@ -57,6 +57,7 @@ def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, aft
         if not np.isfinite(columns[name]).all():
             raise MeasurementError(f"features: a value of {name} is not finite")
     _require_pixels(columns["uv_left"], columns["uv_right"], rig)
+    _require_images(features.images, rig)
     columns["descriptors"] = _of_length(columns["descriptors"], dimensions)
     return replace(features, stamp=stamp, threshold=threshold, **columns)
 
@@ -103,6 +104,21 @@ def _require_pixels(left: Array, right: Array, rig: StereoRig) -> None:
     for name, uv in (("left", left), ("right", right)):
         if ((uv < -size) | (uv > 2 * size)).any():  # NaN compares false
             raise MeasurementError(f"features: a {name} pixel lies far outside of the image")
+
+
+def _require_images(images: Any, rig: StereoRig) -> None:
+    """Images, where there are any, are a pair of the rectified rig, whose size is the rig's own."""
+    if images is None:
+        return
+    if not isinstance(images, ImagePair):
+        raise MeasurementError(f"features: images must be an ImagePair, got {type(images).__name__}")
+    for side, image in (("left", images.left), ("right", images.right)):
+        if image is None and side == "right":
+            continue
+        shape = (rig.height, rig.width)
+        if not isinstance(image, np.ndarray) or image.dtype != np.float32 or image.shape != shape:
+            got = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise MeasurementError(f"features: the {side} image must be float32 of shape {shape}, got {got}")
 
 
 def _of_length(descriptors: Array, dimensions: int | None) -> Array:

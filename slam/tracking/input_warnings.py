@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from numbers import Real
 
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import CalibrationError
+from slam.errors import CalibrationError, MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels
+from slam.tracking.feature_check import usable
 from slam.tracking.pair_check import NO_DISPARITY, pair_geometry
 from slam.tracking.state import ENOUGH_FEATURES
 
@@ -53,10 +53,14 @@ class InputWarnings:
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
         """Look at a frame and what the front end found in it; what is no frame is for others to refuse."""
-        if not isinstance(frame, StereoFrame) or not isinstance(features, StereoFeatures):
+        try:
+            features = usable(features, self._rig, None, -np.inf)
+        except MeasurementError:
             return
-        if len(self._stamps) <= _INTERVALS and isinstance(frame.stamp, Real):
-            self._stamps.append(float(frame.stamp))
+        if not isinstance(frame, StereoFrame):
+            return
+        if len(self._stamps) <= _INTERVALS:
+            self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_is_known:

@@ -62,6 +62,18 @@ def test_what_is_not_there_is_not_found():
         assert not np.isfinite(found_right).any()
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 9.3e18])
+def test_patches_are_not_looked_for_beyond_all_images(value):
+    """Nothing is read there; a pixel that no integer holds would be one anywhere in memory."""
+    frontend = SurfFrontend(RIG)
+    pair = ImagePair(*(image.astype(np.float32) for image in stereo_pair(DISPARITY)))
+    uv = np.full((3, 2), 120.0)
+    patches = frontend.patches(pair, uv, np.full(3, 15.0))
+    start = np.array([[value, 120.0], [120.0, value], [value, value]])
+    for found in frontend.align(pair, patches, np.tile(np.eye(2), (3, 1, 1)), start, start):
+        assert np.isnan(found).all()
+
+
 def test_patches_at_the_border_are_not_found():
     frontend = SurfFrontend(RIG)
     left, right = (image.astype(np.float32) for image in stereo_pair(DISPARITY))

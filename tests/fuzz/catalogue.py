@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.fuzz import agreement, bookkeeping, commands, library, live, readers, runs, saved, settings
+from tests.fuzz import agreement, aligning, bookkeeping, commands, library, live, readers, runs, saved, settings
 
 SUBJECTS = (
     *readers.SUBJECTS,
@@ -11,6 +11,7 @@ SUBJECTS = (
     *commands.SUBJECTS,
     *runs.SUBJECTS,
     *library.SUBJECTS,
+    *aligning.SUBJECTS,
     *live.SUBJECTS,
     *agreement.SUBJECTS,
     *bookkeeping.SUBJECTS,

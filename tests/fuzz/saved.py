@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.calibration.kept import KeptCalibration, RigNumbers, load_calibration
 from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode, load_map
 from slam.objects.config import ObjectsConfig
@@ -23,7 +24,7 @@ from slam.run.recording import load_recording, save_recording
 from slam.run.replay import record
 from slam.run.runner import RunOptions, run_recording
 from slam.system import StereoSlam
-from tests.fuzz.harness import Subject
+from tests.fuzz.harness import Broken, Subject
 from tests.fuzz.hostile import VALUES, broken_bytes, broken_text, choose
 from tests.fuzz.settings import scene
 
@@ -114,6 +115,22 @@ def large_map(rng: np.random.Generator, folder: Path) -> None:
     system = StereoSlam(rig, None, "ekf" if len(known) > 4999 else choose(rng, _BACKENDS), known_map=known)
     for features in frames[:2]:
         system.process_features(features)
+
+
+def kept_calibration(rng: np.random.Generator, folder: Path) -> None:
+    """A kept calibration with hostile values, and a run that begins with it."""
+    rig, frames = scene()
+    path = folder / "a.json"
+    tree = KeptCalibration(_run()[0].calibration.posterior, RigNumbers.of(rig)).to_json()
+    for _ in range(int(rng.integers(1, 3))):
+        tree = _hostile_tree(rng, tree)
+    text = json.dumps(tree)
+    path.write_text(broken_text(rng, text) if rng.random() < 0.3 else text, errors="replace")
+    system = StereoSlam(rig, None, choose(rng, _BACKENDS), rig_prior=load_calibration(path))
+    for features in frames[:3]:
+        result = system.process_features(features)
+        if not np.isfinite(result.estimate.covariance).all():
+            raise Broken("a covariance is not finite")
 
 
 def read_recording(rng: np.random.Generator, folder: Path) -> None:
@@ -301,6 +318,8 @@ SUBJECTS = (
             quiet=False),
     Subject("extreme maps", "maps of 10⁵ landmarks, or scaled by 10⁻²⁰ to 10²⁰", "a run or one line", large_map,
             quiet=False, short=25),
+    Subject("kept calibrations", "mutated files of a rig's errors, and runs that begin with them", "a run or one line",
+            kept_calibration, short=40),
     Subject("recordings", "mutated recordings, replayed into both back ends", "a run or one line", read_recording,
             quiet=False, short=50),
     Subject("databases", "mutated databases of an object's features, and runs that look for it", "a run or one line",

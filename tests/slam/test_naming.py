@@ -7,7 +7,7 @@ import pytest
 from slam import registry
 from slam.commands.compare import variants_of
 from slam.config import SystemConfig
-from slam.errors import SlamError, UnknownNameError
+from slam.errors import ConfigurationError, SlamError, UnknownNameError
 from slam.naming import suggestion
 from slam.sequences import open_sequence
 
@@ -52,12 +52,12 @@ def test_a_back_end_is_suggested():
 
 def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     (tmp_path / "my_own_module.py").write_text(
-        "class Mine:\n    def __init__(self, rig, models=None):\n        self.rig = rig\n"
+        "class Mine:\n    def __init__(self, rig, models=None):\n        self.rig = rig\n    extract = print\n"
     )
     (tmp_path / "a_broken_module.py").write_text("class Mine(:\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    assert registry.create("backends", "my_own_module:Mine", "rig").rig == "rig"
+    assert registry.create("frontends", "my_own_module:Mine", "rig").rig == "rig"
     assert sys.path[-1] == str(tmp_path)  # last: nothing that is installed is replaced
     for name in (
         "my_own_module:Other",
@@ -68,6 +68,38 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     ):
         with pytest.raises(UnknownNameError, match=f"back end '{name}' cannot be loaded"):
             registry.resolve("backends", name)
+
+
+FOREIGN = """
+class Nothing:
+    def __init__(self, rig): pass
+class Raises:
+    def __init__(self, rig): raise RuntimeError("no way")
+class Quits:
+    def __init__(self, rig): raise SystemExit(0)
+number = 3
+"""
+
+
+def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monkeypatch):
+    (tmp_path / "foreign_classes.py").write_text(FOREIGN)
+    (tmp_path / "module_that_raises.py").write_text("\nundefined\n")
+    (tmp_path / "module_that_quits.py").write_text("raise SystemExit(0)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(UnknownNameError, match=r"NameError: .*undefined.* \(module_that_raises.py, line 2\)"):
+        registry.create("backends", "module_that_raises:Mine", "rig")
+    with pytest.raises(UnknownNameError, match=r"SystemExit: 0 \(module_that_quits.py, line 1\)"):
+        registry.create("backends", "module_that_quits:Mine", "rig")
+    cases = {
+        "Nothing": "is none: it lacks predict, update",
+        "Raises": r"cannot be created: RuntimeError: no way \(foreign_classes.py, line 5\)",
+        "Quits": "cannot be created: SystemExit",
+        "number": "cannot be created: TypeError: 'int' object is not callable",
+    }
+    for name, words in cases.items():
+        with pytest.raises(ConfigurationError, match=words):
+            registry.create("backends", f"foreign_classes:{name}", "rig")
 
 
 @pytest.mark.parametrize(

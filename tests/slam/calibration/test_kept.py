@@ -78,6 +78,8 @@ def spoilt(tree, change):
         (lambda t: t.pop("rig"), "of which rig"),
         (lambda t: t["rig"].update(focal="long"), "of which rig"),
         (lambda t: t["rig"].update(focal=float("nan")), "finite"),
+        (lambda t: t["rig"].update(focal=10**400), "of which rig"),
+        (lambda t: t["parameters"][0].update(mean=10**400), "cannot be read"),
         (lambda t: t.update(residual_scale="x"), "residual_scale"),
         (lambda t: t.pop("parameters"), "neither a file of"),
         (lambda t: t["parameters"].pop(), "cannot be read"),

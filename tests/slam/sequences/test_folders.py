@@ -245,6 +245,9 @@ def test_all_that_is_wrong_with_five_numbers_is_said_at_once(tmp_path: Path) -> 
         opencv_rig([file], SIZE)
     for part in ("fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which must be positive"):
         assert part in str(error.value)
+    file.write_text("fx: 500\nfy: 500\ncx: true\ncy: 24\nbaseline: 0.12\n")
+    with pytest.raises(CalibrationError, match="cx is no number"):
+        opencv_rig([file], SIZE)
 
 
 CAMCHAIN = """cam0:

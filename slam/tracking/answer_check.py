@@ -1,0 +1,109 @@
+"""Checks of what a back end or a front end from elsewhere gives back, so that nonsense ends a step with one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from slam.data import Estimate, IdArray, Prediction, UpdateReport
+from slam.errors import SlamError
+from slam.geometry.se3 import Array
+from slam.interfaces import Patches
+
+
+def require_prediction(prediction: Any, owner: object) -> None:
+    """Check what `Backend.predict` of `owner` gave.
+
+    Raises:
+        SlamError: it is no `Prediction`, shapes differ from the documented ones, or pose or covariance are not finite.
+    """
+    what = f"{type(owner).__name__}.predict"
+    _require_kind(prediction, Prediction, what)
+    _require_belief(prediction, what)
+    n = len(prediction.ids)
+    shapes = {"uv_left": (n, 2), "uv_right": (n, 2), "innovation": (n, 2, 2)}
+    for name, shape in shapes.items():
+        _require_shape(getattr(prediction, name), shape, f"{what}: {name}")
+
+
+def require_report(report: Any, owner: object) -> None:
+    """Check what `Backend.update` of `owner` gave.
+
+    Raises:
+        SlamError: it is no `UpdateReport`.
+    """
+    _require_kind(report, UpdateReport, f"{type(owner).__name__}.update")
+
+
+def require_estimate(estimate: Any, owner: object) -> None:
+    """Check the pose that `Backend.estimate` of `owner` gave.
+
+    Raises:
+        SlamError: it is no `Estimate`, or pose or covariance are of another shape or not finite.
+    """
+    what = f"{type(owner).__name__}.estimate"
+    _require_kind(estimate, Estimate, what)
+    _require_belief(estimate, what)
+
+
+def require_positions(positions: Any, ids: IdArray, owner: object) -> Array:
+    """What `Backend.positions` of `owner` gave for `ids`.
+
+    Raises:
+        SlamError: not (N, 3), or not finite.
+    """
+    what = f"{type(owner).__name__}.positions"
+    _require_shape(positions, (len(ids), 3), what)
+    if not np.isfinite(positions).all():
+        raise SlamError(f"{what}: a landmark's position is not finite")
+    return np.asarray(positions)
+
+
+def require_patches(patches: Any, count: int, known: Patches, owner: object) -> None:
+    """Check what `AligningFrontend.patches` of `owner` gave for so many pixels.
+
+    Raises:
+        SlamError: no `Patches` of that many rows, or of another size than the `known` ones.
+    """
+    what = f"{type(owner).__name__}.patches"
+    _require_kind(patches, Patches, what)
+    shape = np.shape(patches.images)
+    if len(shape) != 3 or shape[0] != count or (len(known) and shape[1:] != known.images.shape[1:]):
+        expected = f"({count}, S, S)" if not len(known) else str((count, *known.images.shape[1:]))
+        raise SlamError(f"{what}: images must be {expected}, got {shape}")
+    _require_shape(patches.centres, (count, 2), f"{what}: centres")
+    _require_shape(patches.size, (count,), f"{what}: size")
+
+
+def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array]:
+    """Left and right pixels that `AligningFrontend.align` of `owner` gave for so many patches.
+
+    Raises:
+        SlamError: not two arrays (N, 2).
+    """
+    what = f"{type(owner).__name__}.align"
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise SlamError(f"{what}: must give left and right pixels, got {type(found).__name__}")
+    for side, uv in zip(("left", "right"), found):
+        _require_shape(uv, (count, 2), f"{what}: {side} pixels")
+    return found[0], found[1]
+
+
+def _require_belief(belief: Prediction | Estimate, what: str) -> None:
+    for name, value, side in (("the pose", belief.T_world_left, 4), ("the covariance", belief.covariance, 6)):
+        _require_shape(value, (side, side), f"{what}: {name}")
+        if not np.isfinite(value).all():
+            raise SlamError(f"{what}: {name} is not finite")
+
+
+def _require_kind(value: Any, kind: type, what: str) -> None:
+    if not isinstance(value, kind):
+        raise SlamError(f"{what}: must give a {kind.__name__}, got {type(value).__name__}")
+
+
+def _require_shape(value: Any, shape: tuple[int, ...], what: str) -> None:
+    """An array of numbers of this shape."""
+    if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in "fiu":
+        got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise SlamError(f"{what}: must be an array {shape} of numbers, got {got}")

@@ -1,0 +1,133 @@
+"""Nonsense from a back end or a front end of elsewhere ends a step with one line that names the method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from backends.ekf import EkfBackend
+from frontends.surf import SurfFrontend
+from slam.config import SystemConfig
+from slam.data import ImagePair, StereoFeatures, StereoFrame
+from slam.errors import MeasurementError, SlamError
+from slam.geometry.rig import StereoRig
+from slam.interfaces import Patches
+from slam.models import EstimatorModels
+from slam.system import StereoSlam
+from tests.frontends.scenes import stereo_pair
+
+RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
+LEFT, RIGHT = stereo_pair(12.25)
+
+
+class Changed(EkfBackend):
+    """A filter with one answer changed."""
+
+    def __init__(self, method: str, change) -> None:
+        super().__init__(RIG, models=EstimatorModels())
+        answer = getattr(self, method)
+        setattr(self, method, lambda *arguments, **options: change(answer(*arguments, **options)))
+
+
+ANSWERS = [
+    ("predict", lambda p: None, "predict: must give a Prediction"),
+    ("predict", lambda p: replace(p, T_world_left=np.full((4, 4), np.nan)), "predict: the pose is not finite"),
+    ("predict", lambda p: replace(p, covariance=np.eye(3)), "predict: the covariance: must be an array"),
+    ("predict", lambda p: replace(p, uv_left=p.uv_left[None]), "predict: uv_left"),
+    ("update", lambda r: None, "update: must give a UpdateReport"),
+    ("estimate", lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "estimate: the covariance is not finite"),
+    ("positions", lambda x: x[:-1] if len(x) else None, "positions: must be an array"),
+    ("positions", lambda x: x * np.nan, "positions: a landmark's position is not finite"),
+]
+
+
+@pytest.mark.parametrize("method,change,words", ANSWERS)
+def test_a_back_end_of_nonsense_is_named(method, change, words):
+    system = StereoSlam(RIG, "surf", Changed(method, change))
+    with pytest.raises(SlamError, match=f"Changed.{words}"):
+        system.process(LEFT, RIGHT, 0.0)
+
+
+class Spoilt(SurfFrontend):
+    """SURF with one answer replaced."""
+
+    answers: dict
+
+    def patches(self, images, uv_left, size):
+        change = self.answers.get("patches")
+        return change(super().patches(images, uv_left, size)) if change else super().patches(images, uv_left, size)
+
+    def align(self, images, patches, warps, uv_left, uv_right):
+        found = super().align(images, patches, warps, uv_left, uv_right)
+        return self.answers["align"](found) if "align" in self.answers else found
+
+
+def aligning(**answers) -> StereoSlam:
+    frontend = Spoilt(RIG, features=150)
+    frontend.answers = answers
+    config = SystemConfig()
+    config = replace(config, association=replace(config.association, align=True))
+    return StereoSlam(RIG, frontend, "ekf", config=config)
+
+
+WRONG = [
+    ("patches", lambda p: None, "patches: must give a Patches"),
+    ("patches", lambda p: p.select(np.arange(1)), "patches: images must be"),
+    ("patches", lambda p: Patches(p.images, p.centres[:, :1], p.size), "patches: centres"),
+    ("align", lambda f: None, "align: must give left and right pixels"),
+    ("align", lambda f: (f[0][:-1], f[1]), "align: left pixels"),
+]
+
+
+@pytest.mark.parametrize("method,change,words", WRONG)
+def test_a_front_end_of_nonsense_is_named_and_the_next_frame_is_taken(method, change, words):
+    system = aligning(**{method: change})
+    with pytest.raises(SlamError, match=f"Spoilt.{words}"):
+        for k in range(3):
+            system.process(LEFT, RIGHT, 0.1 * k)
+    system.frontend.answers = {}
+    for k in range(3, 6):
+        result = system.process(LEFT, RIGHT, 0.1 * k)
+    assert result.status.measured
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e9])
+def test_patches_found_in_no_image_are_not_found(value):
+    system = aligning(align=lambda found: (np.full_like(found[0], value), found[1]))
+    for k in range(3):
+        result = system.process(LEFT, RIGHT, 0.1 * k)
+    assert result.status.measured
+    assert RIG.left.in_image(result.features.uv_left).all()
+
+
+IMAGES = [
+    (3, "must be an ImagePair"),
+    (ImagePair(LEFT, None), "left image must be float32"),
+    (ImagePair(np.float32(LEFT)[:-1], None), r"left image must be float32 of shape \(240, 320\)"),
+    (ImagePair(np.float32(LEFT), np.float64(RIGHT)), "right image must be float32"),
+]
+
+
+@pytest.mark.parametrize("images,words", IMAGES)
+def test_images_of_features_are_of_the_rectified_rig(images, words):
+    system = aligning()
+    with pytest.raises(MeasurementError, match=words):
+        system.process_features(replace(StereoFeatures.empty(0.0), images=images))
+    assert system.process(LEFT, RIGHT, 0.0).status.measured
+
+
+def test_a_front_end_whose_features_are_no_features_ends_in_one_line():
+    class Flat(SurfFrontend):
+        def extract(self, frame):
+            features = super().extract(frame)
+            return replace(features, uv_right=features.uv_right[:, 0])
+
+    with pytest.raises(MeasurementError, match="uv_right must be an array of 2 dimensions"):
+        StereoSlam(RIG, Flat(RIG, features=50)).process(StereoFrame(0, 0.0, LEFT, RIGHT))
+
+
+def test_features_of_ragged_tuples_are_refused():
+    with pytest.raises(MeasurementError):
+        replace(StereoFeatures.empty(0.0), uv_right=(1, (2, 3)))
