@@ -30,10 +30,11 @@ def lines(frames, features=200, rig=RIG, kind="handheld", stereo=200):
         StereoFeatures.empty(0.0),
         **{name: image for name in ("uv_left", "descriptors")},
         uv_right=np.where(np.arange(features)[:, None] < stereo, image, np.nan),
-        **{name: image[:, 0] for name in ("scale", "angle", "response", "laplacian")},
+        **{name: image[:, 0] for name in ("scale", "angle", "response")},
+        laplacian=np.zeros(features, np.int8),
     )
     for frame in frames:
-        watch.look(frame, found)
+        watch.look(frame, replace(found, stamp=frame.stamp))
     return watch.lines
 
 
