@@ -17,6 +17,7 @@ from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
+_LARGEST = 1.0  # correction [rad, focal lengths, 1] and variance that a file may hold: others are no calibration's
 _SAME = 1e-5  # relative difference of numbers of the same calibration, written and read
 _NOT_KEPT = (
     "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
@@ -113,6 +114,8 @@ class KeptCalibration:
         posterior = RigPosterior.from_json(tree)
         if posterior.names != RigModel.names:
             raise CalibrationError("calibration: its parameters are not those of this version")
+        if max(np.abs(posterior.mean).max(), np.diag(posterior.covariance).max()) > _LARGEST:
+            raise CalibrationError("calibration: a correction or its deviation is larger than the rig itself")
         symmetric = np.allclose(posterior.covariance, posterior.covariance.T, rtol=1e-6, atol=0)
         if not symmetric or np.linalg.eigvalsh(posterior.covariance).min() <= 0:
             raise CalibrationError("calibration: its covariance is none")

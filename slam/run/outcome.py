@@ -49,6 +49,6 @@ def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
             "images are of two cameras, the left one first, and the calibration"
         )
     return baseline_doubt(rig) or (
-        "features are found in both images, but not again in the next frame: frames too far apart, images that are not "
-        "in order of time, or the calibration of another camera"
+        "features are found in both images, but not again in the next frame: a vehicle's camera (then say --kind "
+        "driving), frames too far apart, images that are not in order of time, or the calibration of another camera"
     )

@@ -105,6 +105,17 @@ def test_files_of_another_kind_get_one_line(tmp_path, content):
         slam.load_calibration(tmp_path / "none.json")
 
 
+@pytest.mark.parametrize("name", ["mean", "sigma"])
+def test_corrections_larger_than_the_rig_are_refused(first, name):
+    tree = first.kept().to_json()
+    if name == "mean":
+        tree["parameters"][3]["mean"] = -1e300
+    else:
+        tree["covariance"] = (1e300 * np.eye(len(tree["parameters"]))).tolist()
+    with pytest.raises(CalibrationError, match="larger than the rig"):
+        slam.calibration.KeptCalibration.from_json(tree)
+
+
 def test_one_recording_jointly_is_that_recording(first):
     joint = joint_calibration(first.model, [first.evidence()], first.config.systematic).posterior
     np.testing.assert_allclose(joint.mean, first.posterior.mean, rtol=1e-9)
