@@ -9,7 +9,7 @@ times seconds. Pose covariances are (6, 6), order [rotation, translation], of a 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Protocol
 
@@ -57,6 +57,41 @@ class ImagePair:
 
     left: NDArray[np.float32]
     right: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class Patches:
+    """What the image looks like around some pixels, a row each; made and understood by a front end.
+
+    Attributes:
+        images: (N, S, S) float32, NaN beyond the image.
+        centres: the pixels in them (N, 2).
+        size: of the features there (N,) [px].
+    """
+
+    images: NDArray[np.float32]
+    centres: Array
+    size: Array
+
+    @classmethod
+    def none(cls) -> Patches:
+        """No patches."""
+        return cls(np.zeros((0, 0, 0), np.float32), np.zeros((0, 2)), np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    def select(self, keep: NDArray) -> Patches:
+        """Some of the rows (a mask or indices)."""
+        return Patches(self.images[keep], self.centres[keep], self.size[keep])
+
+    def joined(self, other: Patches) -> Patches:
+        """These and others."""
+        if not len(self):
+            return other
+        if not len(other):
+            return self
+        return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
 
 
 @dataclass(frozen=True)

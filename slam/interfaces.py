@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
-from slam.data import Estimate, IdArray, ImagePair, Observations, Prediction, StereoFeatures, StereoFrame, UpdateReport
+from slam.data import (
+    Estimate,
+    IdArray,
+    ImagePair,
+    Observations,
+    Patches,
+    Prediction,
+    StereoFeatures,
+    StereoFrame,
+    UpdateReport,
+)
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.object_data import ObjectEstimate, ObjectObservations
@@ -28,41 +34,6 @@ class Frontend(Protocol):
             SequenceError: the images are not of the rig's size or of an unusable type.
         """
         ...
-
-
-@dataclass(frozen=True)
-class Patches:
-    """What the image looks like around some pixels, a row each; made and understood by a front end.
-
-    Attributes:
-        images: (N, S, S) float32, NaN beyond the image.
-        centres: the pixels in them (N, 2).
-        size: of the features there (N,) [px].
-    """
-
-    images: NDArray[np.float32]
-    centres: Array
-    size: Array
-
-    @classmethod
-    def none(cls) -> Patches:
-        """No patches."""
-        return cls(np.zeros((0, 0, 0), np.float32), np.zeros((0, 2)), np.zeros(0))
-
-    def __len__(self) -> int:
-        return len(self.size)
-
-    def select(self, keep: NDArray) -> Patches:
-        """Some of the rows (a mask or indices)."""
-        return Patches(self.images[keep], self.centres[keep], self.size[keep])
-
-    def joined(self, other: Patches) -> Patches:
-        """These and others."""
-        if not len(self):
-            return other
-        if not len(other):
-            return self
-        return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
 
 
 @runtime_checkable

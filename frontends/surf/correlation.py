@@ -10,7 +10,7 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
 _ITERATIONS = 12  # of the alignment at most
 _CONVERGED = 0.01  # px
-_MARGIN = 18  # half width of a patch that is kept [px]: the large one and its gradients, one and a half times as wide
+_MARGIN = 3 * (_HALVES[1] + 1) // 2  # half width of a patch that is kept [px]: it may be seen 1.5 times as large
 
 
 def patch_windows(spread: float) -> NDArray[np.float32]:
@@ -24,6 +24,14 @@ def patch_windows(spread: float) -> NDArray[np.float32]:
         n = 2 * half + 1
         out[k, :n, :n] = np.outer(line, line) / line.sum() ** 2
     return out
+
+
+@helper
+def _window_of(size):
+    """Number and half width of the window [px] in which a feature of some size [px] is compared."""
+    if size < 24.0:
+        return 0, _HALVES[0]
+    return 1, _HALVES[1]
 
 
 @vector_helper
@@ -139,8 +147,7 @@ def _refine(
     for i in range(len(uv)):
         if np.isnan(start[i, 0]):
             continue
-        k = 0 if size[i] < 24.0 else 1
-        half = 7 if k == 0 else 11
+        k, half = _window_of(size[i])
         rows, lanes = 2 * half + 1, 2 * half + 2
         if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
             continue
@@ -239,8 +246,7 @@ def _align_patches(
     for i in range(len(start)):
         if not (0.0 <= start[i, 0] < shape[1] and 0.0 <= start[i, 1] < shape[0]):
             continue
-        k = 0 if size[i] < 24.0 else 1
-        half = 7 if k == 0 else 11
+        k, half = _window_of(size[i])
         rows, lanes = 2 * half + 1, 2 * half + 2
         if not _sample_warped(patches[i], centres[i], warps[i], half + 1, rows + 2, lanes + 2, sampled):
             continue

@@ -16,10 +16,9 @@ from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
 from frontends.surf.surf import Surf
-from slam.data import ImagePair, StereoFeatures, StereoFrame
+from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
-from slam.interfaces import Patches
 
 _SURPLUS = 1.35  # features detected for each one needed, to have a choice when spreading them
 _CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima

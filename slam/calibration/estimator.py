@@ -36,7 +36,7 @@ _LATER = 1.25  # after so many times the frames such a pair is solved anew: its 
 _MOST_ROWS = 250  # of a frame: more say little more
 _MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
-_LIKELIER = 1.0  # logarithm of how much; where the calibration is right 0.3 was seen, where it is not some hundred
+_LIKELIER = 1.0  # logarithm of how much: what a single parameter that is fitted must gain (Akaike)
 _CONFIGURED = 4  # pairs that the configured noise counts for
 _RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
 _TURN = 0.05  # but never rarer than once in this turn [rad]: turns are rare, and they alone show the focal length
@@ -130,8 +130,8 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether what was seen in motion is likelier with the mean than with the calibration as delivered."""
-        parts, mean = self._parts()[1:], self._solution.mean
-        return sum(float(part.e @ mean - 0.5 * mean @ part.S @ mean) for part in parts) > _LIKELIER
+        found, mean = self.evidence(), self._solution.mean
+        return found is not None and bool(found.motion.e @ mean - 0.5 * mean @ found.motion.S @ mean > _LIKELIER)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.data import BoolArray, IdArray, Patches, StereoFeatures
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.geometry.se3 import Array
-from slam.interfaces import AligningFrontend, Frontend, Patches
+from slam.interfaces import AligningFrontend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches

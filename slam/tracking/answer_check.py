@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Prediction, UpdateReport
+from slam.data import Estimate, IdArray, Patches, Prediction, UpdateReport
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
-from slam.interfaces import Patches
 
 
 def require_prediction(prediction: Any, owner: object) -> None:

@@ -14,12 +14,11 @@ import numpy as np
 import slam
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
-from slam.data import ImagePair, StereoFeatures, StereoFrame
+from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
 from slam.errors import SlamError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
-from slam.interfaces import Patches
 from slam.sequences.calibration import rig_from_transform
 from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject, require_line

@@ -10,10 +10,9 @@ import pytest
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
-from slam.data import ImagePair, StereoFeatures, StereoFrame
+from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
 from slam.errors import MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
-from slam.interfaces import Patches
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.frontends.scenes import stereo_pair
