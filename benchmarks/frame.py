@@ -14,7 +14,6 @@ The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -32,6 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.orb_odometry import OrbOdometry
 from benchmarks.orb_vocabulary import write_vocabulary
+from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from slam.data import FrameStatus, StereoFrame
 from slam.errors import SlamError
@@ -173,10 +173,8 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few frames of each: does it work?")
+    parser = script_options(__file__, __doc__, "a few frames of each: does it work?")
     parser.add_argument("--orbslam3", metavar="PYTHON", help="interpreter that has orbslam3-python")
-    parser.add_argument("--out", type=Path, default=Path("results/frame"))
     arguments = parser.parse_args()
     table: list[list[str]] = []
     for size in sizes(arguments.quick):

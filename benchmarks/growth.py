@@ -9,7 +9,6 @@ times, medians, floors from the same run; prints a Markdown table and draws the 
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from threadpoolctl import threadpool_limits
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.backends import bare_dsyrk, seconds, standing
+from experiments.common import script_options, timed
 from experiments.long_run import Corridor, run
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
@@ -88,12 +88,8 @@ def by_objects(name: str, cars: int, frames: int) -> Point:
     features, found = [sequence.observations(k) for k in range(frames)], []  # type: ignore[attr-defined]
     for mode in ("detect", "off"):
         config = SystemConfig.for_kind(sequence.kind, None, name).with_settings([f"objects.mode={mode}"])
-        system, times = StereoSlam(sequence.rig, None, name, kind=sequence.kind, config=config), []
-        for seen in features:
-            start = time.process_time()
-            system.process_features(seen)
-            times.append(time.process_time() - start)
-        found.append(1e3 * float(np.median(times[frames // 3 :])))
+        system = StereoSlam(sequence.rig, None, name, kind=sequence.kind, config=config)
+        found.append(float(np.median(timed(system.process_features, features)[1][frames // 3 :])))
     return Point(OBJECTS, name, cars, *found)
 
 
@@ -143,9 +139,7 @@ def draw(path: Path, found: list[Point]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small sizes and few frames")
-    parser.add_argument("--out", type=Path, default=Path("results/growth"))
+    parser = script_options(__file__, __doc__, "small sizes and few frames")
     arguments = parser.parse_args()
     found = points(arguments.quick)
     table = [p.row() for p in found]

@@ -10,7 +10,6 @@ pose deviation below 1.5 cm, peak 3 cm, 318 landmarks.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from frontends import create
 from slam.config import SystemConfig
@@ -140,11 +140,9 @@ def main() -> int:
     import matplotlib
 
     matplotlib.use("Agg")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="30 frames")
+    parser = script_options(__file__, __doc__, "30 frames")
     parser.add_argument("--world", default="synthetic:aisle", help="a rendered world")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
-    parser.add_argument("--out", type=Path, default=Path("results/aisle"))
     arguments = parser.parse_args()
     world = (
         arguments.world + ("&" if "?" in arguments.world else "?") + "frames=30" if arguments.quick else arguments.world

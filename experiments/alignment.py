@@ -9,10 +9,7 @@ the online path after alignment, CPU time of a frame; medians.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -22,21 +19,20 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import online_error, recordings, script_options, timed
 from experiments.tables import markdown, write_json
 from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
-from slam.evaluation.metrics import absolute_errors, associate
-from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
 BACKENDS = ("ekf", "smoother")
 WORLDS = ("synthetic:aisle?frames=150", "synthetic:desk?frames=150")
-DRIVES = (
-    "kitti_odometry/sequences/06",
-    "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync",
-    "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
-)
+DRIVES = {
+    "06": "kitti_odometry/sequences/06",
+    "0001": "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync",
+    "0013": "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
+}
 HEADER = ("sequence", "back end", "places of features", "measured a frame", "lifetime [frames]", "ATE online [m]",
           "CPU [ms]")  # fmt: skip
 _LATER = 3  # frames by which a trial begins later than the one before
@@ -44,12 +40,8 @@ _LATER = 3  # frames by which a trial begins later than the one before
 
 def sequences(quick: bool) -> Iterator[Sequence]:
     """Worlds, and the drives that are there."""
-    data = Path(os.environ.get("SLAM_DATA") or "/nowhere")
-    for source in WORLDS[: 1 if quick else None]:
-        yield open_sequence(source)
-    for folder in DRIVES[: 0 if quick else None]:
-        if (data / folder).is_dir():
-            yield open_sequence(data / folder)
+    drives = recordings(DRIVES).values()
+    yield from map(open_sequence, WORLDS[:1] if quick else [*WORLDS, *drives])
 
 
 def run(sequence: Sequence, backend: str, align: bool, first: int, frames: int | None) -> list[float]:
@@ -57,25 +49,18 @@ def run(sequence: Sequence, backend: str, align: bool, first: int, frames: int |
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
     config = replace(config, association=replace(config.association, align=align))
     system, lifetimes = StereoSlam(sequence.rig, "surf", backend, config=config), Lifetimes()
-    stamps, poses, used, times = [], [], [], []
-    for frame in islice(sequence, first, None if frames is None else first + frames):
-        start = time.process_time()
-        result = system.process(frame)
-        times.append(1e3 * (time.process_time() - start))
+    last = None if frames is None else first + frames
+    results, times = timed(system.process, islice(sequence, first, last))
+    for result in results:
         lifetimes.add(result)
-        stamps.append(frame.stamp)
-        poses.append(result.estimate.T_world_left)
-        used.append(len(result.report.used))
-    pairs = associate(Trajectory(np.array(stamps), np.array(poses)), sequence.ground_truth, 0.02, interpolated=True)
-    error = absolute_errors(*pairs).translation_statistics.rmse
+    used = [len(result.report.used) for result in results]
+    error = online_error(results, sequence.ground_truth)
     return [float(np.median(used)), lifetimes.figures()["lifetime_mean_frames"], error, float(np.median(times))]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="ten frames of one world")
+    parser = script_options(__file__, __doc__, "ten frames of one world")
     parser.add_argument("--trials", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("results/alignment"))
     arguments = parser.parse_args()
     frames, trials = (10, 1) if arguments.quick else (None, arguments.trials)
     rows = []

@@ -18,7 +18,6 @@ desk is drawn from the motion model itself, so that predictions, too, can be hel
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 from collections.abc import Iterator, Sequence
@@ -29,6 +28,7 @@ from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.consistency_trials import BACKENDS, CASES, Trial, trials
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry.se3 import Array
@@ -194,14 +194,12 @@ def draw(path: Path, results: dict[str, list[Trial]]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two seeds of fifteen frames")
+    parser = script_options(__file__, __doc__, "two seeds of fifteen frames")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--wrong", type=int, default=6, help="seeds that are run with wrong matches as well")
     parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)
     parser.add_argument("--resume", action="store_true", help="go on with the runs that are in the folder already")
-    parser.add_argument("--out", type=Path, default=Path("results/consistency"))
     arguments = parser.parse_args()
     seeds, frames, wrong = arguments.seeds, arguments.frames, arguments.wrong
     if arguments.quick:

@@ -9,7 +9,6 @@ the papers' filter on rendered worlds where the surface point behind every landm
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 from functools import partial
@@ -20,6 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.surf import medians, test_image
+from experiments.common import script_options
 from frontends.surf import Surf
 from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant
@@ -83,10 +83,8 @@ def draw(counts: tuple[int, ...], ms: np.ndarray, errors: dict[str, np.ndarray],
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed of fifteen frames")
+    parser = script_options(__file__, __doc__, "one seed of fifteen frames")
     parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--out", type=Path, default=Path("results/descriptors"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     counts = (100, 800) if arguments.quick else (100, 200, 400, 600, 800)

@@ -9,7 +9,6 @@ over frames of the rendered aisle.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.surf import medians
+from experiments.common import script_options
 from frontends.surf import Surf
 from slam.sequences import open_sequence
 
@@ -76,9 +76,7 @@ def draw(table: np.ndarray, ms: np.ndarray, radii: list[np.ndarray], path: Path)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three images, few repetitions")
-    parser.add_argument("--out", type=Path, default=Path("results/detector"))
+    parser = script_options(__file__, __doc__, "three images, few repetitions")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     pictures = images(3 if arguments.quick else 25)

@@ -15,7 +15,6 @@ that were not tracked. ``--page`` puts the table of all runs in DIR, also earlie
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 import time
@@ -29,6 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
+from experiments.common import script_options
 from experiments.long_run import DT, MODELS, RIG, Loop, measured, memory
 from slam.config import SystemConfig
 from slam.data import FrameResult, FrameStatus, StereoFeatures, StereoFrame
@@ -155,12 +155,10 @@ def write_csv(path: Path, parts: list[Part]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two hundred frames of each")
+    parser = script_options(__file__, __doc__, "two hundred frames of each")
     parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"])
     parser.add_argument("--frames", type=int, default=20_000, help="of observations; 0 for none")
     parser.add_argument("--images", type=int, default=3_000, help="frames of images; 0 for none")
-    parser.add_argument("--out", type=Path, default=Path("results/endurance"))
     parser.add_argument("--page", type=Path, help="a page for the table")
     arguments = parser.parse_args()
     counts = {"observations": arguments.frames, "images": arguments.images}

@@ -9,7 +9,6 @@ Draws the error frame by frame.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from frontends import create
 from slam.config import SystemConfig
@@ -145,9 +145,7 @@ def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three of the faults, shorter recordings")
-    parser.add_argument("--out", type=Path, default=Path("results/faults"))
+    parser = script_options(__file__, __doc__, "three of the faults, shorter recordings")
     arguments = parser.parse_args()
     rows, errors = [], {}
     for fault in faults(arguments.quick):

@@ -10,10 +10,7 @@ alignment, the CPU time of a frame without its features, and, for comparison, th
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,12 +18,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from experiments.frame_rate import features_of
+from experiments.common import features_of, online_error, recordings, script_options, timed
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
-from slam.evaluation.metrics import absolute_errors, associate
-from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
@@ -45,34 +40,27 @@ def sequences(quick: bool, seeds: int) -> Iterator[tuple[str, list[Sequence]]]:
     for world, frames in list(WORLDS.items())[: 1 if quick else None]:
         length = 30 if quick else frames
         yield world, [open_sequence(f"synthetic:{world}?frames={length}&seed={seed}") for seed in range(seeds)]
-    for name, folder in DRIVES.items():
-        drive = Path(os.environ.get("SLAM_DATA", "")) / folder
-        if not quick and os.environ.get("SLAM_DATA") and drive.is_dir():
-            yield name, [open_sequence(drive)]
+    for name, drive in recordings({} if quick else DRIVES).items():
+        yield name, [open_sequence(drive)]
 
 
 def run(sequence: Sequence, backend: str, features: list[StereoFeatures], settings: list[str]) -> tuple[float, float]:
     """RMSE of the online path [cm] and median CPU time of a frame [ms]."""
     config = SystemConfig.for_kind(sequence.kind, None, backend).with_settings(settings)
-    system, poses, times = StereoSlam(sequence.rig, None, backend, kind=sequence.kind, config=config), [], []
-    for seen in features:
-        start = time.process_time()
-        poses.append(system.process_features(seen).estimate.T_world_left)
-        times.append(1e3 * (time.process_time() - start))
-    path = Trajectory(np.array([seen.stamp for seen in features]), np.array(poses))
-    errors = absolute_errors(*associate(path, sequence.ground_truth, 0.02, interpolated=True))
-    return 100 * errors.translation_statistics.rmse, float(np.median(times[len(times) // 3 :]))
+    system = StereoSlam(sequence.rig, None, backend, kind=sequence.kind, config=config)
+    results, times = timed(system.process_features, features)
+    return 100 * online_error(results, sequence.ground_truth), float(np.median(times[len(times) // 3 :]))
 
 
-def rows(name: str, recordings: list[Sequence], counts: tuple[int | None, ...]) -> Iterator[list[object]]:
+def rows(name: str, same: list[Sequence], counts: tuple[int | None, ...]) -> Iterator[list[object]]:
     """A row for each back end and number of measurements."""
-    features = [features_of(sequence) for sequence in recordings]
+    features = [features_of(sequence) for sequence in same]
     for backend in BACKENDS:
         for count in counts:
 
             def found(setting: str, count: int | None = count, backend: str = backend) -> np.ndarray:
                 settings = [] if count is None else [f"{setting}={count}"]
-                return np.median([run(s, backend, seen, settings) for s, seen in zip(recordings, features)], axis=0)
+                return np.median([run(s, backend, seen, settings) for s, seen in zip(same, features)], axis=0)
 
             chosen = found("association.measured")
             fewer = None if count is None else float(found("map.target_in_view")[0])
@@ -108,14 +96,12 @@ def draw(path: Path, table: list[list[object]]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one world, 30 frames, two numbers")
+    parser = script_options(__file__, __doc__, "one world, 30 frames, two numbers")
     parser.add_argument("--seeds", type=int, default=2, help="of each world")
-    parser.add_argument("--out", type=Path, default=Path("results/informative"))
     arguments = parser.parse_args()
     table: list[list[object]] = []
-    for name, recordings in sequences(arguments.quick, 1 if arguments.quick else arguments.seeds):
-        for row in rows(name, recordings, COUNTS[-2:] if arguments.quick else COUNTS):
+    for name, same in sequences(arguments.quick, 1 if arguments.quick else arguments.seeds):
+        for row in rows(name, same, COUNTS[-2:] if arguments.quick else COUNTS):
             table.append(row)
             print(row, file=sys.stderr, flush=True)
     print(markdown(HEADER, table, 3))

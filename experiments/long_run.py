@@ -17,7 +17,6 @@ error and NEES. At the end, time and memory of the first and the last thousand f
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import os
@@ -33,6 +32,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
+from experiments.common import script_options
 from slam.data import IdArray, Observations
 from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
@@ -312,14 +312,12 @@ def setting(text: str) -> tuple[str, object]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two hundred frames")
+    parser = script_options(__file__, __doc__, "two hundred frames")
     parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"], help="any registered ones")
     parser.add_argument("--world", nargs="*", default=list(WORLDS), choices=list(WORLDS))
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", nargs="*", type=setting, default=[], metavar="KEY=VALUE", help="back-end options")
-    parser.add_argument("--out", type=Path, default=Path("results/long_run"))
     arguments = parser.parse_args()
     frames = 200 if arguments.quick else arguments.frames
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -22,6 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
 from slam.data import FrameResult
@@ -221,15 +222,13 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
+    parser = script_options(__file__, __doc__)
     parser.add_argument("--paths", nargs="*", default=["06"])
     parser.add_argument("--backend", nargs="*", default=list(BACKENDS))
     parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
     parser.add_argument("--only-paths", action="store_true")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--option", nargs="*", default=[])
-    parser.add_argument("--out", type=Path, default=Path("results/loops"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     quick = list(QUICK) if given.quick else []

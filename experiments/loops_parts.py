@@ -20,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import timed
 from experiments.loops import HEADER as ROW_HEADER
 from experiments.loops import QUICK, ROW_TEXTS, ate, drive, false_loops, nees, row
 from experiments.tables import markdown
@@ -68,16 +69,12 @@ def bounded() -> str:
             sequence = open_sequence(world)
             config = SystemConfig.for_kind(sequence.kind, None, "smoother").with_settings([f"backend.lag={lag}"])
             system = StereoSlam(sequence.rig, None, "smoother", config=config)
-            poses, times = [], []
-            for k in range(len(sequence)):
-                begin = time.process_time()
-                poses.append(system.process_features(sequence.observations(k)).estimate.T_world_left)
-                times.append(time.process_time() - begin)
+            results, times = timed(system.process_features, map(sequence.observations, range(len(sequence))))
             assert sequence.ground_truth is not None
-            truth = sequence.ground_truth.poses[: len(poses)]
-            online.append(1e3 * ate(np.array(poses), truth))
+            truth = sequence.ground_truth.poses[: len(results)]
+            online.append(1e3 * ate(np.array([result.estimate.T_world_left for result in results]), truth))
             final.append(1e3 * ate(system.trajectory().poses, truth))
-            slowest.append(1e3 * float(np.median(times[-50:])))
+            slowest.append(float(np.median(times[-50:])))
         for what, values in (("online", online), ("final", final)):
             rows.append([name, what, len(sequence), *values, 100 * (values[0] / values[1] - 1), *slowest])
     header = (

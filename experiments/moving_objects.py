@@ -11,7 +11,6 @@ they give noisy observations without images.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -23,6 +22,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
+from experiments.common import script_options
 from experiments.labelled_cars import Labels, hidden, labelled_speed, nearest_car, read_labels
 from experiments.object_runs import (
     body_row,
@@ -331,11 +331,9 @@ def rounded(tree: Any) -> Any:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few frames of each part")
+    parser = script_options(__file__, __doc__, "a few frames of each part")
     parser.add_argument("--observations", action="store_true", help="worlds as observations, not rendered")
     parser.add_argument("--only", default=",".join(PARTS), help="parts, joined by commas")
-    parser.add_argument("--out", type=Path, default=Path("results/moving_objects"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     parts = {

@@ -12,8 +12,6 @@ processor time, of which half is the front end's.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -24,6 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import recordings, script_options
 from experiments.tables import markdown, write_json
 from frontends import create
 from slam.config import SystemConfig
@@ -194,17 +193,14 @@ def table(faults: tuple[Fault, ...], places: dict[str, Path], last: int, trials:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two faults, one trial, ten frames of one drive")
+    parser = script_options(__file__, __doc__, "two faults, one trial, ten frames of one drive")
     parser.add_argument("--trials", type=int, default=10, help="runs of each row")
     parser.add_argument("--frames", type=int, default=60, help="of each drive, at most")
-    parser.add_argument("--out", type=Path, default=Path("results/perturbations"))
     arguments = parser.parse_args()
-    data = os.environ.get("SLAM_DATA")
-    if not data:
+    found = recordings(DRIVES)
+    if not found:
         print("perturbations: set SLAM_DATA to the folder that holds the drives; nothing was run")
         return 0
-    found = {name: Path(data) / folder for name, folder in DRIVES.items() if (Path(data) / folder).is_dir()}
     faults, trials, frames = FAULTS, arguments.trials, arguments.frames
     if arguments.quick:
         faults, trials, frames = (FAULTS[0], FAULTS[4]), 1, 15

@@ -14,7 +14,6 @@ missing. About three minutes of CPU time a seed.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -29,6 +28,7 @@ from threadpoolctl import threadpool_limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from frontends import create
 from slam.config import SystemConfig
@@ -177,13 +177,11 @@ def draw(found: dict[tuple[str, str], list[dict[str, float]]], path: Path) -> No
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, 20 frames")
+    parser = script_options(__file__, __doc__, "one seed, 20 frames")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--frames", default="880:1180", metavar="A:B", help="part of the recording")
     parser.add_argument("--world", default="synthetic:aisle", help="a rendered world")
-    parser.add_argument("--out", type=Path, default=Path("results/policies"))
     arguments = parser.parse_args()
     first, last = (int(n) for n in arguments.frames.split(":"))
     frames = range(first, first + 20 if arguments.quick else last)

@@ -9,8 +9,6 @@ median time of a frame. Draws the paths from above with the true one.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import recordings, script_options
 from experiments.tables import markdown, write_json
 from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
@@ -91,19 +90,14 @@ def true_path(folder: Path, estimate: Trajectory) -> np.ndarray | None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="ten frames of each sequence")
-    parser.add_argument("--out", type=Path, default=Path("results/real_sequences"))
+    parser = script_options(__file__, __doc__, "ten frames of each sequence")
     arguments = parser.parse_args()
-    data = os.environ.get("SLAM_DATA")
-    if not data:
+    found = recordings(SEQUENCES)
+    if not found:
         print("real sequences: set SLAM_DATA to the folder that holds them; nothing was run")
         return 0
-    found = {name: Path(data) / folder for name, folder in SEQUENCES.items() if (Path(data) / folder).is_dir()}
     if len(found) < len(SEQUENCES):
-        print(f"left out, not in {data}: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
-    if not found:
-        return 0
+        print(f"left out, not there: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
     frames = 10 if arguments.quick else None
     rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in BACKENDS]
     print(markdown(HEADER, rows, 2))

@@ -12,7 +12,6 @@ segments of 100 to 800 m, the CPU time of the back end's own calls, and how ofte
 
 from __future__ import annotations
 
-import argparse
 import csv
 import os
 import sys
@@ -26,6 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
+from experiments.common import script_options
 from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.data import Observations
@@ -194,13 +194,11 @@ def span(text: str) -> tuple[int, int]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="forty frames")
+    parser = script_options(__file__, __doc__, "forty frames")
     parser.add_argument("--backend", nargs="*", default=BACKENDS, metavar="NAME", help="back ends")
     parser.add_argument("--frames", type=span, default=(0, 1000), metavar="A:B", help="from A to before B")
     parser.add_argument("--wrong", type=float, nargs="*", default=[0.0], metavar="FRACTION", help="of wrong matches")
     parser.add_argument("--set", nargs="*", default=[], metavar="section.key=value", help="settings, as in slam run")
-    parser.add_argument("--out", type=Path, default=Path("results/recorded_tracks"))
     given = parser.parse_args()
     folder = Path(os.environ.get("SLAM_DATA", "."))
     if not (folder / f"{FILE}_sync_KLT.mat").is_file():

@@ -11,7 +11,6 @@ view, so that the ATE after alignment of the path from there on is given as well
 
 from __future__ import annotations
 
-import argparse
 import csv
 import os
 import sys
@@ -24,6 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
+from experiments.common import script_options
 from experiments.tables import markdown
 from slam.data import Observations
 from slam.evaluation.metrics import absolute_errors, nees, pose_residuals
@@ -179,11 +179,9 @@ def span(text: str) -> tuple[int, int]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a hundred steps from one start")
+    parser = script_options(__file__, __doc__, "a hundred steps from one start")
     parser.add_argument("--sigma", type=float, default=6.0, help="assumed pixel noise [px]")
     parser.add_argument("--parts", type=span, nargs="*", default=PARTS, metavar="A:B", help="steps from A to before B")
-    parser.add_argument("--out", type=Path, default=Path("results/starry_night"))
     arguments = parser.parse_args()
     folder = os.environ.get("SLAM_DATA")
     if not folder or not (Path(folder) / FILE).is_file():

@@ -12,7 +12,6 @@ planes as in Fig. 6, and the error over time with what the back end says of it).
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from backends import create
+from experiments.common import script_options
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry import se3
@@ -184,9 +184,7 @@ def draw(runs: list[StartUp], path: Path) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="30 frames instead of 150")
-    parser.add_argument("--out", type=Path, default=Path("results/startup"))
+    parser = script_options(__file__, __doc__, "30 frames instead of 150")
     arguments = parser.parse_args()
     sequence = open_sequence("synthetic:startup")
     assert isinstance(sequence, WorldSequence)

@@ -9,13 +9,13 @@ back ends, with the errors against the truth.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments.common import script_options
 from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler, available_cores
@@ -45,9 +45,7 @@ def row(run: Run) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the first twenty frames")
-    parser.add_argument("--out", type=Path, default=Path("results/walking_robot"))
+    parser = script_options(__file__, __doc__, "the first twenty frames")
     arguments = parser.parse_args()
     stop = 20 if arguments.quick else None
     plan = Plan(("synthetic:field",), ("ekf", "smoother"), stop=stop, replay=False)

@@ -1,0 +1,66 @@
+"""What experiments share: their options, the recordings that are there, runs with times, the error of a path."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from frontends import create
+from slam.config import SystemConfig
+from slam.data import FrameResult, StereoFeatures
+from slam.evaluation.metrics import absolute_errors, associate
+from slam.geometry.trajectory import Trajectory
+from slam.sequences import Sequence
+
+T = TypeVar("T")
+
+
+def script_options(script: str, doc: str | None, quick: str | None = None) -> argparse.ArgumentParser:
+    """A parser for a script with ``--quick`` and ``--out DIR``, by default ``results/NAME``.
+
+    Args:
+        script: its file.
+        doc: the docstring of its module.
+        quick: what ``--quick`` does.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--out", type=Path, default=Path("results") / Path(script).stem, metavar="DIR")
+    return parser
+
+
+def recordings(folders: Mapping[str, str]) -> dict[str, Path]:
+    """By name, those of some folders below SLAM_DATA that are there; none where it is not set."""
+    data = os.environ.get("SLAM_DATA")
+    return {name: Path(data) / f for name, f in folders.items() if (Path(data) / f).is_dir()} if data else {}
+
+
+def features_of(sequence: Sequence) -> list[StereoFeatures]:
+    """Features of every frame: those of a world as they are simulated, of a recording those of the front end."""
+    if hasattr(sequence, "observations"):
+        return [sequence.observations(k) for k in range(len(sequence))]
+    frontend = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend)
+    return [frontend.extract(frame) for frame in sequence]
+
+
+def timed(step: Callable[[T], FrameResult], frames: Iterable[T]) -> tuple[list[FrameResult], np.ndarray]:
+    """What a step of the system gives for each frame, and its CPU times (F,) [ms]."""
+    results, times = [], []
+    for frame in frames:
+        start = time.process_time()
+        results.append(step(frame))
+        times.append(1e3 * (time.process_time() - start))
+    return results, np.array(times)
+
+
+def online_error(results: Iterable[FrameResult], truth: Trajectory | None) -> float:
+    """RMSE of the positions as they were estimated frame by frame [m], after alignment without scale."""
+    estimates = [result.estimate for result in results]
+    path = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
+    return absolute_errors(*associate(path, truth, 0.02, interpolated=True)).translation_statistics.rmse
