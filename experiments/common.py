@@ -35,6 +35,12 @@ def script_options(script: str, doc: str | None, quick: str | None = None) -> ar
     return parser
 
 
+def span(text: str) -> tuple[int, int]:
+    """``A:B``: from A to before B."""
+    start, stop = text.split(":")
+    return int(start), int(stop)
+
+
 def recordings(folders: Mapping[str, str]) -> dict[str, Path]:
     """By name, those of some folders below SLAM_DATA that are there; none where it is not set."""
     data = os.environ.get("SLAM_DATA")

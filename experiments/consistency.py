@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
 from experiments.consistency_trials import BACKENDS, CASES, Trial, trials
+from experiments.tables import markdown
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry.se3 import Array
 
@@ -70,11 +71,6 @@ def nis_band(case: str, dof: int, updates: int, gate: float = 0.999) -> tuple[fl
     low, high = chi_square_band(1, dof)
     told = 1.0 if case == "drawn" else 1 - 6 * updates / dof
     return low * cut * told, high * cut
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "| --- | --- |" + " ---: |" * (len(header) - 2)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
 def accuracy_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
@@ -148,7 +144,8 @@ def report(results: dict[str, list[Trial]]) -> str:
     """The three tables."""
     tables = ((ACCURACY, accuracy_rows), (CONSISTENCY, consistency_rows), (WRONG_MATCHES, wrong_match_rows))
     return "\n\n".join(
-        table(header, [row for case, done in results.items() for row in rows(case, done)]) for header, rows in tables
+        markdown(header, [row for case, done in results.items() for row in rows(case, done)], 2)
+        for header, rows in tables
     )
 
 

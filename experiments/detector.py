@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.surf import medians
 from experiments.common import script_options
+from experiments.tables import markdown
 from frontends.surf import Surf
 from slam.sequences import open_sequence
 
@@ -82,16 +83,15 @@ def main() -> int:
     pictures = images(3 if arguments.quick else 25)
     table, radii = counts(pictures)
     ms = times(pictures[len(pictures) // 2], 3 if arguments.quick else 41)
-    head = ["D_threshold", *(f"octave {i + 1}" for i in range(OCTAVES)), "octaves 1 and 2", "paper A"]
-    lines = ["| " + " | ".join([*head, "ms, 1 octave", "ms, 2 octaves"]) + " |", "|" + " ---: |" * (len(head) + 2)]
+    octaves = (f"octave {i + 1}" for i in range(OCTAVES))
+    header, rows = ("D_threshold", *octaves, "octaves 1 and 2", "paper A", "ms, 1 octave", "ms, 2 octaves"), []
     for limit, row, time in zip(THRESHOLDS, table, ms):
         cells = [str(limit), *(f"{n:.0f}" for n in row), f"{row[:2].sum():.0f}", PAPER.get(limit, "")]
-        lines.append("| " + " | ".join([*cells, *(f"{t:.2f}" for t in time)]) + " |")
+        rows.append([*cells, *(f"{t:.2f}" for t in time)])
     shares = table[THRESHOLDS.index(100)] / max(table[THRESHOLDS.index(100)].sum(), 1)
     sizes = ", ".join(f"{np.median(r):.1f} px" for r in radii if len(r))
     first = f"At D_threshold 100, {100 * shares[:2].sum():.0f} % of all features are in the first two octaves"
-    lines += ["", f"{first}; median radius by octave: {sizes}."]
-    text = "\n".join(lines)
+    text = f"{markdown(header, rows, 0)}\n\n{first}; median radius by octave: {sizes}."
     print(text)
     (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
     draw(table, ms, radii, arguments.out / "detector.png")

@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import slam
 from experiments.common import script_options
 from experiments.long_run import DT, MODELS, RIG, Loop, measured, memory
+from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.data import FrameResult, FrameStatus, StereoFeatures, StereoFrame
 from slam.system import StereoSlam
@@ -125,13 +126,12 @@ def _darkened(item: StereoFrame | StereoFeatures) -> StereoFrame | StereoFeature
 def table(runs: dict[str, list[Part]]) -> str:
     """Some parts of every run."""
     header = ("run", "frames", "ms a frame", "memory [MB]", "open files", "landmarks", "not tracked, so far")
-    lines = ["| " + " | ".join(header) + " |", "| --- |" + " ---: |" * (len(header) - 1)]
+    rows = []
     for name, parts in runs.items():
         for i in sorted({0, 1, len(parts) // 2, len(parts) - 1}):
             p, lost = parts[i], sum(q.untracked for q in parts[: i + 1])
-            cells = (p.frame, f"{p.milliseconds:.1f}", f"{p.memory:.0f}", p.files, p.landmarks, lost)
-            lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+            rows.append((name, p.frame, f"{p.milliseconds:.1f}", f"{p.memory:.0f}", p.files, p.landmarks, lost))
+    return markdown(header, rows)
 
 
 def write_page(page: Path, text: str) -> None:

@@ -33,6 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
 from experiments.common import script_options
+from experiments.tables import markdown
 from slam.data import IdArray, Observations
 from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
@@ -250,22 +251,16 @@ _FORMATS = ("{}", "{:.2f}", "{:.2f}", "{:.0f}", "{:.1f}", "{}", "{:.0f}", "{:.1e
             "{:.0%}")  # fmt: skip
 
 
-def row(c: Checkpoint) -> str:
-    """A line of the table."""
-    return "| " + " | ".join(form.format(value) for form, value in zip(_FORMATS, astuple(c))) + " |"
-
-
 def table(done: Sequence[Checkpoint]) -> str:
     """The checkpoints, and what the last did to the first."""
-    lines = ["| " + " | ".join(HEADER) + " |", "|" + " ---: |" * len(HEADER), *map(row, done)]
+    rows = [[form.format(value) for form, value in zip(_FORMATS, astuple(c))] for c in done]
     first, last = done[min(1, len(done) - 1)], done[-1]  # in the first thousand the map is still growing
-    lines.append(
-        f"\nTime of a frame, last over first {done[0].frame} frames: {last.milliseconds / done[0].milliseconds:.2f} "
+    return (
+        f"{markdown(HEADER, rows, 0)}\n\nTime of a frame, last over first {done[0].frame} frames: {last.milliseconds / done[0].milliseconds:.2f} "
         f"(over the second: {last.milliseconds / first.milliseconds:.2f}); "
         f"memory beyond the trajectory: {last.beyond - first.beyond:+.1f} MB since frame {first.frame}; "
         f"covariance without Cholesky factor: {last.indefinite} times; failed updates: {last.failed}."
     )
-    return "\n".join(lines)
 
 
 def write_csv(path: Path, done: Sequence[Checkpoint]) -> None:

@@ -34,6 +34,7 @@ from experiments.object_runs import (
     steps,
     system_for,
 )
+from experiments.tables import markdown
 from experiments.twins import Twins
 from slam import registry
 from slam.compare.measure import Metric
@@ -316,8 +317,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def plain_table(rows: list[dict[str, Any]]) -> str:
     columns = [key for key, value in rows[0].items() if not isinstance(value, dict)]
-    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    return "\n".join(lines + ["| " + " | ".join(text(row.get(c)) for c in columns) + " |" for row in rows])
+    return markdown(columns, [[text(row.get(c)) for c in columns] for row in rows], len(columns))
 
 
 def text(value: Any) -> str:

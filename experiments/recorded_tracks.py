@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
-from experiments.common import script_options
+from experiments.common import script_options, span
 from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.data import Observations
@@ -185,12 +185,6 @@ def draw(found: Sequence[Run], path: Path) -> None:
     axis.axis("equal")
     axis.legend(frameon=False, fontsize=7)
     figure.savefig(path, dpi=110, metadata={"Software": None})
-
-
-def span(text: str) -> tuple[int, int]:
-    """``A:B`` as a range of frames."""
-    start, stop = text.split(":")
-    return int(start), int(stop)
 
 
 def main() -> int:

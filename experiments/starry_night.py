@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
-from experiments.common import script_options
+from experiments.common import script_options, span
 from experiments.tables import markdown
 from slam.data import Observations
 from slam.evaluation.metrics import absolute_errors, nees, pose_residuals
@@ -170,12 +170,6 @@ def cells(part: Part) -> list[str]:
         part.span, part.backend, f"{r['ok']} / {r['empty']} / {r['failed']}", str(r["rejected"]), f"{r['online']:.3f}",
         f"{r['turn']:.2f}", f"{r['final']:.3f}", f"{r['aligned']:.3f}", f"{r['landmarks']:.3f}", f"{r['nees']:.1f}",
     ]  # fmt: skip
-
-
-def span(text: str) -> tuple[int, int]:
-    """``A:B`` as a range of steps."""
-    start, stop = text.split(":")
-    return int(start), int(stop)
 
 
 def main() -> int:

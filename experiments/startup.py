@@ -20,8 +20,11 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from backends import create
 from experiments.common import script_options
+from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry import se3
@@ -150,12 +153,6 @@ def row(run: StartUp) -> list[str]:
     ]  # fmt: skip
 
 
-def table(rows: list[list[str]]) -> str:
-    """Rows as a Markdown table."""
-    lines = [HEADER, ["---"] * len(HEADER), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
 def draw(runs: list[StartUp], path: Path) -> None:
     """The figure: x-y and x-z planes as in paper B, Fig. 6, and the error over time."""
     import matplotlib
@@ -192,7 +189,7 @@ def main() -> int:
     cases = [(pixels, backend, start) for pixels in ("stereo", "left") for backend in BACKENDS for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
     runs += [by_itself(sequence, known, backend, start, frames) for backend in BACKENDS for start in STARTS]
-    text = table([row(run) for run in runs])
+    text = markdown(HEADER, [row(run) for run in runs], 3) + "\n"
     print(f"{len(known)} stored features, {frames} frames\n\n{text}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "startup.md").write_text(text, encoding="utf-8")
