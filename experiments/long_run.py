@@ -256,7 +256,8 @@ def table(done: Sequence[Checkpoint]) -> str:
     rows = [[form.format(value) for form, value in zip(_FORMATS, astuple(c))] for c in done]
     first, last = done[min(1, len(done) - 1)], done[-1]  # in the first thousand the map is still growing
     return (
-        f"{markdown(HEADER, rows, 0)}\n\nTime of a frame, last over first {done[0].frame} frames: {last.milliseconds / done[0].milliseconds:.2f} "
+        f"{markdown(HEADER, rows, 0)}\n\nTime of a frame, last over first {done[0].frame} frames: "
+        f"{last.milliseconds / done[0].milliseconds:.2f} "
         f"(over the second: {last.milliseconds / first.milliseconds:.2f}); "
         f"memory beyond the trajectory: {last.beyond - first.beyond:+.1f} MB since frame {first.frame}; "
         f"covariance without Cholesky factor: {last.indefinite} times; failed updates: {last.failed}."
