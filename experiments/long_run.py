@@ -251,9 +251,14 @@ _FORMATS = ("{}", "{:.2f}", "{:.2f}", "{:.0f}", "{:.1f}", "{}", "{:.0f}", "{:.1e
             "{:.0%}")  # fmt: skip
 
 
+def cells(c: Checkpoint) -> list[str]:
+    """A row of the table."""
+    return [form.format(value) for form, value in zip(_FORMATS, astuple(c))]
+
+
 def table(done: Sequence[Checkpoint]) -> str:
     """The checkpoints, and what the last did to the first."""
-    rows = [[form.format(value) for form, value in zip(_FORMATS, astuple(c))] for c in done]
+    rows = list(map(cells, done))
     first, last = done[min(1, len(done) - 1)], done[-1]  # in the first thousand the map is still growing
     return (
         f"{markdown(HEADER, rows, 0)}\n\nTime of a frame, last over first {done[0].frame} frames: "
@@ -325,7 +330,7 @@ def main() -> int:
             for c in run(name, frames, max(1, min(1000, frames // 4)), WORLDS[world](), arguments.seed,
                          **dict(arguments.set)):  # fmt: skip
                 done.append(c)
-                print(f"{name} {world} {row(c)}", file=sys.stderr, flush=True)
+                print(f"{name} {world} {cells(c)}", file=sys.stderr, flush=True)
                 write_csv(arguments.out / f"{name}_{world}.csv", done)
             texts.append(f"# {name}, {world}, {frames} frames\n\n{table(done)}")
             (arguments.out / "long_run.md").write_text("\n\n".join(texts) + "\n")

@@ -155,8 +155,8 @@ def draw(data: Data, found: list[Part], path: Path) -> None:
     top, *others = figure.subplots(1 + len(spans), 1, sharex=True)
     top.plot([len(data.seen(k)) for k in range(max(part.stop for part in found))], color="0.4", lw=0.8)
     top.set_ylabel("landmarks seen")
-    for axis, span in zip(others, spans):
-        for part in (p for p in found if p.span == span):
+    for axis, steps in zip(others, spans):
+        for part in (p for p in found if p.span == steps):
             axis.semilogy(range(part.start, part.stop), part.errors, lw=1, label=part.backend)
         axis.set_ylabel("error [m]")
     others[0].legend(frameon=False, fontsize=8)
