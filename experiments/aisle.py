@@ -56,7 +56,7 @@ class Remembered:
         return self._features[frame.index]
 
 
-class Judge:
+class AssociationCheck:
     """Counts right associations frame by frame, and keeps the last descriptors for the search for doubles.
 
     Args:
@@ -65,7 +65,7 @@ class Judge:
 
     def __init__(self, sequence: Any) -> None:
         self._points = SurfacePoints(sequence)
-        self._looks: dict[int, np.ndarray] = {}
+        self._descriptors: dict[int, np.ndarray] = {}
         self.score = AssociationScore(0, 0)
 
     def frame(self, result: FrameResult) -> None:
@@ -75,19 +75,19 @@ class Judge:
         right = int((error < 3).sum())
         self.score = AssociationScore(self.score.right + right, self.score.wrong + len(error) - right)
         self._points.add(result.index, result.added, uv[result.added_features])
-        looks = result.features.descriptors
-        self._looks.update(zip(result.added.tolist(), looks[result.added_features]))
+        new = result.features.descriptors[result.added_features]
+        self._descriptors.update(zip(result.added.tolist(), new))
 
-    def doubled(self, folder: Path, distance: float = 0.02, descriptor: float = 0.4) -> int:
-        """Pairs of landmarks nearer than `distance` [m] that looked alike at first sight."""
+    def doubled(self, folder: Path) -> int:
+        """Pairs of landmarks nearer than 2 cm whose first descriptors are less than 0.4 apart."""
         from scipy.spatial import cKDTree
 
         with (folder / "landmarks.csv").open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         positions = np.array([[float(r[c]) for c in "xyz"] for r in rows]).reshape(-1, 3)
-        looks = np.array([self._looks[int(r["id"])] for r in rows])
-        pairs = cKDTree(positions).query_pairs(distance, output_type="ndarray")
-        return int((np.linalg.norm(looks[pairs[:, 0]] - looks[pairs[:, 1]], axis=1) < descriptor).sum())
+        first = np.array([self._descriptors[int(r["id"])] for r in rows])
+        pairs = cKDTree(positions).query_pairs(0.02, output_type="ndarray")
+        return int((np.linalg.norm(first[pairs[:, 0]] - first[pairs[:, 1]], axis=1) < 0.4).sum())
 
 
 def position_errors(path: Trajectory, truth: Trajectory) -> np.ndarray:
@@ -102,8 +102,8 @@ def _mean_and_peak(errors: np.ndarray) -> tuple[float, float]:
 
 def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemConfig, out: Path) -> list[Any]:
     """Run one back end; its row of the table."""
-    judge = Judge(sequence)
-    summary = run(sequence, RunOptions(backend, "surf", config, out / backend), judge.frame, frontend)
+    check = AssociationCheck(sequence)
+    summary = run(sequence, RunOptions(backend, "surf", config, out / backend), check.frame, frontend)
     data = RunData.read(out / backend, backend)
     assert sequence.ground_truth is not None
     online = position_errors(data.online, sequence.ground_truth)
@@ -111,7 +111,7 @@ def row(sequence: Sequence, backend: str, frontend: Remembered, config: SystemCo
     tracked = summary["status"].get("tracked", 0) + summary["status"].get("started", 0)
     return [
         backend, f"{tracked} of {summary['frames']}", *_mean_and_peak(online), float(online[-1]),
-        *_mean_and_peak(final), summary["landmarks"], judge.doubled(out / backend), 100 * judge.score.precision,
+        *_mean_and_peak(final), summary["landmarks"], check.doubled(out / backend), 100 * check.score.precision,
         summary["consistency"]["NIS per degree of freedom"],
     ]  # fmt: skip
 

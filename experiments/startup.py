@@ -104,7 +104,7 @@ def start_up(sequence: WorldSequence, known: SavedMap, backend: str, start: str,
     config = SystemConfig.for_kind(sequence.kind, None)
     sigma_px = sequence.values["sigma"]
     models = replace(config.models, T_world_left=T.tolist(), pixel_sigma=sigma_px, motion=STANDING)
-    system = StereoSlam(sequence.rig, None, backend, config=replace(config, models=models), known_map=known)
+    system = StereoSlam(sequence.rig, None, backend, config=replace(config, models=models), prior_map=known)
     positions, sigma = [T[:3, 3]], []
     for k in range(frames):
         estimate = system.process_features(taken(sequence.observations(k), pixels)).estimate

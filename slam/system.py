@@ -78,7 +78,7 @@ class StereoSlam:
         backend: a name (see ``backends.names()``) or an object with `Backend`'s methods.
         kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
         config: all settings; overrides `kind`.
-        known_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames are lost until
+        prior_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames are lost until
             the camera is found in it. The back end must be given by name.
         rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
             corrected from the first frame on, and estimated further.
@@ -104,14 +104,14 @@ class StereoSlam:
         *,
         kind: str = "handheld",
         config: SystemConfig | None = None,
-        known_map: SavedMap | None = None,
+        prior_map: SavedMap | None = None,
         rig_prior: KeptCalibration | None = None,
     ) -> None:
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
         c = config or SystemConfig.for_kind(kind, *names)
-        if known_map is not None and len(known_map) > c.map.max_landmarks:  # all of it is kept
-            c = replace(c, map=replace(c.map, max_landmarks=len(known_map)))
+        if prior_map is not None and len(prior_map) > c.map.max_landmarks:  # all of it is kept
+            c = replace(c, map=replace(c.map, max_landmarks=len(prior_map)))
         self.config = c
         self.frontend: Frontend | None = (
             registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
@@ -125,7 +125,7 @@ class StereoSlam:
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
-        self.world_frame = FIRST_FRAME if known_map is None else known_map.world_frame
+        self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
         self._rig_error = RemainingRigError(self.calibration, c.models.pixel_sigma)
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self._aligner = Aligner(rig, c.association.align)
@@ -139,12 +139,12 @@ class StereoSlam:
         self._input_warnings = InputWarnings(rig, c.models, rows)
         self._stepping, self._extracting = OneThread("this system"), OneThread("this system's front end")
         self._stamp = -np.inf  # that the back end was last advanced to [s]
-        if known_map is not None:
-            known_map.require_fits(self.frontend_name)
-            self._relocalizer.search_in(known_map, self.backend)
-            self.landmarks = known_map.rows
-            self.atlas = Atlas.of_earlier_run(known_map.keyframes, known_map.keyframe_poses, known_map.loops)
-            self._last = _Last(dimensions=known_map.dimensions if len(known_map) else None, mapped=len(known_map) > 0)
+        if prior_map is not None:
+            prior_map.require_fits(self.frontend_name)
+            self._relocalizer.search_in(prior_map, self.backend)
+            self.landmarks = prior_map.rows
+            self.atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
+            self._last = _Last(dimensions=prior_map.dimensions if len(prior_map) else None, mapped=len(prior_map) > 0)
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
@@ -324,7 +324,7 @@ class StereoSlam:
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """The left camera's path: the latest estimate of each frame's pose; in a known map, since it was found."""
+        """The left camera's path: the latest estimate of each frame's pose; in a prior map, since it was found."""
         with self._stepping:
             return self.atlas.path(self._path())
 

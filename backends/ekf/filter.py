@@ -52,7 +52,7 @@ class EkfBackend:
         ConfigurationError: an option is unknown or out of range.
     """
 
-    #: Of a known map: with more, the joint covariance (72 N² bytes, and copies of it while it grows) is too large.
+    #: Of a prior map: with more, the joint covariance (72 N² bytes, and copies of it while it grows) is too large.
     most_landmarks = 2000
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008

@@ -246,7 +246,7 @@ class SelfCalibration:
     def _update(self) -> None:
         """Bayes' rule with what all pairs of views and all rows so far say."""
         for part in (self._rows, self._motion):
-            part.judge(self._solution.mean, self._solution.inner)
+            part.update_inflation(self._solution.mean, self._solution.inner)
         found = self.evidence()
         assert found is not None  # as there are pairs
         if self._kept:

@@ -108,7 +108,7 @@ class Accumulator:
             whole += block
         return [whole.scaled(1 / self.inflation)]
 
-    def judge(self, mean: Array, covariance: Array) -> None:
+    def update_inflation(self, mean: Array, covariance: Array) -> None:
         """Estimate the inflation anew from the scatter of the blocks' gradients.
 
         Args:

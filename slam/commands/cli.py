@@ -109,11 +109,11 @@ def run_command(
     record: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
     ] = None,
-    known_map: Annotated[
+    prior_map: Annotated[
         Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")
     ] = None,
     save_map: Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")] = None,
-    mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a known map.")] = False,
+    mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a prior map.")] = False,
     calibration: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),
@@ -143,7 +143,7 @@ def run_command(
     from slam.sequences import is_live
 
     wanted = Wanted(
-        sequence, config, backend, frontend, settings or (), frames, kind, format, known_map, mono, calibration
+        sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
     )
     opened, options, origin = prepare(wanted)
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)

@@ -31,7 +31,7 @@ class Wanted:
         frames: ``A:B``.
         kind: of motion.
         format: of the sequence.
-        known_map: file of a map to start in.
+        prior_map: file of a map to start in.
         mono: whether to use the left images alone.
         calibration: file with what is known of the rig's error.
     """
@@ -44,7 +44,7 @@ class Wanted:
     frames: str | None = None
     kind: str | None = None
     format: str | None = None
-    known_map: Path | None = None
+    prior_map: Path | None = None
     mono: bool = False
     calibration: Path | None = None
 
@@ -56,7 +56,7 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
         SlamError: bad input; one line says what and where.
     """
     before = (
-        None if wanted.config is None else load(wanted.config, wanted.sequence, wanted.known_map, wanted.calibration)
+        None if wanted.config is None else load(wanted.config, wanted.sequence, wanted.prior_map, wanted.calibration)
     )
     if before is not None and wanted.kind is not None:
         raise ConfigurationError("--kind does not go with --config: settings of a kind of motion are already in it")
@@ -69,9 +69,9 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     frontend = wanted.frontend or (before.frontend if before is not None else _FRONTEND)
     backend = wanted.backend or (before.backend if before is not None else _BACKEND)
     mono = wanted.mono or (before is not None and before.origin.mono)
-    known_map = wanted.known_map or (before.origin.known_map if before is not None else None)
+    prior_map = wanted.prior_map or (before.origin.prior_map if before is not None else None)
     calibration = wanted.calibration or (before.origin.calibration if before is not None else None)
-    if mono and known_map is None:
+    if mono and prior_map is None:
         raise ConfigurationError("--mono needs --map FILE: left images alone do not tell how large the world is")
     kind = wanted.kind or (opened.kind if before is None else before.origin.kind)
     config = SystemConfig.for_kind(kind, frontend, backend)
@@ -81,9 +81,9 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     start, stop = (before.start, before.stop) if before is not None else (0, None)
     if wanted.frames is not None:
         start, stop = parse_frames(wanted.frames)
-    options = RunOptions(backend, frontend, config, Path(), start, stop, known_map=known_map, mono=mono)
+    options = RunOptions(backend, frontend, config, Path(), start, stop, prior_map=prior_map, mono=mono)
     options = replace(options, calibration=calibration)
-    return opened, options, Origin(command_line(), text or "", format, kind, known_map, mono, calibration)
+    return opened, options, Origin(command_line(), text or "", format, kind, prior_map, mono, calibration)
 
 
 def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:

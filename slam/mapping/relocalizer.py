@@ -66,11 +66,11 @@ class Relocalizer:
         """Look for the camera in a map before any back end starts.
 
         Raises:
-            ConfigurationError: the back end was not given by its name, or cannot start in a known map.
+            ConfigurationError: the back end was not given by its name, or cannot start in a prior map.
             SlamError: the map is empty, or too large for the back end.
         """
         if self._backend is None:
-            raise ConfigurationError("a system that starts in a known map needs its back end by name")
+            raise ConfigurationError("a system that starts in a prior map needs its back end by name")
         if not len(known) and not known.keyframes:
             raise SlamError(f"{known.source}: the map holds no landmarks, so the camera cannot be found in it")
         self.search = MapSearch(known, self._rig, self._localizer, self._models.initial_pose)
@@ -110,7 +110,7 @@ class Relocalizer:
 
 
 class MapSearch:
-    """Looks for the camera in a known map, by descriptors over the whole map and a geometric check.
+    """Looks for the camera in a prior map, by descriptors over the whole map and a geometric check.
 
     Args:
         known: the map.
@@ -148,11 +148,11 @@ class MapSearch:
         """Give a back end the map.
 
         Raises:
-            ConfigurationError: it cannot start in a known map.
+            ConfigurationError: it cannot start in a prior map.
             SlamError: it cannot hold a map of this size.
         """
         if not isinstance(backend, MapBackend):
-            raise ConfigurationError(f"{type(backend).__name__} cannot start in a known map: it has no insert")
+            raise ConfigurationError(f"{type(backend).__name__} cannot start in a prior map: it has no insert")
         most = getattr(backend, "most_landmarks", None)
         if most is not None and len(self.known) > most:
             name = type(backend).__name__

@@ -29,7 +29,7 @@ class Origin:
         sequence: as `slam.open_sequence` takes it.
         format: of the sequence; None for found out.
         kind: kind of motion that the defaults are for.
-        known_map: file of the map that it starts in; None for none.
+        prior_map: file of the map that it starts in; None for none.
         mono: whether the left images are used alone.
         calibration: file with what is known of the rig's error; None for none.
     """
@@ -38,7 +38,7 @@ class Origin:
     sequence: str
     format: str | None
     kind: str
-    known_map: Path | None = None
+    prior_map: Path | None = None
     mono: bool = False
     calibration: Path | None = None
 
@@ -49,7 +49,7 @@ class Origin:
             "source": {"format": self.format, **_places(self.sequence, folder, self.format in ("synthetic", "camera"))},
             "kind": self.kind,
             "mono": self.mono,
-            "known_map": None if self.known_map is None else _places(str(self.known_map), folder),
+            "prior_map": None if self.prior_map is None else _places(str(self.prior_map), folder),
             "calibration": None if self.calibration is None else _places(str(self.calibration), folder),
         }
 
@@ -76,14 +76,14 @@ class Repeat:
 
 
 def load(
-    path: Path, sequence: str | None = None, known_map: Path | None = None, calibration: Path | None = None
+    path: Path, sequence: str | None = None, prior_map: Path | None = None, calibration: Path | None = None
 ) -> Repeat:
     """Read the ``config.json`` of a run.
 
     Args:
         path: the file, or the run's folder.
         sequence: taken in place of the run's own.
-        known_map: taken in place of the run's own.
+        prior_map: taken in place of the run's own.
         calibration: likewise.
 
     Raises:
@@ -95,14 +95,14 @@ def load(
         tree = _restored(json.loads(file.read_text(encoding="utf-8")))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        source, known, kept = tree.get("source") or {}, tree.get("known_map"), tree.get("calibration")
+        source, known, kept = tree.get("source") or {}, tree.get("prior_map"), tree.get("calibration")
         start, stop = tree["frames"]
         origin = Origin(
             str(tree.get("command", "")),
             sequence or (_found(source, file) if source else ""),
             source.get("format"),
             str(tree.get("kind", "handheld")),
-            known_map or (Path(_found(known, file)) if known else None),
+            prior_map or (Path(_found(known, file)) if known else None),
             bool(tree.get("mono", False)),
             calibration or (Path(_found(kept, file)) if kept else None),
         )

@@ -49,7 +49,7 @@ class RunOptions:
         out: folder for the files.
         start, stop: range of frames; `stop` None for all.
         record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
-        known_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
+        prior_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
         calibration: file with what is known of the rig's error, see `slam.calibration.kept`; None for nothing.
         mono: use the left images alone.
@@ -65,7 +65,7 @@ class RunOptions:
     start: int = 0
     stop: int | None = None
     record: Path | None = None
-    known_map: Path | None = None
+    prior_map: Path | None = None
     save_map: Path | None = None
     calibration: Path | None = None
     mono: bool = False
@@ -104,8 +104,8 @@ def run(
             require_target(target)
     if options.record is not None and options.record == options.save_map:
         raise SlamError(f"{options.record}: the recording and the map cannot be one file")
-    if options.known_map is not None and options.record is not None:
-        raise SlamError("a run that starts in a known map cannot be recorded: the recording would lack the map")
+    if options.prior_map is not None and options.record is not None:
+        raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
     if options.config.map.monocular and options.record is not None:
         raise SlamError("a run with map.monocular cannot be recorded: a recording holds stereo observations alone")
     frames = sequence.frames(options.start, options.stop)
@@ -115,14 +115,14 @@ def run(
         frames = iter(live)
     if options.mono:
         frames = (replace(frame, right=None) for frame in frames)
-    known = None if options.known_map is None else load_map(options.known_map)
+    known = None if options.prior_map is None else load_map(options.prior_map)
     rig_prior = None if options.calibration is None else load_calibration(options.calibration)
     system = StereoSlam(
         sequence.rig,
         frontend or options.frontend,
         options.backend,
         config=options.config,
-        known_map=known,
+        prior_map=known,
         rig_prior=rig_prior,
     )
     record = RunRecord()
@@ -304,7 +304,7 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "tracking": outcome(record, sequence.rig, getattr(system, "warnings", ()), options.known_map is not None),
+        "tracking": outcome(record, sequence.rig, getattr(system, "warnings", ()), options.prior_map is not None),
         "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
     }
     if live is not None:

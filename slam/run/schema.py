@@ -13,7 +13,7 @@ STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "obje
 
 #: Frames of coordinates.
 FRAMES = {
-    "world": "the left camera's axes in the first frame, x right, y down, z forward; in a known map, the map's world",
+    "world": "the left camera's axes in the first frame, x right, y down, z forward; in a prior map, the map's world",
     "body": "fixed to a moving body; when it is found the axes are the world's, the origin is the mean of its points",
 }
 
@@ -61,7 +61,7 @@ FRAME_TABLE = (
         ("keyframe", "loop", "refused"),
         "",
         "1 for a keyframe, else 0; the earlier frame of the same place, where a loop is closed (`map`: it is in the "
-        "known map); the same for a loop that is refused because it contradicts the path",
+        "prior map); the same for a loop that is refused because it contradicts the path",
     ),
     Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
     Columns(

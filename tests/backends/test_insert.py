@@ -78,7 +78,7 @@ def squared_distance(estimate, truth):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_camera_is_found_in_a_known_map(name):
+def test_the_camera_is_found_in_a_prior_map(name):
     scene = Scene()
     backend = tracked(name, scene)
     assert isinstance(backend, MapBackend)
@@ -102,7 +102,7 @@ def test_measuring_makes_the_map_better_and_its_covariances_fit(name):
 
 
 @pytest.mark.parametrize("name", ("ekf", "smoother"))
-def test_left_pixels_alone_are_enough_in_a_known_map(name):
+def test_left_pixels_alone_are_enough_in_a_prior_map(name):
     scene = Scene(mono=True)
     estimate = tracked(name, scene).estimate()
     assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
@@ -159,7 +159,7 @@ def test_the_smoother_keeps_what_was_known_when_it_is_rebuilt():
     assert np.linalg.norm(last[:3, 3] - scene.poses[-1][:3, 3]) < 0.05
 
 
-def test_the_smoother_with_a_lag_tracks_in_a_known_map():
+def test_the_smoother_with_a_lag_tracks_in_a_prior_map():
     scene = Scene(frames=30)
     estimate = tracked("smoother", scene, {"lag": 12}).estimate()
     assert np.linalg.norm(estimate.T_world_left[:3, 3] - scene.poses[-1][:3, 3]) < 0.05

@@ -92,7 +92,7 @@ def read_map(rng: np.random.Generator, folder: Path) -> None:
         archive = broken_bytes(rng, archive)
     signed = b"surf-stereo-slam map 4\n" + hashlib.sha256(archive).hexdigest().encode() + b"\n" + archive
     rig, frames = scene()
-    system = StereoSlam(rig, None, choose(rng, _BACKENDS), known_map=decode(signed, "a.map"))
+    system = StereoSlam(rig, None, choose(rng, _BACKENDS), prior_map=decode(signed, "a.map"))
     for features in frames[:3]:
         system.process_features(features)
     system.snapshot()
@@ -112,7 +112,7 @@ def large_map(rng: np.random.Generator, folder: Path) -> None:
         name = choose(rng, ("positions", "covariances", "descriptors"))
         known = replace(known, **{name: (getattr(known, name) * scale).astype(getattr(known, name).dtype)})
     rig, frames = scene()
-    system = StereoSlam(rig, None, "ekf" if len(known) > 4999 else choose(rng, _BACKENDS), known_map=known)
+    system = StereoSlam(rig, None, "ekf" if len(known) > 4999 else choose(rng, _BACKENDS), prior_map=known)
     for features in frames[:2]:
         system.process_features(features)
 

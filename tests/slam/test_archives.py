@@ -142,4 +142,4 @@ def test_a_map_that_the_filter_cannot_hold_is_refused_in_a_line():
     )  # fmt: skip
     rig = open_sequence("synthetic:desk?frames=1").rig
     with pytest.raises(SlamError, match="100000 landmarks, but EkfBackend takes a map of at most 2000"):
-        StereoSlam(rig, None, "ekf", known_map=known)
+        StereoSlam(rig, None, "ekf", prior_map=known)

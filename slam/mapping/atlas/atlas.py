@@ -111,7 +111,7 @@ class Atlas:
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused as they contradict the path.
 
-        In a known map, its keyframes are counted too, and apart as ``known``.
+        In a prior map, its keyframes are counted too, and apart as ``known``.
         """
         closed = sum(loop.second >= self.known for loop in self.loops)
         known = {"known": self.known} if self.known else {}
@@ -141,7 +141,7 @@ class Atlas:
             rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
             poses[self.known :] = path.poses[rows]
         count, m = len(self), len(rig.known)
-        none = np.zeros((6, m))  # where a known map was made without them
+        none = np.zeros((6, m))  # where a prior map was made without them
         shares = np.array([k.shares if k.shares.shape[1] == m else none for k in self.keyframes]).reshape(6 * count, m)
         common = (shares @ rig.root).reshape(count, 6, rig.scale.shape[1] + 1)
         common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]

@@ -23,7 +23,7 @@ from slam.mapping.atlas.keyframes import (
     step_covariance,
     view_has_changed,
 )
-from slam.mapping.atlas.loops import Sighting, alike, sighting
+from slam.mapping.atlas.loops import Verified, alike, verify
 from slam.mapping.atlas.places import Vectors
 from slam.mapping.atlas.shelf import Shelf
 from slam.mapping.mapper import KnownPlace, Returned, Step
@@ -112,7 +112,7 @@ class LoopCloser:
         index = atlas.index.with_new(descriptors)
         kept = new if self._shelf is None else self._shelf.put(new)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
-        best = self._best_sighting(atlas, candidates, step.features, step.index)
+        best = self._best_verified(atlas, candidates, step.features, step.index)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
 
     @one_blas_thread
@@ -128,7 +128,7 @@ class LoopCloser:
             return None
         features = self._rectify(features)
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
-        loops = [loop for loop, _ in self._sightings(atlas, self._ranked(atlas, likely, features), features, seed)]
+        loops = [loop for loop, _ in self._verified(atlas, self._ranked(atlas, likely, features), features, seed)]
         if not loops:
             return None
         loop = max(loops, key=lambda one: one.inliers)
@@ -242,16 +242,16 @@ class LoopCloser:
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
 
-    def _best_sighting(
+    def _best_verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
-    ) -> tuple[Loop, Sighting] | None:
+    ) -> tuple[Loop, Verified] | None:
         """The candidate with which most features agree on a pose."""
-        found = self._sightings(atlas, candidates, features, seed)
+        found = self._verified(atlas, candidates, features, seed)
         return max(found, key=lambda one: one[0].inliers, default=None)
 
-    def _sightings(
+    def _verified(
         self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
-    ) -> list[tuple[Loop, Sighting]]:
+    ) -> list[tuple[Loop, Verified]]:
         """The candidates with which enough features agree on a pose, as loops that end at the present camera.
 
         Their second number is that of the newest keyframe, which the camera is unless it is lost.
@@ -259,7 +259,7 @@ class LoopCloser:
         X = self._rectified.T_left_rectified
         A, found = adjoint(X), []
         for k in candidates.tolist():
-            seen = sighting(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
+            seen = verify(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
                 # Both poses have what their frames add, which is no more than what such measurements are off by.
                 T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
@@ -267,12 +267,12 @@ class LoopCloser:
         return found
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
-        """Whether two sightings put the camera at places nearer to each other than what it sees there."""
+        """Whether two verified loops put the camera at places nearer to each other than what it sees there."""
         T, U = (atlas.pose_in_map(loop.first) @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
-        self, atlas: Atlas, loop: Loop, seen: Sighting, rig: CommonError, path: Callable[[], Trajectory]
+        self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
         from slam.mapping.atlas.pose_graph import PoseGraph
@@ -319,7 +319,7 @@ class LoopCloser:
         _, P = chain.motion(last.second, loop.second)
         return bool(np.trace(P[3:, 3:]) > np.trace(loop.covariance[3:, 3:]))
 
-    def _returned(self, keyframe: Keyframe, seen: Sighting) -> Returned:
+    def _returned(self, keyframe: Keyframe, seen: Verified) -> Returned:
         """The old keyframe's features that agree, in the coordinates of the present left camera."""
         m, X, back = seen.matches, self._rectified.T_left_rectified, inverse(seen.T_keyframe_left)
         points = keyframe.points[m.landmarks].astype(float)

@@ -26,7 +26,7 @@ _CONVERGED = 1e-6  # step [rad], [m]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Verified:
     """A keyframe's place, seen again.
 
     Attributes:
@@ -47,14 +47,14 @@ def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfi
     return len(match_everywhere(keyframe.descriptors.astype(np.float32), keyframe.laplacian, features, config))
 
 
-def sighting(
+def verify(
     keyframe: Keyframe,
     features: StereoFeatures,
     rig: StereoRig,
     localizer: Localizer,
     config: AtlasConfig,
     seed: int,
-) -> Sighting | None:
+) -> Verified | None:
     """The present camera's pose before a keyframe, or None where too few features agree on one, or all in one spot.
 
     Args:
@@ -80,7 +80,7 @@ def sighting(
     T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
     slide = _SLIDE / rig.left.fu
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
-    return Sighting(T, covariance, noise, Matches(ids.astype(np.intp), seen))
+    return Verified(T, covariance, noise, Matches(ids.astype(np.intp), seen))
 
 
 def refined_pose(

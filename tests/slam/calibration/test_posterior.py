@@ -70,7 +70,7 @@ def test_errors_that_last_are_counted_as_such(length):
             sums.add(evidence(x, 1.0))
         for _ in range(5):
             solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6), np.ones(1)), 0.0, sums.total())
-            sums.judge(solution.mean, solution.inner)
+            sums.update_inflation(solution.mean, solution.inner)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9

@@ -79,12 +79,12 @@ def test_a_recording_is_found_by_its_absolute_and_by_its_relative_path(here, rec
     assert load(here / "third").config == found.config
 
 
-def test_a_known_map_is_found_again(here):
+def test_a_prior_map_is_found_again(here):
     slam("run", WORLD, "--save-map", "desk.map", "--out", "first", "-q", "--no-picture")
     slam("run", WORLD, "--map", "desk.map", "--mono", "--frames", "0:3", "--out", "second", "-q", "--no-picture")
     before = load(here / "second")
     assert before.origin.mono
-    assert before.origin.known_map == here / "desk.map"
+    assert before.origin.prior_map == here / "desk.map"
     assert before.config.map.monocular
     slam("run", "--config", "second", "--out", "third", "-q", "--no-picture")
     assert (here / "second/trajectory.txt").read_bytes() == (here / "third/trajectory.txt").read_bytes()

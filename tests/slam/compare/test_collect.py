@@ -103,7 +103,7 @@ def test_frames_that_are_not_tracked_are_counted_and_left_out_of_the_accuracy():
 
 
 def test_frames_without_a_pose_are_counted_too():
-    """A camera that starts in a known map and has not been found yet has no pose at all."""
+    """A camera that starts in a prior map and has not been found yet has no pose at all."""
     measured = collected({k: FrameStatus.LOST for k in range(12)}, located=range(12))
     assert measured.metrics["tracked"] == pytest.approx(0.9)
     assert measured.metrics["frames_lost"] == pytest.approx(0.1)

@@ -177,7 +177,7 @@ def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
     cloud = Cloud(150)
     known = first_run(backend, cloud=cloud).snapshot()
     start = se3.exp(np.array([0.02, -0.15, 0.05, -0.3, 0.1, 0.4]))
-    system = StereoSlam(RIG, None, backend, config=CONFIG, known_map=known)
+    system = StereoSlam(RIG, None, backend, config=CONFIG, prior_map=known)
     assert system.snapshot() is known
     dark = system.process_features(StereoFeatures.empty(0.0, 32))
     assert dark.status is FrameStatus.LOST and not dark.located and dark.map_size == len(known)
@@ -195,7 +195,7 @@ def test_a_second_run_elsewhere_in_the_map_is_in_the_maps_world(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backend):
     known = first_run(backend).snapshot()
-    system, elsewhere = StereoSlam(RIG, None, backend, config=CONFIG, known_map=known), Cloud(150, seed=9)
+    system, elsewhere = StereoSlam(RIG, None, backend, config=CONFIG, prior_map=known), Cloud(150, seed=9)
     for k, T in enumerate(path(8)):
         result = system.process_features(elsewhere.features(T, k / 30, 0.3)[0])
         assert result.status is FrameStatus.LOST and not len(result.added)
@@ -205,7 +205,7 @@ def test_where_nothing_is_known_the_camera_stays_lost_and_the_map_as_it_is(backe
 
 def test_descriptors_of_another_kind_are_refused():
     known = first_run("ekf").snapshot()
-    system = StereoSlam(RIG, None, "ekf", config=CONFIG, known_map=known)
+    system = StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=known)
     assert system.process_features(StereoFeatures.empty(0.0, 64)).status is FrameStatus.LOST  # nothing to see
     features, _ = Cloud(60, dimensions=64).features(np.eye(4), 1.0)
     with pytest.raises(SlamError, match="descriptors have 64 numbers, those of earlier frames 32"):
@@ -214,15 +214,15 @@ def test_descriptors_of_another_kind_are_refused():
     with pytest.raises(MeasurementError, match="not later"):
         system.process_features(StereoFeatures.empty(1.5, 32))
     with pytest.raises(SlamError, match="front end 'orb'"):
-        StereoSlam(RIG, "surf", "ekf", known_map=replace(known, frontend="orb"))
+        StereoSlam(RIG, "surf", "ekf", prior_map=replace(known, frontend="orb"))
     with pytest.raises(ConfigurationError, match="by name"):
-        StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, known_map=known)
+        StereoSlam(RIG, None, StereoSlam(RIG, None, "ekf").backend, prior_map=known)
 
 
-def test_a_known_map_that_is_larger_than_the_limit_is_kept():
+def test_a_prior_map_that_is_larger_than_the_limit_is_kept():
     known = first_run("ekf").snapshot()
     small = replace(CONFIG, map=replace(CONFIG.map, target_in_view=10, max_landmarks=10))
-    system = StereoSlam(RIG, None, "ekf", config=small, known_map=known)
+    system = StereoSlam(RIG, None, "ekf", config=small, prior_map=known)
     assert system.config.map.max_landmarks == len(known) > 10
 
 
@@ -233,7 +233,7 @@ def test_an_empty_map_is_refused():
         known.seen[:0], known.in_view[:0],
     )  # fmt: skip
     with pytest.raises(SlamError, match="holds no landmarks"):
-        StereoSlam(RIG, None, "ekf", config=CONFIG, known_map=empty)
+        StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=empty)
 
 
 def test_there_is_no_map_before_the_first_frame():

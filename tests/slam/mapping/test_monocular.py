@@ -110,11 +110,11 @@ def map_of(cloud, rows=slice(None)):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_left_images_alone_in_a_known_map_go_on_beyond_it(backend):
+def test_left_images_alone_in_a_prior_map_go_on_beyond_it(backend):
     """A third of the points is known; the others join the map by two views, where they truly are."""
     cloud = Cloud(150)
     config = SystemConfig().with_settings(["map.monocular=true", "models.pixel_sigma=0.5"])
-    system = StereoSlam(RIG, None, backend, config=config, known_map=map_of(cloud, slice(0, 50)))
+    system = StereoSlam(RIG, None, backend, config=config, prior_map=map_of(cloud, slice(0, 50)))
     owner: dict[int, int] = {}
     for k in range(40):
         T = se3.exp(np.array([0, 0, 0, 0.6 * k / 30, 0, 0]))  # sideways: forward motion shows little depth
@@ -146,7 +146,7 @@ def test_the_desk_with_left_images_alone(backend):
     known = SavedMap(*(getattr(whole, name)[rows] for name in names))
     truth = np.linalg.inv(one.ground_truth.poses[0]) @ two.ground_truth.poses
     config = config.with_settings(["map.monocular=true"])
-    system, errors = StereoSlam(one.rig, None, backend, config=config, known_map=known), []
+    system, errors = StereoSlam(one.rig, None, backend, config=config, prior_map=known), []
     for k in range(60, 160):
         features = two.observations(k)
         result = system.process_features(replace(features, uv_right=features.uv_right * np.nan))

@@ -246,7 +246,7 @@ def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tm
     slam.save_map(tmp_path / "first.map", first)
     known = slam.load_map(tmp_path / "first.map")
     config = system_for(sequence, "ekf").config
-    second = slam.StereoSlam(sequence.rig, None, "ekf", config=config, known_map=known)
+    second = slam.StereoSlam(sequence.rig, None, "ekf", config=config, prior_map=known)
     results = [second.process_features(sequence.observations(40 + k)) for k in range(12)]
     assert results[-1].status.value == "tracked"
     before, after = first.atlas, second.snapshot()

@@ -18,7 +18,7 @@ from slam.mapping.atlas.keyframes import (
     view_has_changed,
     what_was_added,
 )
-from slam.mapping.atlas.loops import refined_pose, sighting
+from slam.mapping.atlas.loops import refined_pose, verify
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import Localizer
@@ -73,7 +73,7 @@ def test_the_pose_of_a_place_seen_again():
         points, descriptors = world(seed)
         old = keyframe(view(np.eye(4), points, descriptors, 2 * seed))
         measured = view(MOVED, points, descriptors, 2 * seed + 1)
-        found = sighting(old, measured, RIG, LOCALIZER, AtlasConfig(), seed)
+        found = verify(old, measured, RIG, LOCALIZER, AtlasConfig(), seed)
         assert found is not None and len(found.matches) > 50
         error = log(inverse(found.T_keyframe_left) @ MOVED)
         assert np.linalg.norm(error[3:]) < 0.15 and np.linalg.norm(error[:3]) < 0.01
@@ -101,7 +101,7 @@ def test_least_squares_knows_how_sure_it_is():
 def test_another_place_is_not_the_same():
     old = keyframe(view(np.eye(4), *world(0), 0))
     for seed in range(1, 11):
-        assert sighting(old, view(MOVED, *world(seed), seed), RIG, LOCALIZER, AtlasConfig(), seed) is None
+        assert verify(old, view(MOVED, *world(seed), seed), RIG, LOCALIZER, AtlasConfig(), seed) is None
 
 
 def test_matches_in_one_spot_are_not_enough():
@@ -109,8 +109,8 @@ def test_matches_in_one_spot_are_not_enough():
     rng = np.random.default_rng(0)
     spot = np.column_stack([rng.uniform(0, 0.5, 300), rng.uniform(0, 0.5, 300), rng.uniform(9, 10, 300)])
     old, seen = keyframe(view(np.eye(4), spot, descriptors, 0)), view(MOVED, spot, descriptors, 1)
-    assert sighting(old, seen, RIG, LOCALIZER, AtlasConfig(), 0) is None
-    assert sighting(old, seen, RIG, LOCALIZER, AtlasConfig(spread=0.0), 0) is not None
+    assert verify(old, seen, RIG, LOCALIZER, AtlasConfig(), 0) is None
+    assert verify(old, seen, RIG, LOCALIZER, AtlasConfig(spread=0.0), 0) is not None
 
 
 def test_moving_features_are_not_kept():
