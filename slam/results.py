@@ -10,7 +10,8 @@ import numpy as np
 from slam.data import CommonError, FrameResult, FrameStatus, Revision, UpdateStatus
 from slam.geometry.se3 import Array, inverse
 from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.mapper import MapChange, Step
+from slam.mapping.mapper import MapChange
+from slam.mapping.step import Step
 from slam.object_data import MovingObject
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import overload
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from slam import registry
 from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfCalibration
 from slam.config import SystemConfig
-from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame
+from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame, UpdateReport
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -20,8 +20,9 @@ from slam.landmarks import LandmarkRows
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
-from slam.mapping.mapper import MapChange, Mapper, Step
+from slam.mapping.mapper import MapChange, Mapper
 from slam.mapping.relocalizer import Relocalizer
+from slam.mapping.step import Associated, Completed, Step
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
@@ -38,30 +39,6 @@ from slam.tracking.state import TrackingState
 
 #: How far from its row a front end looks for a feature's partner, where it does not say [px].
 _ROWS = 1.5
-
-
-@dataclass(frozen=True)
-class _Last:
-    """What completed steps leave for the next one, besides the map.
-
-    Attributes:
-        index: of the last frame.
-        state: how localization has gone.
-        dimensions: length of the descriptors; None before the first feature.
-        mapped: whether there ever was a landmark.
-        anchors: what landmarks looked like at first sight.
-    """
-
-    index: int = -1
-    state: TrackingState = field(default_factory=TrackingState)
-    dimensions: int | None = None
-    mapped: bool = False
-    anchors: Anchors = field(default_factory=Anchors.none)
-
-    def after(self, step: Step, change: MapChange, anchors: Anchors) -> _Last:
-        """The same after one more step."""
-        dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        return _Last(step.index, step.state, dimensions, self.mapped or len(change.added) > 0, anchors)
 
 
 class StereoSlam:
@@ -133,7 +110,7 @@ class StereoSlam:
         self.atlas = Atlas()
         self._loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
-        self._last = _Last()
+        self._last = Completed()
         self._stages = Stages()
         rows = getattr(getattr(self.frontend, "config", None), "epipolar", _ROWS)
         self._input_warnings = InputWarnings(rig, c.models, rows)
@@ -144,7 +121,9 @@ class StereoSlam:
             self._relocalizer.search_in(prior_map, self.backend)
             self.landmarks = prior_map.rows
             self.atlas = Atlas.of_earlier_run(prior_map.keyframes, prior_map.keyframe_poses, prior_map.loops)
-            self._last = _Last(dimensions=prior_map.dimensions if len(prior_map) else None, mapped=len(prior_map) > 0)
+            self._last = Completed(
+                dimensions=prior_map.dimensions if len(prior_map) else None, mapped=len(prior_map) > 0
+            )
 
     def __repr__(self) -> str:
         frontend = "no front end" if self.frontend is None else type(self.frontend).__name__
@@ -234,73 +213,96 @@ class StereoSlam:
         """`process_features`, in the only thread."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
         self._roll_back()
-        index, stages = self._last.index + 1, self._stages
-        if self._relocalizer.search is not None and not self._locate(features, index):
+        index, stages, search = self._last.index + 1, self._stages, self._relocalizer.search
+        if search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
-            return self._relocalizer.search.lost(index, replace(features, images=None))
+            return search.lost(index, replace(features, images=None))
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
-            revision = self._revise()
-            prediction = self.backend.predict(features.stamp)
-            require_prediction(prediction, self.backend)
-            dt, self._stamp = features.stamp - self._stamp, features.stamp
+            revision, prediction, dt = self._revise(), *self._predict(features.stamp)
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
-            raw, features = features, self.calibration.correct(features)
-            landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
-            landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
-            anchors, places = self._last.anchors, self.backend.positions
-            aligned = self._aligner.align(self.frontend, anchors, raw, matches, landmarks, places)
-            raw = replace(aligned.features, images=None)
-            features = self.calibration.correct(raw)
-            held = self.objects.suspects
-            held_rows = matches.rows[np.isin(matches.ids, held)]
-            matches = matches.without(held)
+            seen = self._associate(prediction, features, index)
         with stages.stage("update"):  # the measurement of the landmarks
-            asked, spared = self._localizer.informative(prediction, matches, self._positions(matches.ids), dt)
-            report = self.backend.update(asked.observations(features), asked.T_world_left)
-            require_report(report, self.backend)
-            state = self._localizer.state_after(self._last.state, prediction, features, asked, report)
-            pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
-            self.calibration.observe(raw, pose)
+            report, spared, state = self._update(seen, dt)
         with stages.stage("estimate"):
-            estimate = self.backend.estimate(landmarks=False)
-            require_estimate(estimate, self.backend)
-            used = report.used
-            self._rig_error.uncertainty.observe(estimate.T_world_left, used, self._positions(used))
+            estimate = self._estimate_pose(report)
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
-            labels = self.objects.classify(features, estimate, matches.landmark_of(len(features)))
-            objects = self.objects.update(self.backend, features)
+            labels = self.objects.classify(seen.features, estimate, seen.matches.landmark_of(len(seen.features)))
+            objects = self.objects.update(self.backend, seen.features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
-            step = Step(index, features, prediction, matches, held, held_rows, spared, report, state, estimate, labels)
-            change = self._mapper.update(self.backend, landmarks, step)
-            T = estimate.T_world_left
-            anchors = self._aligner.anchored(self.frontend, aligned, matches, change.added, T)
-            new = np.setdiff1d(change.added.ids, change.erased)
-            self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
+            step = Step(
+                index, seen.features, seen.prediction, seen.matches, seen.held, seen.held_rows, spared, report, state,
+                estimate, labels,
+            )  # fmt: skip
+            change, anchors = self._manage(seen, step)
         with stages.stage("atlas"):  # a place seen again corrects the path since
-            estimate = self._rig_error.added_to(estimate)
-            step = replace(step, estimate=estimate, common=self._rig_error.common(as_given=False))
-            atlas, change = self._close_loops(step, change)
+            step, atlas, change = self._close_loops(step, change)
         common = self._rig_error.common(as_given=True)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
-            self._last.after(step, change, anchors), change.landmarks, atlas, Stages(),
+            self._last.after(step, len(change.added), anchors), change.landmarks, atlas, Stages(),
         )  # fmt: skip
         return result
+
+    def _predict(self, stamp: float) -> tuple[Prediction, float]:
+        """The back end's prediction for a time, and the time since the last one [s]."""
+        prediction = self.backend.predict(stamp)
+        require_prediction(prediction, self.backend)
+        dt, self._stamp = stamp - self._stamp, stamp
+        return prediction, dt
+
+    def _associate(self, prediction: Prediction, features: StereoFeatures, index: int) -> Associated:
+        """Match landmarks with features, and align these where the front end can."""
+        corrected = self.calibration.correct(features)
+        landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
+        landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
+        anchors, places = self._last.anchors, self.backend.positions
+        aligned = self._aligner.align(self.frontend, anchors, features, matches, landmarks, places)
+        corrected = self.calibration.correct(replace(aligned.features, images=None))
+        held = self.objects.suspects
+        rows = matches.rows[np.isin(matches.ids, held)]
+        return Associated(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
+
+    def _update(self, seen: Associated, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:
+        """Measure the landmarks: what the update did, landmarks that were left out of it, and how tracking goes on."""
+        positions = self._positions(seen.matches.ids)
+        asked, spared = self._localizer.informative(seen.prediction, seen.matches, positions, dt)
+        report = self.backend.update(asked.observations(seen.features), asked.T_world_left)
+        require_report(report, self.backend)
+        state = self._localizer.state_after(self._last.state, seen.prediction, seen.features, asked, report)
+        self.calibration.observe(replace(seen.aligned.features, images=None), seen.pose)
+        return report, spared, state
+
+    def _estimate_pose(self, report: UpdateReport) -> Estimate:
+        """The camera's pose, after an update; what the rig's error does to it is taken down."""
+        estimate = self.backend.estimate(landmarks=False)
+        require_estimate(estimate, self.backend)
+        self._rig_error.uncertainty.observe(estimate.T_world_left, report.used, self._positions(report.used))
+        return estimate
+
+    def _manage(self, seen: Associated, step: Step) -> tuple[MapChange, Anchors]:
+        """What a step does to the map, and what its landmarks look like."""
+        change = self._mapper.update(self.backend, seen.landmarks, step)
+        T = step.estimate.T_world_left
+        anchors = self._aligner.anchored(self.frontend, seen.aligned, seen.matches, change.added, T)
+        new = np.setdiff1d(change.added.ids, change.erased)
+        self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
+        return change, anchors
 
     def _positions(self, ids: IdArray) -> np.ndarray:
         """Where landmarks are in the world (N, 3)."""
         return require_positions(self.backend.positions(ids), ids, self.backend)
 
-    def _close_loops(self, step: Step, change: MapChange) -> tuple[Atlas, MapChange]:
-        """The atlas after a step; where a loop was closed, landmarks of the old place are in the map again."""
-        restarts = len(self.restarted)
+    def _close_loops(self, step: Step, change: MapChange) -> tuple[Step, Atlas, MapChange]:
+        """The step with the rig's error in its estimate, and the atlas; after a loop the old landmarks are back."""
+        estimate, common = self._rig_error.added_to(step.estimate), self._rig_error.common(as_given=False)
+        step, restarts = replace(step, estimate=estimate, common=common), len(self.restarted)
         atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
         if seen_again is not None:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
             self._rig_error.uncertainty.see_anew(back, self._positions(back))
-        return atlas, change
+        return step, atlas, change
 
     def roll_back(self) -> None:
         """After a step that an exception ended: take back what it did to the map, in the back end as well.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, CommonError, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import BoolArray, IdArray
 from slam.errors import ConfigurationError
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
@@ -19,43 +19,9 @@ from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landm
 from slam.mapping.duplicates import doubled_landmarks, known_features
 from slam.mapping.monocular import MonocularDepth, unclaimed
 from slam.mapping.selection import new_landmarks
-from slam.object_data import MotionLabels
+from slam.mapping.step import Step
 from slam.tracking.localizer import LandmarkMatches, Localizer
-from slam.tracking.state import TrackingState
 from slam.tracking.visibility import MapView, expected_landmarks
-
-
-@dataclass(frozen=True)
-class Step:
-    """What a frame brought before the map was changed.
-
-    Attributes:
-        index: of the frame.
-        features: all of them, corrected by the calibration.
-        prediction: of the back end.
-        matches: landmarks that were recognised.
-        held: ids of landmarks that were not given to the back end's update, because they may move.
-        held_rows: features that were matched with some of these.
-        spared: ids of those of the matches that were not given to the update, because others tell more.
-        report: of the update.
-        state: whether the pose is known.
-        estimate: the camera's pose after the update.
-        labels: which features move.
-        common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
-    """
-
-    index: int
-    features: StereoFeatures
-    prediction: Prediction
-    matches: LandmarkMatches
-    held: IdArray
-    held_rows: NDArray[np.intp]
-    spared: IdArray
-    report: UpdateReport
-    state: TrackingState
-    estimate: Estimate
-    labels: MotionLabels
-    common: CommonError = field(default_factory=CommonError)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from slam.mapping.atlas.keyframes import (
 from slam.mapping.atlas.loops import Verified, alike, verify
 from slam.mapping.atlas.places import Vectors
 from slam.mapping.atlas.shelf import Shelf
-from slam.mapping.mapper import KnownPlace, Returned, Step
+from slam.mapping.mapper import KnownPlace, Returned
+from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig

@@ -1,0 +1,101 @@
+"""What a frame brings before it changes the map, and what completed steps leave for the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.data import CommonError, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.geometry.se3 import Array
+from slam.landmarks import LandmarkRows
+from slam.object_data import MotionLabels
+from slam.tracking.alignment import Aligned, Anchors
+from slam.tracking.localizer import LandmarkMatches
+from slam.tracking.state import TrackingState
+
+
+@dataclass(frozen=True)
+class Associated:
+    """A frame whose features are matched with landmarks.
+
+    Attributes:
+        aligned: the features as they were measured, and the patches that they were aligned to.
+        features: the same, corrected by the calibration.
+        landmarks: the map.
+        prediction: of the back end.
+        matches: landmarks that were matched, but for those held.
+        held: ids of landmarks that are not given to the back end's update, because they may move.
+        held_rows: features that were matched with some of these.
+    """
+
+    aligned: Aligned
+    features: StereoFeatures
+    landmarks: LandmarkRows
+    prediction: Prediction
+    matches: LandmarkMatches
+    held: IdArray
+    held_rows: NDArray[np.intp]
+
+    @property
+    def pose(self) -> Array:
+        """The pose T_world_left (4, 4) on which the matches agree, or the predicted one."""
+        return self.prediction.T_world_left if self.matches.T_world_left is None else self.matches.T_world_left
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a frame brought before the map was changed.
+
+    Attributes:
+        index: of the frame.
+        features: all of them, corrected by the calibration.
+        prediction: of the back end.
+        matches: landmarks that were matched.
+        held: ids of landmarks that were not given to the back end's update, because they may move.
+        held_rows: features that were matched with some of these.
+        spared: ids of those of the matches that were not given to the update, because others tell more.
+        report: of the update.
+        state: whether the pose is known.
+        estimate: the camera's pose after the update.
+        labels: which features move.
+        common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
+    """
+
+    index: int
+    features: StereoFeatures
+    prediction: Prediction
+    matches: LandmarkMatches
+    held: IdArray
+    held_rows: NDArray[np.intp]
+    spared: IdArray
+    report: UpdateReport
+    state: TrackingState
+    estimate: Estimate
+    labels: MotionLabels
+    common: CommonError = field(default_factory=CommonError)
+
+
+@dataclass(frozen=True)
+class Completed:
+    """What completed steps leave for the next one, besides the map.
+
+    Attributes:
+        index: of the last frame.
+        state: how localization has gone.
+        dimensions: length of the descriptors; None before the first feature.
+        mapped: whether there ever was a landmark.
+        anchors: what landmarks looked like at first sight.
+    """
+
+    index: int = -1
+    state: TrackingState = field(default_factory=TrackingState)
+    dimensions: int | None = None
+    mapped: bool = False
+    anchors: Anchors = field(default_factory=Anchors.none)
+
+    def after(self, step: Step, added: int, anchors: Anchors) -> Completed:
+        """The same after one more step, in which so many landmarks joined the map."""
+        dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
+        return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors)
