@@ -36,11 +36,13 @@ the geometric mean over short runs of {cases} (`python experiments/sensitivity.p
 Under small perturbations of the pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose
 ratios lie within does not matter there.
 
-- "same": the same bytes.
+{counts}
+
+- "same": the same bytes. Such a number is kept if it guards against input that these runs do not have (degenerate
+  geometry, wrong matches, a kidnapped camera, overflow), or if it only trades time: most iterations, sizes of blocks.
 - "fails": a run did not end, or lost the camera or the bodies.
 - "not read": none of these runs comes to the code that reads the number, as that for faults and long runs.
-- Empty: not measured. Such numbers are compiled into kernels, are read on import, or belong to the front
-  end{rest}.
+- Empty: not measured, as it is compiled into a kernel, read on import, part of the front end{rest}.
 """
 
 
@@ -129,9 +131,10 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
     ratios = sensitivity.get("ratios", {})
     lines = [INTRODUCTION]
     if ratios:
-        rest = "" if sensitivity["complete"] else ", or their runs are still to be made"
+        rest = "" if sensitivity["complete"] else ", or to be run still"
         cases = ", ".join(f"`{case}`" for case in sensitivity["cases"])
-        lines.append(SENSITIVITY.format(cases=cases, rest=rest, **sensitivity["scatter"]))
+        counts = _counts([ratios.get(f"{p.module}:{p.name}") for p in parameters], sensitivity["scatter"])
+        lines.append(SENSITIVITY.format(cases=cases, rest=rest, counts=counts, **sensitivity["scatter"]))
     titles = ["file", "name", "value", "what it is", *(["½", "2"] if ratios else [])]
     rule = ["---", "---", "---:", "---", *(["---:", "---:"] if ratios else [])]
     for room in ROOMS:
@@ -145,6 +148,25 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
             lines.append(_row([*cells, *map(_ratio, measured)]))
         lines.append("")
     return "\n".join(lines)
+
+
+def _counts(measured: list[list[dict[str, Any]] | None], scatter: dict[str, float]) -> str:
+    """How many numbers matter, in a sentence."""
+    known = [m for m in measured if m]
+    kinds = [{value for side in m for value in side.values()} for m in known]
+    texts = [{value for value in values if isinstance(value, str)} for values in kinds]
+    same, unread = (sum(values == {word} for values in kinds) for word in ("same", "not read"))
+    fails = sum("fails" in words for words in texts)
+    within = [
+        all(isinstance(v, str) or 1 / scatter[k] <= v <= scatter[k] for s in m for k, v in s.items()) for m in known
+    ]
+    small = sum(within) - same - unread - sum(w and "fails" in t for w, t in zip(within, texts))
+    more = len(known) - unread - same - small - fails
+    return (
+        f"Of {len(measured)} numbers {len(known)} are measured; {unread} of these are not read in these runs.\n"
+        f"At half or twice its value, {same} change nothing, {small} change errors by less than the scatter, {more} by\n"
+        f"more, and {fails} make a run fail."
+    )
 
 
 def _row(cells: list[str]) -> str:

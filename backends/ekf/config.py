@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from slam.bounds import require_positive
 from slam.errors import ConfigurationError
 
 MEASUREMENTS = ("stereo", "left")
 LANDMARKS = ("inverse_depth", "euclidean")
-
-_MOST_ITERATIONS = 1000  # bound of a setting
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,7 @@ class EkfConfig:
     consistent: bool = True
 
     def __post_init__(self) -> None:
-        if self.measurement not in MEASUREMENTS:
-            raise ConfigurationError(f"ekf: measurement must be one of {MEASUREMENTS}, got {self.measurement!r}")
-        if self.landmarks not in LANDMARKS:
-            raise ConfigurationError(f"ekf: landmarks must be one of {LANDMARKS}, got {self.landmarks!r}")
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
-            raise ConfigurationError(f"ekf: iterations must be an integer of at least 1, got {self.iterations!r}")
-        if self.iterations > _MOST_ITERATIONS:
-            raise ConfigurationError(f"ekf: iterations must be at most {_MOST_ITERATIONS}, got {self.iterations}")
-        if not isinstance(self.consistent, bool):
-            raise ConfigurationError(f"ekf: consistent must be true or false, got {self.consistent!r}")
+        require_positive(self, {"iterations": (1, 1000)}, "ekf")
+        for name, known in (("measurement", MEASUREMENTS), ("landmarks", LANDMARKS)):
+            if getattr(self, name) not in known:
+                raise ConfigurationError(f"ekf: {name} must be one of {known}, got {getattr(self, name)!r}")

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from slam.errors import ConfigurationError
-
-_MOST = 1_000_000  # poses or landmarks
-_LEAST_ERROR, _MOST_ERROR = 1e-9, 1e6  # [px]
+from slam.bounds import require_not_negative
 
 
 @dataclass(frozen=True)
@@ -38,23 +33,5 @@ class SmootherConfig:
     lag: int | None = 50
 
     def __post_init__(self) -> None:
-        _require_whole(self.track, "track", 2)
-        _require_whole(self.explicit, "explicit", 0)
-        _require_whole(self.window, "window", 2)
-        if self.lag is not None:
-            _require_whole(self.lag, "lag", self.window)
-        value = self.relinearise
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not (number and (isinstance(value, int) or np.isfinite(value)) and value > 0):
-            raise ConfigurationError(f"smoother: relinearise must be positive and finite, got {value!r}")
-        if not _LEAST_ERROR <= value <= _MOST_ERROR:
-            raise ConfigurationError(
-                f"smoother: relinearise must lie between {_LEAST_ERROR:g} and {_MOST_ERROR:g}, got {value}"
-            )
-
-
-def _require_whole(value: object, name: str, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ConfigurationError(f"smoother: {name} must be an integer of at least {least}, got {value!r}")
-    if value > _MOST:
-        raise ConfigurationError(f"smoother: {name} must be at most {_MOST}, got {value}")
+        ranges = {"track": (2, 10**6), "explicit": (0, 10**6), "relinearise": (1e-9, 10**6), "window": (2, 10**6)}
+        require_not_negative(self, {**ranges, "lag": (self.window, 10**6)}, "smoother")

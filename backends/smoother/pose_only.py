@@ -14,10 +14,10 @@ import numpy as np
 from backends.smoother import pose_kernels as kernels
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
+from slam.geometry.pnp import STEPS
 from slam.geometry.se3 import Array, inverse
 from slam.tracking.gating import chi_square_gate, whiteners
 
-_STEPS = 12  # of Gauss-Newton at most
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # of solving and gating
 _CONVERGED = 1e-5  # [rad, m]; the steps shrink quadratically, so what is left is far smaller
@@ -88,5 +88,5 @@ def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: Boo
     counted = np.ones(len(problem.points), bool) if used is None else used
     return np.asarray(kernels.gauss_newton(
         stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted,
-        problem.information, prior, start, _HUBER if robust else np.inf, _STEPS, _CONVERGED,
+        problem.information, prior, start, _HUBER if robust else np.inf, STEPS, _CONVERGED,
     ))  # fmt: skip

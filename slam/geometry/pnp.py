@@ -20,7 +20,7 @@ MINIMAL_POINTS = 3
 _REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5  # of least squares on what agrees, at most
-_STEPS = 10  # of Gauss-Newton at most
+STEPS = 10  #: of Gauss-Newton at most, from the last pose; it converges quadratically
 _BATCH = 50  # hypotheses tried at once
 _APPROACHES = 3  # steps towards the better half of the matches, from a guess that is far off
 _ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
@@ -114,7 +114,7 @@ def _polish(rig: StereoRig, points: Array, measured: Array, T_left_world: Array,
     for _ in range(_POLISHING_ROUNDS):
         if inliers.sum() < MINIMAL_POINTS:
             break
-        better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], _STEPS)[0]
+        better = _refined(rig, points, measured, _some(inliers)[None], T_left_world[None], STEPS)[0]
         again = _agreement(rig, points, measured, better[None], threshold)[0]
         if again.sum() < inliers.sum():
             break
