@@ -164,8 +164,8 @@ def _counts(measured: list[list[dict[str, Any]] | None], scatter: dict[str, floa
     more = len(known) - unread - same - small - fails
     return (
         f"Of {len(measured)} numbers {len(known)} are measured; {unread} of these are not read in these runs.\n"
-        f"At half or twice its value, {same} change nothing, {small} change errors by less than the scatter, {more} by\n"
-        f"more, and {fails} make a run fail."
+        f"At half or twice its value, {same} change nothing, {small} change errors by less than the scatter, {more}\n"
+        f"by more, and {fails} make a run fail."
     )
 
 

@@ -16,19 +16,28 @@ import typer
 from slam.commands import completion
 from slam.commands.options import (
     BackendOption,
+    CalibrationOption,
     ConfigOption,
+    DrawOption,
     FormatOption,
     FramesOption,
     FrontendOption,
     KindOption,
+    LiveOption,
+    MapOption,
+    MonoOption,
     OptionalSequence,
     OutOption,
+    OverlapOption,
     OverwriteOption,
     PictureOption,
     QuietOption,
+    RecordOption,
     RunOutOption,
+    SaveMapOption,
     SequenceArgument,
     SetOption,
+    ViewerOption,
 )
 from slam.commands.signals import Stopped, catch_signals, whole_frames
 from slam.errors import SlamError, one_line
@@ -36,6 +45,7 @@ from slam.files import reason
 
 if TYPE_CHECKING:
     from slam.run.replay import Recording
+    from slam.run.runner import Watch
     from slam.sequences import Sequence
 
 app = typer.Typer(
@@ -106,30 +116,15 @@ def run_command(
     frames: FramesOption = None,
     kind: KindOption = None,
     format: FormatOption = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
-    ] = None,
-    prior_map: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")
-    ] = None,
-    save_map: Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")] = None,
-    mono: Annotated[bool, typer.Option("--mono", help="Left images alone, in a prior map.")] = False,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),
-    ] = None,
-    viewer: Annotated[
-        str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
-    ] = None,
-    draw: Annotated[
-        Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
-    ] = None,
-    overlap: Annotated[
-        bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
-    ] = True,
-    live: Annotated[
-        bool, typer.Option("--live", help="Frames at their own rate; those that come too late are dropped.")
-    ] = False,
+    record: RecordOption = None,
+    prior_map: MapOption = None,
+    save_map: SaveMapOption = None,
+    mono: MonoOption = False,
+    calibration: CalibrationOption = None,
+    viewer: ViewerOption = None,
+    draw: DrawOption = None,
+    overlap: OverlapOption = True,
+    live: LiveOption = False,
     picture: PictureOption = True,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -153,20 +148,26 @@ def run_command(
             stack.enter_context(compiled_beside(options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
-        watches = []
-        if viewer is not None:
-            from slam.run.viewer import Viewer
-
-            watches.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
-        if draw is not None:
-            from slam.run.drawing import FramePictures
-
-            watches.append(stack.enter_context(FramePictures(draw)).show)
+        watches = _watches(stack, opened, viewer, draw)
         until = threading.Event() if live or is_live(opened) else None
         end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until)
     _leave_picture(folder, picture)
     _finish(summary, folder, quiet)
+
+
+def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None) -> list[Watch]:
+    """What is shown of every frame: the viewer, and pictures in a folder or a video."""
+    watches = []
+    if viewer is not None:
+        from slam.run.viewer import Viewer
+
+        watches.append(stack.enter_context(Viewer(viewer, opened.rig, opened.ground_truth)).show)
+    if draw is not None:
+        from slam.run.drawing import FramePictures
+
+        watches.append(stack.enter_context(FramePictures(draw)).show)
+    return watches
 
 
 @app.command("replay", short_help="Feed a back end recorded measurements.")

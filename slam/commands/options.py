@@ -40,8 +40,6 @@ BackendOption = Annotated[
 FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames, B left out.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")]
 PictureOption = Annotated[bool, typer.Option("--picture/--no-picture", help="Leave a picture of the run.")]
-
-
 OptionalSequence = Annotated[
     str | None,
     typer.Argument(
@@ -72,4 +70,26 @@ FormatOption = Annotated[
     typer.Option(
         metavar="FORMAT", help="Format; default: found out from the folder.", autocompletion=completion.formats
     ),
+]
+RecordOption = Annotated[
+    Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
+]
+MapOption = Annotated[Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")]
+SaveMapOption = Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")]
+MonoOption = Annotated[bool, typer.Option("--mono", help="Left images alone, in a prior map.")]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),
+]
+ViewerOption = Annotated[
+    str | None, typer.Option(metavar="live|FILE.rrd", help="Show it in Rerun, or keep it for Rerun.")
+]
+DrawOption = Annotated[
+    Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
+]
+OverlapOption = Annotated[
+    bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
+]
+LiveOption = Annotated[
+    bool, typer.Option("--live", help="Frames at their own rate; those that come too late are dropped.")
 ]
