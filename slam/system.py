@@ -30,11 +30,11 @@ from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.showing import count
-from slam.tracking.alignment import Aligner, Anchors
 from slam.tracking.answer_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.feature_check import usable
 from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.patch_alignment import Aligner, Anchors
 from slam.tracking.state import TrackingState
 
 #: How far from its row a front end looks for a feature's partner, where it does not say [px].

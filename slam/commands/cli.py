@@ -158,7 +158,7 @@ def run_command(
 
 def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None) -> list[Watch]:
     """What is shown of every frame: the viewer, and pictures in a folder or a video."""
-    watches = []
+    watches: list[Watch] = []
     if viewer is not None:
         from slam.run.viewer import Viewer
 

@@ -11,8 +11,8 @@ from slam.data import CommonError, Estimate, IdArray, Prediction, StereoFeatures
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.object_data import MotionLabels
-from slam.tracking.alignment import Aligned, Anchors
 from slam.tracking.localizer import LandmarkMatches
+from slam.tracking.patch_alignment import Aligned, Anchors
 from slam.tracking.state import TrackingState
 
 

@@ -68,7 +68,7 @@ class AssociationConfig:
             and ratio: what they tell about the drift meanwhile is worth more than what the point may have slid. Found,
             they count as first seen from there.
         align: features of landmarks are moved to where the image around them is as at the landmark's first sight (see
-            `slam.tracking.alignment`), where the front end can do that.
+            `slam.tracking.patch_alignment`), where the front end can do that.
         measured: matches that a back end gets in a frame at most, those that tell most of the camera's motion (see
             `slam.tracking.informative`); 0 for all.
         refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.

@@ -15,6 +15,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Anchor, Atlas
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.config import AtlasConfig
+from slam.mapping.atlas.feature_file import FeatureFile
 from slam.mapping.atlas.keyframes import (
     Keyframe,
     Loop,
@@ -23,9 +24,8 @@ from slam.mapping.atlas.keyframes import (
     step_covariance,
     view_has_changed,
 )
-from slam.mapping.atlas.loops import Verified, alike, verify
 from slam.mapping.atlas.places import Vectors
-from slam.mapping.atlas.shelf import Shelf
+from slam.mapping.atlas.verification import Verified, alike, verify
 from slam.mapping.mapper import KnownPlace, Returned
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
@@ -82,7 +82,7 @@ class LoopCloser:
         self._rig = rig.rectified.rig
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
-        self._shelf = Shelf() if config.on_disk else None
+        self._file = FeatureFile() if config.on_disk else None
         lax = _CONSISTENCY * association.consistency_sigmas
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
@@ -111,7 +111,7 @@ class LoopCloser:
         candidates = self._candidates(atlas, new, step, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
         index = atlas.index.with_new(descriptors)
-        kept = new if self._shelf is None else self._shelf.put(new)
+        kept = new if self._file is None else self._file.put(new)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
         best = self._best_verified(atlas, candidates, step.features, step.index)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)

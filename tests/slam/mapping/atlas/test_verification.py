@@ -18,7 +18,7 @@ from slam.mapping.atlas.keyframes import (
     view_has_changed,
     what_was_added,
 )
-from slam.mapping.atlas.loops import refined_pose, verify
+from slam.mapping.atlas.verification import refined_pose, verify
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import Localizer

@@ -13,8 +13,8 @@ from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.landmarks import LandmarkRows
-from slam.tracking.alignment import Aligner, Anchors, warps_of
 from slam.tracking.localizer import LandmarkMatches
+from slam.tracking.patch_alignment import Aligner, Anchors, warps_of
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 

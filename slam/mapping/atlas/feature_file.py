@@ -15,10 +15,10 @@ from slam.mapping.atlas.keyframes import Keyframe
 _ALIGNMENT = 8  # bytes
 
 
-class Shelf:
+class FeatureFile:
     """Puts features of keyframes into a file that goes with this object; the system reads them where they are needed.
 
-    A copy of a shelf is empty: what it holds so far belongs to the keyframes, whose copies are in memory.
+    A copy is empty: what it holds so far belongs to the keyframes, whose copies are in memory.
     """
 
     def __init__(self) -> None:

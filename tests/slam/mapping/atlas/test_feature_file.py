@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from slam.errors import SlamError
+from slam.mapping.atlas.feature_file import FeatureFile
 from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.atlas.shelf import Shelf
 from tests.slam.mapping.atlas.test_saved import KEYFRAMES
 
 
@@ -20,8 +20,8 @@ def same(one: Keyframe, other: Keyframe) -> bool:
 
 
 def test_features_are_the_same_and_in_the_file():
-    shelf = Shelf()
-    put = [shelf.put(keyframe) for keyframe in KEYFRAMES]
+    file = FeatureFile()
+    put = [file.put(keyframe) for keyframe in KEYFRAMES]
     for keyframe, kept in zip(KEYFRAMES, put):
         assert same(keyframe, kept)
         assert isinstance(kept.points, np.memmap) and isinstance(kept.descriptors, np.memmap)
@@ -29,9 +29,9 @@ def test_features_are_the_same_and_in_the_file():
 
 
 def test_copies_of_the_keyframes_and_of_the_shelf_go_on_apart():
-    shelf = Shelf()
-    put = shelf.put(KEYFRAMES[0])
-    for other, kept in (copy.deepcopy((shelf, put)), pickle.loads(pickle.dumps((shelf, put)))):
+    file = FeatureFile()
+    put = file.put(KEYFRAMES[0])
+    for other, kept in (copy.deepcopy((file, put)), pickle.loads(pickle.dumps((file, put)))):
         assert same(kept, KEYFRAMES[0])
         assert same(other.put(KEYFRAMES[1]), KEYFRAMES[1])
     assert same(put, KEYFRAMES[0])
@@ -43,4 +43,4 @@ def test_a_disk_that_takes_nothing_is_one_clear_line(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("tempfile.TemporaryFile", full)
     with pytest.raises(SlamError, match=r"^atlas\.on_disk: No space left on device$"):
-        Shelf().put(KEYFRAMES[0])
+        FeatureFile().put(KEYFRAMES[0])
