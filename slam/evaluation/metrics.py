@@ -97,11 +97,6 @@ class SegmentErrors:
         """Mean over all stretches of all lengths [%]; NaN where there is none."""
         return float(np.mean(self.translation)) if len(self.lengths) else float("nan")
 
-    @property
-    def mean_rotation(self) -> float:
-        """Mean over all stretches of all lengths [deg/m]; NaN where there is none."""
-        return float(np.mean(self.rotation)) if len(self.lengths) else float("nan")
-
     def of_length(self, length: float) -> SegmentErrors:
         """The stretches of one length."""
         rows = self.lengths == length

@@ -33,3 +33,9 @@ def assert_equal_to_rounding(found: np.ndarray, expected: np.ndarray, steps: int
     """
     expected = np.asarray(expected)
     np.testing.assert_allclose(found, expected, rtol=0, atol=steps * 1e-12 * np.abs(expected).max(initial=0.0))
+
+
+def positive(n: int, rng: np.random.Generator) -> np.ndarray:
+    """A random positive definite matrix (n, n)."""
+    A = rng.standard_normal((n, n))
+    return A @ A.T + np.eye(n)
