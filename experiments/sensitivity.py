@@ -5,7 +5,8 @@
 Features are extracted once. Each run then gives them to a system in which one constant is changed, and compares the
 camera's path and the moving bodies' motion with the truth. A run is left out where the default run never reads the
 constant. Constants that are compiled into kernels, that are read on import, or that belong to the front end are not
-measured. The table is written after each constant, and a later call goes on with those that are missing.
+measured. A constant takes about ten seconds of CPU time. The table is written after each, and a later call goes on with
+those that are missing.
 """
 
 from __future__ import annotations
@@ -286,15 +287,7 @@ def ratios(parameter: Parameter, factor: float, defaults: list[Default]) -> dict
             for d in readers:
                 with limited(_PATIENCE * max(d.seconds, 1.0)):
                     found[d.index, d.backend] = run(d.index, d.backend)
-    except (
-        slam.SlamError,
-        ArithmeticError,
-        ValueError,
-        LookupError,
-        RuntimeError,
-        TimeoutError,
-        np.linalg.LinAlgError,
-    ):
+    except _FAILURES:
         return {"camera": "fails", "bodies": "fails"}
     if all(found[d.index, d.backend].path == d.errors.path for d in readers):
         return {"camera": "same", "bodies": "same"}
@@ -311,7 +304,7 @@ def _worst(values: list[tuple[float, str]]) -> float | str:
     if not values or not np.isfinite([v for v, _ in values]).all() or max(v for v, _ in values) > _LOST:
         return "fails"
     logs = [np.mean([np.log(v) for v, backend in values if backend == name]) for name in BACKENDS]
-    return float(np.exp(max(logs)))
+    return round(float(np.exp(max(logs))), 4)
 
 
 def scatter(defaults: list[Default], seeds: int) -> dict[str, float]:
@@ -337,7 +330,9 @@ def main() -> int:
     arguments = parser.parse_args()
     file = arguments.out / "sensitivity.json" if arguments.out.is_dir() else arguments.out
     table = json.loads(file.read_text()) if file.exists() else {"ratios": {}}
-    wanted = [p for p in find() if arguments.only in f"{p.module}:{p.name}" and measured(p)]
+    present = {name_of(p): p for p in find()}
+    table["ratios"] = {name: found for name, found in table["ratios"].items() if name in present}
+    wanted = [p for name, p in present.items() if arguments.only in name and measured(p)]
     names = frozenset(p.name for p in wanted)
     count = 1 if arguments.quick else len(cases())
     defaults = [Default.of(i, b, names) for i in range(count) for b in BACKENDS]
