@@ -8,6 +8,7 @@ import pytest
 from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalibrationConfig
 from slam.calibration.prior import prior_information
 from slam.config import SystemConfig
+from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -46,6 +47,18 @@ def test_a_turned_camera_is_found_and_corrected():
     assert np.abs(z_scores(calibration, TURNED)).max() < 3
     assert disparity_error(calibration, TURNED) < 0.1 < 0.3 < disparity_error(drive(frames=1), TURNED)
     assert calibration.unsolved == 0 and calibration.pairs > 10
+
+
+def test_pairs_without_a_common_motion_are_counted_and_told():
+    calibration, rng, street = SelfCalibration(CAR, SelfCalibrationConfig()), np.random.default_rng(3), Street(3)
+    for k in range(6):
+        looks, n = street.descriptors[50 * k : 50 * k + 80], 80  # 30 of them are in the next view
+        left = rng.uniform([100, 50], [1100, 320], (n, 2))
+        right = left - np.column_stack([rng.uniform(5, 60, n), np.zeros(n)])
+        ones = np.ones(n)
+        calibration.observe(StereoFeatures(k, left, right, ones, ones, ones, np.ones(n, np.int8), looks), pose(k))
+    assert calibration.pairs == 0
+    assert calibration.summary()["unsolved_pairs"] == calibration.unsolved >= 4
 
 
 def test_an_offset_of_the_disparity_is_found():
