@@ -249,8 +249,8 @@ class StereoSlam:
             landmarks, prediction, matches = self._localize(prediction, landmarks, features, index)
             anchors, places = self._last.anchors, self.backend.positions
             aligned = self._aligner.align(self.frontend, anchors, raw, matches, landmarks, places)
-            raw = replace(aligned.features, images=None)
-            features = self.calibration.correct(raw)
+            moved, raw = aligned.features is not raw, replace(aligned.features, images=None)
+            features = self.calibration.correct(raw) if moved else replace(features, images=None)
             held = self.objects.suspects
             held_rows = matches.rows[np.isin(matches.ids, held)]
             matches = matches.without(held)
