@@ -61,7 +61,8 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
     history, kept = log.history, Change()
     gone = _old_landmarks(log, first, most)
     leaving = {*map(pose_key, range(history.first, first)), *gone}
-    touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
+    touched, staying = gtsam.NonlinearFactorGraph(), set()
+    slots: dict[int, int] = {}
     held_keys, keep = [] if history.held is None else [history.held.key], kept.factors.add
     for slot, factor in solver.factors():  # there are thousands
         keys = factor.keys()
