@@ -83,6 +83,8 @@ class Patches:
 
     def select(self, keep: NDArray) -> Patches:
         """Some of the rows (a mask or indices)."""
+        if keep.dtype == bool and keep.all():
+            return self  # images are large
         return Patches(self.images[keep], self.centres[keep], self.size[keep])
 
     def joined(self, other: Patches) -> Patches:

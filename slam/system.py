@@ -27,6 +27,7 @@ from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
 from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
+from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.showing import count
@@ -46,7 +47,7 @@ class StereoSlam:
 
     Use a system from one thread at a time; several systems may run in several threads, and give the same bytes as
     alone. A system whose parts can be pickled or copied (`copy.deepcopy`) can be, too; the copy continues with the same
-    bytes.
+    bytes. The first system has the process keep memory that it has freed (see `slam.runtime.memory`).
 
     Args:
         rig: the two cameras.
@@ -84,6 +85,7 @@ class StereoSlam:
         prior_map: SavedMap | None = None,
         rig_prior: KeptCalibration | None = None,
     ) -> None:
+        keep_freed_memory()
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
         c = config or SystemConfig.for_kind(kind, *names)
@@ -258,7 +260,9 @@ class StereoSlam:
         landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
         anchors, places = self._last.anchors, self.backend.positions
         aligned = self._aligner.align(self.frontend, anchors, features, matches, landmarks, places)
-        corrected = self.calibration.correct(replace(aligned.features, images=None))
+        if aligned.features is not features:
+            corrected = self.calibration.correct(aligned.features)
+        corrected = replace(corrected, images=None)
         held = self.objects.suspects
         rows = matches.rows[np.isin(matches.ids, held)]
         return Associated(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)

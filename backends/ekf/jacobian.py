@@ -60,8 +60,9 @@ class Jacobian:
     def times(self, X: Array) -> Array:
         """``H X`` (3M, N) for X (6 + 3M, N)."""
         m, n = len(self.own), X.shape[1]
-        out = self.by_pose.reshape(3 * m, 6) @ X[:6]
-        out += (self.own @ X[6:].reshape(m, 3, n)).reshape(3 * m, n)
+        out = np.empty((3 * m, n))
+        np.matmul(self.own, X[6:].reshape(m, 3, n), out=out.reshape(m, 3, n))
+        out += self.by_pose.reshape(3 * m, 6) @ X[:6]
         if self.displacement is not None and self.by_displacement is not None:
             out -= self.by_displacement @ (self.displacement.share @ X)
         return np.asarray(out)

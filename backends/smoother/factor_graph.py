@@ -290,7 +290,7 @@ class FactorGraph:
     def _new_solver(self) -> Solver:
         """An empty solver for as many variables as there will be."""
         c = self.config
-        return Solver(self._seldom, None if c.lag is None else 2 * (c.lag + c.explicit))
+        return Solver(self._seldom, None if c.lag is None else c.lag + c.explicit)
 
     # --- factors ---
 

@@ -17,7 +17,7 @@ from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of
 
 #: Poses leave once so many are there as the lag and one part in so many of it.
-_SHARE = 4
+_SHARE = 2
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,16 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
     history, kept = log.history, Change()
     gone = _old_landmarks(log, first, most)
     leaving = {*map(pose_key, range(history.first, first)), *gone}
-    touched, slots, staying = gtsam.NonlinearFactorGraph(), {}, set()
-    for slot, factor in solver.factors():
+    touched, staying = gtsam.NonlinearFactorGraph(), set()
+    slots: dict[int, int] = {}
+    held_keys, keep = [] if history.held is None else [history.held.key], kept.factors.add
+    for slot, factor in solver.factors():  # there are thousands
         keys = factor.keys()
-        if history.held is not None and keys == [history.held.key] and isinstance(factor, gtsam.PriorFactorPose3):
-            continue  # what holds it; a prior on that pose alone is a `CustomFactor`
         if leaving.isdisjoint(keys):
-            slots[slot] = kept.factors.size()
-            kept.factors.add(factor)
-        else:
-            touched.add(factor)
+            slots[slot] = len(slots)
+            keep(factor)
+        elif keys != held_keys or not isinstance(factor, gtsam.PriorFactorPose3):
+            touched.add(factor)  # but not what holds the oldest pose; a prior on that alone is a `CustomFactor`
             staying.update(keys)
     values = solver.values()
     if history.held is not None and history.held.pulled(values.atPose3(history.held.key).matrix()):

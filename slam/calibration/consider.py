@@ -102,6 +102,8 @@ class RigUncertainty:
     def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
         assert self._T_world is not None
+        if not len(ids) and not len(erased):
+            return
         kept = self._landmarks.select(~np.isin(self._landmarks.ids, erased))
         new = ~np.isin(ids, np.concatenate([kept.ids, erased]))
         local = transform(inverse(self._T_world), positions[new])

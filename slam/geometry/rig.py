@@ -247,6 +247,13 @@ class StereoRig:
         out[good] = inverse @ np.swapaxes(inverse, 1, 2)
         return out
 
+    def depth_deviation(self, points: Array, sigma: float) -> Array:
+        """Standard deviations (N,) [m] of the depths of triangulated points (N, 3), see `triangulation_covariance`."""
+        if not self.is_rectified:
+            return np.sqrt(self.triangulation_covariance(points, sigma)[:, 2, 2])
+        with np.errstate(over="ignore"):  # at infinity
+            return np.asarray(points[:, 2] ** 2 * (np.sqrt(2.0) * sigma / (self.left.fu * self.baseline)))
+
     @cached_property
     def rectified(self) -> RectifiedRig:
         """The rectified rig: itself where `is_rectified`."""
@@ -276,20 +283,28 @@ class RectifiedRig:
         return T
 
     def rectify_left(self, uv: Array) -> Array:
-        """Rectified left pixels (N, 2) of original left pixels (N, 2)."""
-        return _move_pixels(self.original.left, self.rig.left, self.R_left, uv)
+        """Rectified left pixels (N, 2) of original left pixels (N, 2); the same array where the rig is rectified."""
+        return self._moved(self.original.left, self.rig.left, self.R_left, uv)
 
     def rectify_right(self, uv: Array) -> Array:
         """Rectified right pixels (N, 2) of original right pixels (N, 2)."""
-        return _move_pixels(self.original.right, self.rig.right, self.R_right, uv)
+        return self._moved(self.original.right, self.rig.right, self.R_right, uv)
 
     def unrectify_left(self, uv: Array) -> Array:
         """Original left pixels (N, 2) of rectified left pixels (N, 2)."""
-        return _move_pixels(self.rig.left, self.original.left, self.R_left.T, uv)
+        return self._moved(self.rig.left, self.original.left, self.R_left.T, uv)
 
     def unrectify_right(self, uv: Array) -> Array:
         """Original right pixels (N, 2) of rectified right pixels (N, 2)."""
-        return _move_pixels(self.rig.right, self.original.right, self.R_right.T, uv)
+        return self._moved(self.rig.right, self.original.right, self.R_right.T, uv)
+
+    def _moved(self, source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:
+        """Pixels of `target` that look along the same rays as pixels of `source`, turned by R."""
+        if self.original is self.rig:
+            return uv
+        xy = source.normalise(uv)
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        return target.project(rays @ R.T)
 
     @cached_property
     def maps(self) -> tuple[RectificationMaps, RectificationMaps]:
@@ -348,10 +363,3 @@ def _stereo_rectify(rig: StereoRig) -> tuple[Array, Array, Array, Array]:
         return cv2.stereoRectify(a.K, D_left, c.K, D_right, size, rig.R, t, flags=_ZERO_DISPARITY, alpha=0)[:4]
     except cv2.error as error:
         raise CalibrationError("stereo rig cannot be rectified") from error
-
-
-def _move_pixels(source: PinholeCamera, target: PinholeCamera, R: Array, uv: Array) -> Array:
-    """Pixels of `target` that look along the same rays as pixels of `source`, turned by R."""
-    xy = source.normalise(uv)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    return target.project(rays @ R.T)

@@ -45,9 +45,7 @@ def _depth_is_good(
 ) -> BoolArray:
     """Which rows have a positive depth whose relative standard deviation is below the limit."""
     points = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
-    variance = rig.triangulation_covariance(points, pixel_sigma)[:, 2, 2]
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(variance) < limit * points[:, 2])
+    return np.asarray(rig.depth_deviation(points, pixel_sigma) < limit * points[:, 2])
 
 
 def _spread(

@@ -220,13 +220,13 @@ class _Regions:
 
     def near(self, tracks: MovingTracks, rows: NDArray[np.intp] | slice, places: Array) -> BoolArray:
         """Which tracks lie in each region (C, M), given the covariances (N, 3, 3) of its middle as each sees it."""
-        gaps = tracks.motion.position[rows] - self.state[:, None, :3]
-        return _squares(gaps, places[rows] + self.covariance[:, None, :3, :3]) < _NEAR
+        P = self.covariance[:, :3, :3]
+        return _below(_NEAR, self.state[:, :3], P, tracks.motion.position[rows], places[rows])
 
     def unexplained(self, tracks: MovingTracks, regions: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
         """χ²(3) of the velocities of tracks (K,), each less that of one of the regions (K,)."""
-        gaps = tracks.motion.velocity[rows] - self.state[regions, 3:]
-        return _squares(gaps, tracks.motion.velocity_covariance[rows] + self.covariance[regions, 3:, 3:])
+        m, gaps = tracks.motion, tracks.motion.velocity[rows] - self.state[regions, 3:]
+        return np.asarray(squared_distances(gaps, m.velocity_covariance[rows] + self.covariance[regions, 3:, 3:]))
 
 
 def _advanced(candidates: list[Candidate], dt: float, acceleration: float) -> _Regions:
@@ -294,12 +294,8 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     rows, m = np.flatnonzero(free), tracks.motion
     if len(rows) < _BEGIN:
         return []
-    places = tracks.places[rows]
-    gaps = m.position[rows][:, None] - m.position[rows]
-    near = _squares(gaps, places[:, None] + places) < _NEAR
-    changes = m.velocity[rows][:, None] - m.velocity[rows]
-    velocities = m.velocity_covariance[rows]
-    near &= _squares(changes, velocities[:, None] + velocities) <= _AGREES
+    at, places, speed, speeds = m.position[rows], tracks.places[rows], m.velocity[rows], m.velocity_covariance[rows]
+    near = _below(_NEAR, at, places, at, places) & _below(_AGREES, speed, speeds, speed, speeds)
     left, found = np.ones(len(rows), bool), []
     for i in np.argsort(-near.sum(axis=1), kind="stable"):
         group = near[i] & left
@@ -327,7 +323,12 @@ def _share(count: Any) -> Any:
     return _OVERLAP * np.sqrt(count)
 
 
-def _squares(gaps: Array, covariances: Array) -> Array:
-    """χ² (...) of gaps (..., 3) with covariances (..., 3, 3)."""
-    flat = squared_distances(gaps.reshape(-1, 3), covariances.reshape(-1, 3, 3))
-    return np.asarray(flat.reshape(gaps.shape[:-1]))
+def _below(limit: float, first: Array, covariances: Array, second: Array, others: Array) -> BoolArray:
+    """Which of some Gaussians (N, 3) are nearer to which others (M, 3) than a limit of χ² (N, M)."""
+    gaps = first[:, None] - second
+    # No variance is larger than the trace: most pairs are too far apart, whatever their covariances are.
+    largest = np.trace(covariances, axis1=1, axis2=2)[:, None] + np.trace(others, axis1=1, axis2=2)
+    near = np.einsum("nmi,nmi->nm", gaps, gaps) < limit * largest
+    one, other = np.nonzero(near)
+    near[one, other] = squared_distances(gaps[one, other], covariances[one] + others[other]) < limit
+    return near

@@ -13,7 +13,7 @@ from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.bodies import Body
 from slam.objects.candidates import Candidate, region_radius
 from slam.objects.config import ObjectsConfig
-from slam.objects.matching import match_far, match_near
+from slam.objects.matching import ByLine, match_far, match_near
 from slam.objects.pixel_kernels import pixel_deviations
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import LEAST_INFORMATION, Tracks
@@ -52,9 +52,10 @@ def follow(
         local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
         z, J = rig.project_stereo(local)
         spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
-        _near(tracks, alive, features, z, spread, config)
+        among = ByLine.of(features)
+        _near(tracks, alive, among, z, spread, config)
         _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
-        _carried_along(tracks, bodies, candidates, T_world_left, features, dt, config, rig, sigma)
+        _carried_along(tracks, bodies, candidates, T_world_left, among, dt, config, rig, sigma)
         _far(tracks, T_world_left, features, measured, dt, config, rig, sigma)
     seen = tracks.seen
     tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
@@ -74,13 +75,13 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
 
 
 def _near(
-    tracks: Tracks, alive: NDArray[np.intp], features: StereoFeatures, z: Array, spread: Array, config: ObjectsConfig
+    tracks: Tracks, alive: NDArray[np.intp], among: ByLine, z: Array, spread: Array, config: ObjectsConfig
 ) -> None:
     size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
     radius = np.fmin(np.fmax(size, least), config.search_limit)  # the least where the size is NaN
     rows, columns = match_near(
-        z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], features, config.d_match, config.ratio
+        z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], among, config.d_match, config.ratio
     )
     tracks.row[alive[rows]] = columns
 
@@ -100,7 +101,7 @@ def _check_right(
 
 def _carried_along(
     tracks: Tracks, bodies: Mapping[int, Body], candidates: Sequence[Candidate], T_world_left: Array,
-    features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
+    among: ByLine, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
 ) -> None:  # fmt: skip
     """Look for young tracks on what moves where it takes them."""
     young = _young(tracks, config.min_frames - 1)
@@ -111,8 +112,8 @@ def _carried_along(
         on = ((local > body.lower - size) & (local < body.upper + size)).all(axis=1)
         R = body.T[:3, :3]
         ahead = transform(body.T, local[on])
-        _look_at(tracks, young[on], ahead, R @ body.covariance[3:, 3:] @ R.T, T_world_left, features, dt, config, rig,
-                 sigma)  # fmt: skip
+        spread = R @ body.covariance[3:, 3:] @ R.T
+        _look_at(tracks, young[on], ahead, spread, T_world_left, among, dt, config, rig, sigma)
     if not len(young) or not candidates:
         return
     middles = np.array([candidate.state[:3] for candidate in candidates])
@@ -120,17 +121,17 @@ def _carried_along(
     inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
     for i in np.flatnonzero(inside.any(axis=1)).tolist():
         on, state, P = inside[i], candidates[i].state, candidates[i].covariance
-        _look_at(tracks, young[on], places[on] + dt * state[3:], dt**2 * P[3:, 3:], T_world_left, features, dt, config,
-                 rig, sigma)  # fmt: skip
+        ahead = places[on] + dt * state[3:]
+        _look_at(tracks, young[on], ahead, dt**2 * P[3:, 3:], T_world_left, among, dt, config, rig, sigma)
 
 
 def _look_at(
     tracks: Tracks, rows: NDArray[np.intp], ahead: Array, covariance: Array, T_world_left: Array,
-    features: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
+    among: ByLine, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
 ) -> None:  # fmt: skip
     """Look for unseen tracks (M,) about places (M, 3) that have a covariance (3, 3), in features not taken yet."""
     unseen = tracks.row[rows] < 0
-    rows, ahead = rows[unseen], ahead[unseen]
+    rows, ahead, features = rows[unseen], ahead[unseen], among.features
     if not len(rows):
         return
     taken = np.zeros(len(features), bool)
@@ -141,7 +142,7 @@ def _look_at(
     size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     radius = np.fmin(np.fmax(size, config.search_radius), config.search_limit)
     mine, columns = match_near(
-        z[:, :2], radius, tracks.descriptors[rows], tracks.laplacian[rows], features, config.d_match, config.ratio
+        z[:, :2], radius, tracks.descriptors[rows], tracks.laplacian[rows], among, config.d_match, config.ratio
     )
     free = ~taken[columns]
     tracks.row[rows[mine[free]]] = columns[free]

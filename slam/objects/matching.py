@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,12 +16,35 @@ _NEIGHBOURS = 8  # features looked at in a window: the nearest ones
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
+@dataclass(frozen=True)
+class ByLine:
+    """A frame's features by ascending line of the left image, to be looked at in many windows.
+
+    Attributes:
+        features: of the frame.
+        order: their rows (N,), by ascending v.
+        pixels, descriptors, laplacian: of the left image, in that order.
+    """
+
+    features: StereoFeatures
+    order: NDArray[np.intp]
+    pixels: Array
+    descriptors: NDArray[np.float32]
+    laplacian: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, features: StereoFeatures) -> ByLine:
+        """A frame's features, sorted."""
+        f, order = features, np.argsort(features.uv_left[:, 1], kind="stable")
+        return cls(f, order, f.uv_left[order], f.descriptors[order], f.laplacian[order])
+
+
 def match_near(
     uv: Array,
     radius: Array,
     descriptors: NDArray[np.float32],
     laplacian: NDArray[np.int8],
-    features: StereoFeatures,
+    among: ByLine,
     d_match: float,
     ratio: float,
 ) -> Pairs:
@@ -30,19 +55,17 @@ def match_near(
         radius: half sizes of the windows (N,) [px].
         descriptors: of the tracks (N, D).
         laplacian: of the tracks (N,).
-        features: of the frame.
+        among: features of the frame.
         d_match: largest descriptor distance.
         ratio: largest ratio of the best to the second best in the window.
     """
-    order = np.argsort(features.uv_left[:, 1], kind="stable")
-    pixels = features.uv_left[order]
-    first = np.searchsorted(pixels[:, 1], uv[:, 1] - radius)
+    first = np.searchsorted(among.pixels[:, 1], uv[:, 1] - radius)
     best = best_in_windows(
-        np.ascontiguousarray(uv), radius, first, descriptors, laplacian, pixels, features.descriptors[order],
-        features.laplacian[order], _NEIGHBOURS, d_match, ratio,
+        np.ascontiguousarray(uv), radius, first, descriptors, laplacian, among.pixels, among.descriptors,
+        among.laplacian, _NEIGHBOURS, d_match, ratio,
     )  # fmt: skip
     rows = np.flatnonzero(best >= 0)
-    return rows, order[best[rows]]
+    return rows, among.order[best[rows]]
 
 
 def match_far(

@@ -66,11 +66,15 @@ def common_motion(L, eta, dWd, rows, prior, pull, soft, sharp):
         _factorise(total, prior, factor)
         _solve(factor, told, motion)
         _products(motion, products)
+        changed = False
         for m in range(len(dWd)):
             if rows[m]:
                 square = _square(L[m], eta[m], dWd[m], motion, products)
                 share = min(1.0, pull / max(square, 1e-9))
+                changed = changed or share < 1.0 or weight[m] < 1.0
                 weight[m] = np.sqrt(share) if k < soft else share
+        if not changed:  # nor would it in the next round
+            break
     return motion
 
 

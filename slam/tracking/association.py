@@ -20,7 +20,6 @@ from slam.models import FORBID_UNKNOWN, require_not_negative
 Descriptors = NDArray[np.float32]
 
 _NONE = np.float32(np.inf)
-_CELL = 24.0  # side of the cells that features are sorted into [px]
 _LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
 
 _POSES = (0, 100_000)  # tried in a frame
@@ -277,47 +276,14 @@ def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchW
 def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending row of the centres.
 
-    Pixels are sorted into square cells, by rows of cells, so that few pairs have to be looked at.
+    Pixels are sorted by column, so that few pairs have to be looked at.
     """
-    x, y = _Cells.of(centres[:, 0], reach[:, 0], uv[:, 0]), _Cells.of(centres[:, 1], reach[:, 1], uv[:, 1])
-    cell = y.cell * x.count + x.cell
-    order = np.argsort(cell, kind="stable")
-    begin = np.zeros(y.count * x.count + 1, np.intp)
-    np.cumsum(np.bincount(cell, minlength=y.count * x.count), out=begin[1:])
-    rows, line = _expand(y.low, np.where(x.high > x.low, y.high, y.low))
-    line *= x.count
-    which, member = _expand(begin.take(line + x.low.take(rows)), begin.take(line + x.high.take(rows)))
-    rows, members = rows.take(which), order.take(member)
-    near = np.flatnonzero(x.near(rows, members) & y.near(rows, members))
-    return rows.take(near), members.take(near)
-
-
-@dataclass(frozen=True)
-class _Cells:
-    """Where pixels (N,) and intervals (M,) lie along one axis, in cells counted from the first pixel's."""
-
-    centres: Array
-    reach: Array
-    pixels: Array
-    cell: NDArray[np.intp]  # of each pixel (N,)
-    count: int
-    low: NDArray[np.intp]  # first cell of each interval (M,), and
-    high: NDArray[np.intp]  # the one after the last
-
-    @classmethod
-    def of(cls, centres: Array, reach: Array, pixels: Array) -> _Cells:
-        pixels, centres, scale = np.ascontiguousarray(pixels), np.ascontiguousarray(centres), 1 / _CELL
-        first = pixels.min()
-        cell = ((pixels - first) * scale).astype(np.intp)
-        count = int(cell.max()) + 1
-        middle, half = (centres - first) * scale, reach * scale
-        low = np.minimum(np.maximum(middle - half, 0), count).astype(np.intp)
-        high = np.minimum(np.maximum(middle + half + 1, 0), count).astype(np.intp)
-        return cls(centres, np.ascontiguousarray(reach), pixels, cell, count, low, high)
-
-    def near(self, rows: NDArray[np.intp], members: NDArray[np.intp]) -> BoolArray:
-        """Which pixels `members` (P,) lie in the intervals `rows` (P,)."""
-        return np.asarray(np.abs(self.pixels.take(members) - self.centres.take(rows)) <= self.reach.take(rows))
+    order = np.argsort(uv[:, 0], kind="stable")
+    x, y = uv[:, 0].take(order), uv[:, 1].take(order)
+    edge = centres[:, 0] - reach[:, 0], centres[:, 0] + reach[:, 0]
+    rows, place = _expand(np.searchsorted(x, edge[0]), np.searchsorted(x, edge[1], side="right"))
+    near = np.flatnonzero(np.abs(y.take(place) - centres[:, 1].take(rows)) <= reach[:, 1].take(rows))
+    return rows.take(near), order.take(place.take(near))
 
 
 def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

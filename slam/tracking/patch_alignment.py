@@ -64,7 +64,7 @@ class Anchors:
         if not len(landmarks):
             return Anchors.none()
         keep = (landmarks.ids[rows] == self.ids) & (landmarks.unseen[rows] <= _FORGOTTEN)
-        return self if keep.all() else self.select(keep)
+        return self.select(keep)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ class MapView:
         local = transform(inverse(T_world_left), positions)
         uv = rig.left.project(local)
         points = rig.triangulate(features.uv_left, features.uv_right)
-        variance = rig.triangulation_covariance(points, pixel_sigma)[:, 2, 2]
-        return cls(T_world_left, positions, local, uv, rig.left.in_image(uv), points, np.sqrt(variance))
+        deviation = rig.depth_deviation(points, pixel_sigma)
+        return cls(T_world_left, positions, local, uv, rig.left.in_image(uv), points, deviation)
 
 
 def similar_view(positions: Array, seen_from: Array, camera: Array, angle: float, ratio: float) -> BoolArray:

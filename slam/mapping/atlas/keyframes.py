@@ -94,7 +94,7 @@ def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, 
     """
     points = rig.triangulate(features.uv_left, features.uv_right)
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
-    deviation = np.sqrt(rig.triangulation_covariance(points[known], sigma)[:, 2, 2])
+    deviation = rig.depth_deviation(points[known], sigma)
     return known[deviation < max_error * points[known, 2]]
 
 
