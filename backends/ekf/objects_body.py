@@ -66,7 +66,7 @@ class Body:
         failures: of each point (p,), how often running its observation was rejected.
         seen: of each point (p,), when it was last observed (number of the update).
         sights: of each point (p,), in how many updates it was used.
-        turned: of each point (p,), the largest angle between the directions from which it was seen first and later [rad].
+        turned: of each point (p,), largest angle between the directions of its first sight and of later ones [rad].
     """
 
     id: int

@@ -131,7 +131,8 @@ def opened(
     points = np.zeros((0, 3))
     return Window(
         np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points,
-        none, none, none, none, points, np.zeros(0), first_velocity, Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
+        none, none, none, none, points, np.zeros(0), first_velocity, Prior(system, T[None], X[None], points),
+        np.zeros((FRAME, FRAME)),
     )  # fmt: skip
 
 
