@@ -86,11 +86,12 @@ def _predicted(
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
     A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
-    the other. At least two points must agree.
+    the other. At least two points must agree, and the body must be expected to within what it measures across: elsewhere
+    any two agree with one of its poses.
     """
     local = measured[rows]
     deep = np.flatnonzero(np.isfinite(local).all(axis=1))
-    if len(deep) < _LEAST_PREDICTED:
+    if len(deep) < _LEAST_PREDICTED or np.trace(body.covariance[3:, 3:]) > body.across**2:
         return None
     y, R = tracks.local[mine[deep]], body.T[:3, :3]
     axes = R.T @ T_world_left[:3, :3]
@@ -138,8 +139,8 @@ def _by_looks(
     near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + _DEPTHS * np.abs(local[:, 2])
     allowed = np.broadcast_to(near, (len(mine), len(free)))
     rows, columns = match_far(
-        tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.wide_d_match,
-        config.wide_ratio,
+        tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.d_match,
+        config.ratio,
     )  # fmt: skip
     return mine[rows], columns
 
