@@ -48,7 +48,8 @@ from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother")
 PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti")
-HIDDEN_AT, HIDDEN_FOR = 185, (15, 30, 60)  # frame in which the box vanishes, while it moves, and for how many
+# The box moves in frames 60 to 105: from which frame it is watched, when it vanishes, and for how many frames.
+WATCHED_FROM, HIDDEN_AT, HIDDEN_FOR, WATCHED_AFTER = 50, 85, (15, 60), 15
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
 KITTI = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 MOVING_CARS = (0, 1, 5)  # two that overtake, and a van that comes towards the camera
@@ -188,29 +189,29 @@ def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 
 def occlusion(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """The box is hidden for up to 2 s while it moves and comes to rest: in how many runs it keeps its id."""
-    rows = []
-    for backend, frames in [(b, h) for b in BACKENDS for h in HIDDEN_FOR][: 1 if quick else None]:
-        kept, others, delays = 0, 0, []
-        seeds = range(1 if quick else 10)
-        for seed in seeds:
-            before, after, delay = ids_about(seed, backend, frames, images)
-            kept += before == after and len(before) == 1
-            others += len(after - before)
-            delays.append(delay)
-        rows.append({
-            "back end": backend, "hidden [s]": frames / 30, "runs": len(seeds), "one id": kept, "other ids": others,
-            "frames until measured again, median": float(np.median(delays)),
-        })  # fmt: skip
-    return rows
+    found: dict[tuple[str, int], list[tuple[set[int], set[int], int]]] = {}
+    for seed in range(1 if quick else 10):
+        for backend, frames in [(b, h) for h in HIDDEN_FOR for b in BACKENDS][: 1 if quick else None]:
+            found.setdefault((backend, frames), []).append(ids_about(seed, backend, frames, images))
+    return [
+        {
+            "back end": backend, "hidden [s]": frames / 30, "runs": len(runs),
+            "one id": sum(before == after and len(before) == 1 for before, after, _ in runs),
+            "other ids": sum(len(after - before) for before, after, _ in runs),
+            "frames until measured again, median": float(np.median([delay for *_, delay in runs])),
+        }
+        for (backend, frames), runs in found.items()
+    ]  # fmt: skip
 
 
 def ids_about(seed: int, backend: str, frames: int, images: bool) -> tuple[set[int], set[int], int]:
-    """Ids measured before the box is hidden for so many frames, and in the second after; frames until it is found."""
+    """Ids measured before the box is hidden for so many frames, and soon after; frames until it is found."""
     name, back = f"box?density=300&camera=moving&seed={seed}", HIDDEN_AT + frames
     sequence = slam.open_sequence(f"synthetic:{name}")
     system = system_for(sequence, backend, images, [])
-    before, after, delay = set(), set(), 30
-    for k, (features, labels) in enumerate(seen_in(name, images, back + 30)):
+    before, after, delay = set(), set(), WATCHED_AFTER
+    seen = seen_in(name, images, HIDDEN_AT + max(HIDDEN_FOR) + WATCHED_AFTER, WATCHED_FROM)
+    for k, (features, labels) in enumerate(seen[: back + WATCHED_AFTER - WATCHED_FROM], WATCHED_FROM):
         shown = features_where(features, labels == 0) if HIDDEN_AT <= k < back else features
         ids = {thing.id for thing in system.process_features(shown).objects if thing.estimate.measured}
         if k < HIDDEN_AT:

@@ -19,16 +19,19 @@ from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 
 
 @lru_cache(maxsize=2)
-def seen_in(name: str, images: bool, frames: int) -> list[tuple[StereoFeatures, Any]]:
-    """Features of a synthetic world's first frames, from its images or simulated, and the body of each feature."""
+def seen_in(name: str, images: bool, frames: int, first: int = 0) -> list[tuple[StereoFeatures, Any]]:
+    """Features of a synthetic world's frames `first` up to, but without, `frames`, and the body of each feature.
+
+    They are found in its images, or simulated.
+    """
     sequence = slam.open_sequence(f"synthetic:{name}")
-    numbers = range(min(frames, len(sequence)))
+    numbers = range(first, min(frames, len(sequence)))
     if not images:
         return [(s.features, s.objects) for s in map(sequence.simulate, numbers)]
     options = SystemConfig.for_kind(sequence.kind, "surf", "ekf").frontend
     frontend = registry.create("frontends", "surf", sequence.rig, **options)
     found = [frontend.extract(sequence.frame(k)) for k in numbers]
-    return [(features, labels_in_images(sequence, k, features)) for k, features in enumerate(found)]
+    return [(features, labels_in_images(sequence, k, features)) for k, features in zip(numbers, found)]
 
 
 def system_for(sequence: Any, backend: str, images: bool, settings: list[str]) -> slam.StereoSlam:

@@ -117,6 +117,7 @@ KINDS = {
         pixel_sigma=0.3,
         initial_velocity_sigma=1.0,
         initial_angular_velocity_sigma=1.0,
+        objects=ObjectModels(drift=0.7),
     ),
     "driving": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=0.3),
@@ -130,6 +131,7 @@ KINDS = {
             initial_angular_velocity_sigma=0.5,
             max_speed=50.0,
             max_turn_rate=3.0,
+            drift=0.7,
         ),
     ),
 }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.bounds import require_positive
+from slam.bounds import require_not_negative
 from slam.errors import ConfigurationError
 from slam.geometry.arrays import Array
 from slam.object_data import ObjectObservations
@@ -24,6 +24,7 @@ _RANGES = {
     "max_speed": (1e-6, 1e6),
     "max_acceleration": (1e-6, 1e9),
     "max_turn_rate": (1e-6, 1e6),
+    "drift": (0.0, 1e3),
 }
 _SIGMAS = 3.0  # standard deviations that a change of velocity may be off
 
@@ -42,6 +43,8 @@ class ObjectModels:
         points: so many points of a body are estimated at most; those unseen for longest make room for new ones.
         max_speed, max_acceleration, max_turn_rate: no body moves beyond these [m/s], [m/s²], [rad/s]: an estimate that
             says so is refused. The acceleration is that of a collision.
+        drift: density of the random walk of a point's pixel in both images with the angle from which it is seen
+            [px / √rad]: a feature looks otherwise from elsewhere, and is found elsewhere on the body.
 
     Raises:
         ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
@@ -55,11 +58,12 @@ class ObjectModels:
     max_speed: float = 3.0
     max_acceleration: float = 100.0
     max_turn_rate: float = 20.0
+    drift: float = 0.0
 
     __pydantic_config__ = FORBID_UNKNOWN
 
     def __post_init__(self) -> None:
-        require_positive(self, _RANGES, "objects")
+        require_not_negative(self, _RANGES, "objects")
         if self.points < 3:
             raise ConfigurationError(f"objects: points must be at least 3, got {self.points}")
 

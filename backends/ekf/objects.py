@@ -17,6 +17,7 @@ from backends.ekf.objects_body import (
     advanced,
     corrected,
     corrected_by_map,
+    drifted,
     found,
     gathered,
     joined,
@@ -168,6 +169,7 @@ class ObjectFilter:
 
         Where nothing agrees with the body (or too little), it is not known where it is, and nothing joins.
         """
+        body = drifted(body, camera.T_world_left, self._models.objects.drift / self._rig.left.fu)
         place = {i: row for row, i in enumerate(body.ids.tolist())}
         rows = np.array([place.get(i, -1) for i in o.points.tolist()], np.intp)
         known = rows >= 0

@@ -20,6 +20,7 @@ from backends.ekf.objects_measurement import BodyPoints, moved
 from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array, adjoint, hat, inverse, pose, so3_exp, so3_left_jacobian
 from slam.object_models import ObjectModels
+from slam.objects.points import drift
 
 RIGID = 12  #: size of [θ, τ, δω, δv]
 
@@ -65,6 +66,7 @@ class Body:
         failures: of each point (p,), how often running its observation was rejected.
         seen: of each point (p,), when it was last observed (number of the update).
         sights: of each point (p,), in how many updates it was used.
+        turned: of each point (p,), largest angle between the directions of its first sight and of later ones [rad].
     """
 
     id: int
@@ -78,6 +80,7 @@ class Body:
     failures: IdArray
     seen: IdArray
     sights: IdArray
+    turned: Array
 
 
 def found(number: int, T: Array, velocity: Array, sigmas: Array, size: int) -> Body:
@@ -90,7 +93,7 @@ def found(number: int, T: Array, velocity: Array, sigmas: Array, size: int) -> B
     none = np.zeros(0, np.int64)
     return Body(
         number, T, velocity, none, BodyPoints.at(T, np.zeros((0, 3))),
-        P, np.zeros((RIGID, size)), np.zeros_like(P), none, none, none,
+        P, np.zeros((RIGID, size)), np.zeros_like(P), none, none, none, np.zeros(0),
     )  # fmt: skip
 
 
@@ -122,6 +125,22 @@ def widened(body: Body, factor: float) -> Body:
     return replace(body, covariance=P)
 
 
+def drifted(body: Body, T_world_left: Array, density: float) -> Body:
+    """With points less certain across the line of sight, where they are seen from farther round than ever before.
+
+    Args:
+        body: the body.
+        T_world_left: the camera's pose (4, 4).
+        density: of the random walk of a point's direction with the angle from which it is seen [rad / √rad].
+    """
+    Y, T = body.points.cartesian(), inverse(body.T) @ T_world_left
+    turned, lateral = drift(Y, body.points.T_body_anchor[:, :3, 3], T[:3, 3], body.turned, density)
+    half = body.points.by_position() @ lateral
+    P, rows = body.covariance.copy(), RIGID + np.arange(3 * len(Y)).reshape(-1, 3)
+    P[rows[:, :, None], rows[:, None, :]] += half @ np.swapaxes(half, 1, 2)
+    return replace(body, covariance=P, turned=turned)
+
+
 def joined(body: Body, camera: CameraBelief, ids: IdArray, h: Array, noise: Array, now: int) -> Body:
     """With new points, seen at h (M, 3) in camera coordinates with covariances `noise` (M, 3, 3)."""
     if not len(ids):
@@ -146,6 +165,7 @@ def joined(body: Body, camera: CameraBelief, ids: IdArray, h: Array, noise: Arra
         failures=np.concatenate([body.failures, np.zeros(len(ids), np.int64)]),
         seen=np.concatenate([body.seen, np.full(len(ids), now)]),
         sights=np.concatenate([body.sights, np.ones(len(ids), np.int64)]),
+        turned=np.concatenate([body.turned, np.zeros(len(ids))]),
     )
 
 
@@ -171,6 +191,7 @@ def without(body: Body, gone: BoolArray) -> Body:
         failures=body.failures[~gone],
         seen=body.seen[~gone],
         sights=body.sights[~gone],
+        turned=body.turned[~gone],
     )
 
 

@@ -15,6 +15,7 @@ from backends.smoother.objects_window import (
     CameraWindow,
     Solver,
     Window,
+    drifted,
     opened,
     with_frame,
     with_points,
@@ -144,6 +145,8 @@ class ObjectSmoother:
             found, known, rows = self._agreement(window, expected, seen)
             window = with_frame(window, frame, stamp, found.T, expected.X, found.scale)
             window.z[-1, rows[found.used]] = seen.z[known][found.used]
+            density = self._models.objects.drift / self._stereo.intrinsics[0]
+            window = drifted(window, inverse(found.T) @ expected.X, density)
             window, sight = self._exchange(window, cameras, seen, known, rows, found.used)
         window = self._solver.solved(window, cameras)
         if len(window) >= _LAG + _BATCH:

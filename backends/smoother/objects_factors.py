@@ -38,6 +38,16 @@ class System:
         information = self.information[rest][:, rest] - rows[:, rest].T @ cross
         return System(0.5 * (information + information.T), self.vector[rest] - self.vector[gone] @ cross)
 
+    def diffused(self, unknowns: IndexArray, roots: Array) -> System:
+        """With independent noise added to triples of unknowns (3M,), given symmetric roots (M, 3, 3) of covariances."""
+        M = (self.information[:, unknowns].reshape(-1, len(roots), 1, 3) @ roots).reshape(-1, len(unknowns))
+        S = (M[unknowns].reshape(len(roots), 3, -1).transpose(0, 2, 1) @ roots).transpose(0, 2, 1)
+        inner = np.eye(len(unknowns)) + S.reshape(len(unknowns), -1)
+        right = (roots @ self.vector[unknowns].reshape(-1, 3, 1)).reshape(-1)
+        lost = np.linalg.solve(inner, np.column_stack([M.T, right]))
+        information = self.information - M @ lost[:, :-1]
+        return System(0.5 * (information + information.T), self.vector - M @ lost[:, -1])
+
 
 def add_measurements(
     system: System, stereo: RectifiedStereo, sigma: float, z: Array, Y: Array, points: Array, first_point: int

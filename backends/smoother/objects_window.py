@@ -23,9 +23,10 @@ from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.object_models import ObjectModels
-from slam.objects.points import Shape
+from slam.objects.points import Shape, drift
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
+_TURN = 0.01  # a point is seen from elsewhere by no less [rad]; what is less adds up
 _LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
 
 
@@ -77,6 +78,9 @@ class Window:
         failures: how often running each point's observation was rejected (p,).
         unseen: number of frames since each point was last observed (p,).
         sights: in how many frames each point was used (p,).
+        since: frames in which each was seen first (p,), and
+        first_seen_from: where in the body the camera was then (p, 3).
+        turned: largest angle between that direction and later ones (p,) [rad].
         first_velocity: what was known beforehand of the velocity in the frame of the first sight; None once that has
             left the window.
         prior: of what has left.
@@ -93,6 +97,9 @@ class Window:
     failures: IdArray
     unseen: IdArray
     sights: IdArray
+    since: IndexArray
+    first_seen_from: Array
+    turned: Array
     first_velocity: VelocityPrior | None
     prior: Prior
     covariance: Array
@@ -124,7 +131,8 @@ def opened(
     points = np.zeros((0, 3))
     return Window(
         np.array([frame]), np.array([stamp]), T[None], np.ones(1), np.zeros((1, 0, 3)), none, points,
-        none, none, none, first_velocity, Prior(system, T[None], X[None], points), np.zeros((FRAME, FRAME)),
+        none, none, none, none, points, np.zeros(0), first_velocity, Prior(system, T[None], X[None], points),
+        np.zeros((FRAME, FRAME)),
     )  # fmt: skip
 
 
@@ -177,9 +185,33 @@ def with_points(window: Window, ids: IdArray, points: Array, shape: Shape, z: Ar
         failures=np.concatenate([window.failures, np.zeros(count, np.int64)]),
         unseen=np.concatenate([window.unseen, np.zeros(count, np.int64)]),
         sights=np.concatenate([window.sights, np.ones(count, np.int64)]),
+        since=np.concatenate([window.since, np.full(count, window.frames[-1])]),
+        first_seen_from=np.concatenate([window.first_seen_from, np.tile(inverse(Y)[:3, 3], (count, 1))]),
+        turned=np.concatenate([window.turned, np.zeros(count)]),
         prior=replace(p, system=system, points=np.concatenate([p.points, points])),
         covariance=_with_zeros(window.covariance, size, 3 * count),
     )
+
+
+def drifted(window: Window, T_body_left: Array, density: float) -> Window:
+    """With points less certain across the line of sight, where they are seen from farther round than ever before.
+
+    What the window itself has measured is left as it is.
+
+    Args:
+        window: with a frame for the present.
+        T_body_left: the camera's pose in the body (4, 4).
+        density: of the random walk of a point's direction with the angle from which it is seen [rad / √rad].
+    """
+    turned, lateral = drift(window.points, window.first_seen_from, T_body_left[:3, 3], window.turned, density)
+    rows = np.flatnonzero((window.since < window.frames[0]) & (turned > window.turned + _TURN))
+    if not (len(rows) and density):
+        return window
+    out = window.turned.copy()
+    out[rows] = turned[rows]
+    unknowns = window.first_point + (3 * rows[:, None] + np.arange(3)).reshape(-1)
+    system = window.prior.system.diffused(unknowns, lateral[rows])
+    return replace(window, prior=replace(window.prior, system=system), turned=out)
 
 
 def without_points(window: Window, gone: BoolArray) -> Window:
@@ -197,6 +229,9 @@ def without_points(window: Window, gone: BoolArray) -> Window:
         failures=window.failures[~gone],
         unseen=window.unseen[~gone],
         sights=window.sights[~gone],
+        since=window.since[~gone],
+        first_seen_from=window.first_seen_from[~gone],
+        turned=window.turned[~gone],
         prior=prior,
         covariance=window.covariance[kept[:, None], kept],
     )

@@ -44,7 +44,7 @@ from slam.objects.twists import fit_twist
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_SETTLED = 30  # frames from which a body is remembered in any case
+_SETTLED = 12  # frames from which a body is remembered in any case
 
 
 class MovingObjectDetector:

@@ -97,6 +97,29 @@ def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Sha
     return h, covariance
 
 
+def drift(points: Array, first: Array, now: Array, turned: Array, density: float) -> tuple[Array, Array]:
+    """How much less is known of points that are seen from farther round than ever before.
+
+    A feature is found where the image looks like it; seen from elsewhere, that is elsewhere on the body.
+
+    Args:
+        points: of the body (p, 3), in body coordinates.
+        first: where the camera was that saw each first (p, 3).
+        now: where it is (3,).
+        turned: largest angles (p,) between the two directions so far [rad].
+        density: of the random walk of a point's direction with that angle [rad / √rad].
+
+    Returns:
+        the angles with this sight (p,), and symmetric roots (p, 3, 3) of the covariances to be added [m].
+    """
+    before, sight = first - points, now - points
+    angle = np.arctan2(np.linalg.norm(np.cross(before, sight), axis=1), (before * sight).sum(axis=1))
+    angle = np.fmax(angle, turned)  # NaN where a point is nowhere
+    distance = np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None, None]
+    across = np.eye(3) - sight[:, :, None] * sight[:, None, :] / distance**2
+    return angle, np.nan_to_num(density * np.sqrt(angle - turned)[:, None, None] * distance * across)
+
+
 def room_makers(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
     """Which points of a full body leave to make room for new ones.
 

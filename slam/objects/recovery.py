@@ -65,6 +65,11 @@ def locate(
     return T
 
 
+def _is_expected(body: Body) -> bool:
+    """Whether it is known where the body is to within what it measures across."""
+    return bool(np.trace(body.covariance[3:, 3:]) <= body.across**2)
+
+
 def _fit(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
     T_world_left: Array, rig: StereoRig, sigma: float, seed: int, least: int = _LEAST,
@@ -86,11 +91,12 @@ def _predicted(
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
     A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
-    the other. At least two points must agree.
+    the other. At least two points must agree, and the body must be expected to within what it measures across: else
+    any two agree with one of its poses.
     """
     local = measured[rows]
     deep = np.flatnonzero(np.isfinite(local).all(axis=1))
-    if len(deep) < _LEAST_PREDICTED:
+    if len(deep) < _LEAST_PREDICTED or not _is_expected(body):
         return None
     y, R = tracks.local[mine[deep]], body.T[:3, :3]
     axes = R.T @ T_world_left[:3, :3]
@@ -125,6 +131,7 @@ def _by_looks(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
     """Members whose looks are seen, and the features' rows, no farther off than the body can have gone.
 
+    A body that may be anywhere has been out of view for long and looks otherwise: more is tried, and the fit decides.
     Free tracks have no claim to their features: where the body was out of view, they follow its points.
     """
     taken = np.zeros(len(features), bool)
@@ -137,10 +144,9 @@ def _by_looks(
     reach = _reach(body, features.stamp, config)
     near = np.linalg.norm(points - body.T[:3, 3], axis=1) < reach + _DEPTHS * np.abs(local[:, 2])
     allowed = np.broadcast_to(near, (len(mine), len(free)))
-    rows, columns = match_far(
-        tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, config.wide_d_match,
-        config.wide_ratio,
-    )  # fmt: skip
+    lost = body.apart_from is None and not _is_expected(body)
+    d_match, ratio = (config.d_match, config.ratio) if lost else (config.wide_d_match, config.wide_ratio)
+    rows, columns = match_far(tracks.descriptors[mine], tracks.laplacian[mine], features, free, allowed, d_match, ratio)
     return mine[rows], columns
 
 

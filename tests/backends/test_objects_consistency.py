@@ -19,7 +19,7 @@ from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from slam.object_data import ObjectObservations
 from slam.object_models import ObjectModels
-from slam.objects.points import Shape, first_frame, room_makers, shape_of, with_shape
+from slam.objects.points import Shape, drift, first_frame, room_makers, shape_of, with_shape
 from tests.backends import scenes
 from tests.backends.objects_scene import HANDHELD, KITTI, SIGMA, box_points, box_scene, car_scene, follow, score
 
@@ -279,6 +279,28 @@ def test_few_points_show_no_shape():
 
 
 # --- who makes room ---
+
+
+def test_points_seen_from_farther_round_are_less_certain_across_the_line_of_sight():
+    point, first = np.zeros((1, 3)), np.array([[0.0, 0.0, -2.0]])
+    now = 3.0 * np.array([np.sin(0.4), 0.0, -np.cos(0.4)])
+    turned, root = drift(point, first, now, np.zeros(1), 0.01)
+    np.testing.assert_allclose(turned, 0.4)
+    np.testing.assert_allclose(root @ root, [(0.01 * 3.0) ** 2 * 0.4 * (np.eye(3) - np.outer(now, now) / 9.0)])
+    again, none = drift(point, first, 0.5 * (first[0] + now), turned, 0.01)
+    assert again == turned and not none.any()  # it has been seen from farther round
+
+
+def test_noise_added_to_unknowns_is_that_of_their_covariance():
+    rng = np.random.default_rng(3)
+    A, root = rng.standard_normal((9, 9)), 0.3 * np.eye(3)[None]
+    system = System(A @ A.T + np.eye(9), rng.standard_normal(9))
+    wider = system.diffused(np.arange(3, 6), root)
+    expected = np.linalg.inv(system.information)
+    expected[3:6, 3:6] += 0.09 * np.eye(3)
+    np.testing.assert_allclose(np.linalg.inv(wider.information), expected, atol=1e-12)
+    mean = np.linalg.solve(system.information, system.vector)
+    np.testing.assert_allclose(np.linalg.solve(wider.information, wider.vector), mean, atol=1e-9)
 
 
 def test_points_unseen_for_longer_than_they_were_seen_make_room():

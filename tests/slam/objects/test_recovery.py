@@ -81,3 +81,10 @@ def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
     assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
     assert tracks.row[:4].tolist() == [0, 1, 2, 3]
     assert (tracks.ids[followers] == -1).all()
+
+
+def test_two_points_do_not_place_a_body_that_may_be_anywhere():
+    body, tracks, features, _ = scene(2, np.zeros(6), np.random.default_rng(6))
+    body = replace(body, covariance=np.diag([0.05**2] * 3 + [body.across**2] * 3))
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    assert locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=25.0), 0) is None
