@@ -180,11 +180,14 @@ class RigUncertainty:
         return adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose
 
     def _factor(self, covariance: Array) -> Array:
-        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept."""
+        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept.
+
+        It is the symmetric one: so its columns mean the same in all frames.
+        """
         n = self._columns
         factor = np.zeros((n, n))
         values, vectors = np.linalg.eigh(covariance)
-        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0))
+        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
         factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
         return factor
 

@@ -25,6 +25,9 @@ SIGMAS = {
 #: Root mean square over the image of what no lens model holds [focal lengths]: a fifth of a pixel at 1000 px.
 _RESIDUAL = 2e-4
 
+#: Parts of that which a rig's fields may be; equally probable before rows show it.
+RESIDUAL_SCALES = np.geomspace(0.05, 1.0, 7)
+
 #: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
 #: [focal lengths].
 MEAN_DISPARITY = 7e-4
@@ -132,12 +135,13 @@ def residual_variance() -> float:
 def systematic_variance(model: RigModel, error: float) -> Array:
     """Variances (n,) of the parameters by an error of the matching that all frames of a recording share.
 
-    Each parameter may be off by what moves rows and disparities by `error` [px] (root mean square over the image, of
-    far points and of points at a twentieth of the focal length). Pixels of repeated structure, of slanted surfaces and
-    of moving shadows are matched with such a bias; it does not average out.
+    All parameters together may be off by what moves rows and disparities by `error` [px] (root mean square over the
+    image, of far points and of points at a twentieth of the focal length), each by the same part of its variance.
+    Pixels of repeated structure, of slanted surfaces and of moving shadows are matched with such a bias; it does not
+    average out.
     """
     far = model.far()
     near = far + np.array([0.0, 0.0, _NEAR * model.focal])
     points = np.concatenate([far, near])
     effect = np.square(model.field(points)[:, 2]) + np.square(model.vertical(points))
-    return np.asarray(error**2 / effect.mean(axis=0))
+    return np.asarray(error**2 / (len(model.names) * effect.mean(axis=0)))

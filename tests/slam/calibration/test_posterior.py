@@ -7,9 +7,12 @@ import pytest
 
 from slam.calibration import RigPosterior
 from slam.calibration.evidence import Accumulator, Evidence
-from slam.calibration.posterior import solve
-from slam.calibration.prior import Prior
+from slam.calibration.model import RigModel
+from slam.calibration.posterior import residual_scale, solve
+from slam.calibration.prior import Prior, as_delivered, residual_variance
+from slam.calibration.rows import row_evidence
 from slam.errors import CalibrationError
+from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
 NONE = np.zeros(1)
 
@@ -52,10 +55,25 @@ def test_a_calibration_that_nothing_speaks_against_is_left_alone():
 
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
     plain, wide = (
-        solve(Prior(NONE, np.ones((1, 1, 1)), np.ones(1)), 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0)
+        solve(Prior(NONE, np.ones((1, 1, 1)), np.ones(1)), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5)
     )
     assert plain.mean == wide.mean and plain.inner == wide.inner
-    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + 0.25**2, rel=0.1)  # 0.5 · 50 / 100
+    expected = residual_variance() * (0.5 * 1e5 / 100) ** 2
+    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + expected, rel=0.1)
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
+def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
+    model, rng = RigModel(CAR), np.random.default_rng(3)
+    fields, theta, rows = scale * residual_fields(rng), parameters(pitch=5e-4, yaw=3e-4), None
+    for _ in range(10):
+        xyz = [[-0.7, -0.2, 0.01], [0.7, 0.2, 0.05]]
+        points = model.focal * rng.uniform(*xyz, (300, 3))
+        vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
+        found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
+        rows = found if rows is None else rows + found
+    assert residual_scale(as_delivered(model), rows) == pytest.approx(scale, rel=0.4)
+    assert residual_scale(as_delivered(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])
