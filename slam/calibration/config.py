@@ -26,7 +26,7 @@ class SelfCalibrationConfig:
         enabled: False leaves all measurements as they are.
         pixel_sigma: noise of a left pixel [px] before anything is known of it; it is found from pairs of views.
         disparity_sigma: the same of a disparity [px].
-        systematic: error of rows and disparities that all frames of a recording may share, over the image [px].
+        systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
         kept_share: two views are compared once less than this share of the first view's features is matched.
         minimum_common: least number of features matched in both views.
         minimum_parallax: least median of what translation moves the features by between two views [px].

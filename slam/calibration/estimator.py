@@ -69,7 +69,7 @@ class SelfCalibration:
             kept.require_fits(rig)
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
-            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance, kept.residual)
+            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance)
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
@@ -79,7 +79,7 @@ class SelfCalibration:
         zoom = focal_sigma(self.model) > 0
         self._focal = zoom / zoom.sum()  # the focal lengths' common error by the parameters
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
-        self._solution = Solution(self._prior.mean, start, start, float(self._prior.residual[-1]))
+        self._solution = Solution(self._prior.mean, start, start, 1.0)
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = _CONFIGURED
         self._waiting: list[View] = []
@@ -202,8 +202,7 @@ class SelfCalibration:
         rows, *motion = self._parts()
         moved = sum(motion[1:], motion[0])
         assert self._fields is not None  # as there are rows
-        residual = residual_scale(self._prior, self._fields.scaled(1 / self._rows.inflation))
-        return RecordingEvidence(rows + moved, moved, residual)
+        return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
     def _parts(self) -> list[Evidence]:
         """What rows and motion say, and the pair that is not complete."""

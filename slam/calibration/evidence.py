@@ -48,7 +48,7 @@ class RecordingEvidence(NamedTuple):
     Attributes:
         whole: by its rows and its motion.
         motion: by its motion alone, which says how large the calibration's errors are: rows have errors of their own.
-        residual: largest scale of the residual fields by its rows, from 0 to 1.
+        residual: scale of the residual fields by its rows, from 0 to 1.
     """
 
     whole: Evidence

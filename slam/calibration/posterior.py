@@ -101,7 +101,7 @@ def solve(
 
     Args:
         prior: of the parameters.
-        residual: largest scale of the residual fields, from 0 to 1 (see `residual_scale`).
+        residual: scale of the residual fields, from 0 to 1 (see `residual_scale`).
         evidence: of the data, from which the prior's scales follow.
         known: what the parameters follow from; None where that is the same.
     """
@@ -113,20 +113,20 @@ def solve(
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
-    fields = np.minimum(prior.residual, residual)
-    moved = np.tensordot(weights * fields, covariances, axes=1) @ whole.cross
-    return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, float(weights @ fields))
+    moved = residual * np.tensordot(weights, covariances, axes=1) @ whole.cross
+    return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, residual)
 
 
 def residual_scale(prior: Prior, rows: Evidence) -> float:
     """How large the residual fields are, as a part of what they may be: what the parameters leave of the rows' errors.
 
     The root mean square over the scales that may be, weighted by their marginal likelihood. Fields along the rows,
-    which nothing shows so directly, are taken to be as large as those across them.
+    which nothing shows so directly, are taken to be as large as those across them. Errors of neighbouring frames are
+    taken for independent: where they are not, the fields seem larger, and the uncertainty does.
 
     Args:
         prior: of the parameters.
-        rows: evidence of the parameters and of the fields across the rows (n + k), with its information as it is worth.
+        rows: evidence of the parameters and of the fields across the rows (n + k).
     """
     n = len(prior.mean)
     known, shared = prior.information[-1] + rows.S[:n, :n], rows.S[:n, n:]

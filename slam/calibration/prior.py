@@ -62,12 +62,10 @@ class Prior:
     Attributes:
         mean: (n,).
         covariances: equally probable ones (K, n, n).
-        residual: scale of the residual fields with each of them (K,).
     """
 
     mean: Array
     covariances: Array
-    residual: Array
 
     @cached_property
     def information(self) -> Array:
@@ -86,22 +84,21 @@ def as_delivered(model: RigModel) -> Prior:
     drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
     scales, turned, zoomed = np.array(list(product(_SCALES, _OFFSETS, _FOCALS))).T
     wide = [s[:, None, None] ** 2 * covariance for s, covariance in ((scales, spread), (turned, drift), (zoomed, zoom))]
-    return Prior(np.zeros(len(model.names)), sum(wide), scales)
+    return Prior(np.zeros(len(model.names)), sum(wide))
 
 
-def as_found(model: RigModel, mean: Array, covariance: Array, residual: float) -> Prior:
+def as_found(model: RigModel, mean: Array, covariance: Array) -> Prior:
     """Of a rig whose earlier recordings are known; its cameras may have turned since.
 
     Args:
         model: the parameters' meaning.
         mean: what the recordings say (n,).
         covariance: how well (n, n).
-        residual: scale of the residual fields.
     """
     sigma = offset_sigma(model)
     turned = np.array(_OFFSETS)
     covariances = covariance + turned[:, None, None] ** 2 * np.outer(sigma, sigma)
-    return Prior(mean, covariances, np.full(len(turned), residual))
+    return Prior(mean, covariances)
 
 
 def prior_information(model: RigModel) -> Array:
@@ -135,13 +132,12 @@ def residual_variance() -> float:
 def systematic_variance(model: RigModel, error: float) -> Array:
     """Variances (n,) of the parameters by an error of the matching that all frames of a recording share.
 
-    All parameters together may be off by what moves rows and disparities by `error` [px] (root mean square over the
-    image, of far points and of points at a twentieth of the focal length), each by the same part of its variance.
-    Pixels of repeated structure, of slanted surfaces and of moving shadows are matched with such a bias; it does not
-    average out.
+    Each parameter may be off by what moves rows and disparities by `error` [px] (root mean square over the image, of
+    far points and of points at a twentieth of the focal length). Pixels of repeated structure, of slanted surfaces and
+    of moving shadows are matched with such a bias; it does not average out.
     """
     far = model.far()
     near = far + np.array([0.0, 0.0, _NEAR * model.focal])
     points = np.concatenate([far, near])
     effect = np.square(model.field(points)[:, 2]) + np.square(model.vertical(points))
-    return np.asarray(error**2 / (len(model.names) * effect.mean(axis=0)))
+    return np.asarray(error**2 / effect.mean(axis=0))

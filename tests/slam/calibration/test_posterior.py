@@ -46,7 +46,7 @@ def test_shapes_and_values_are_checked():
 
 
 def test_a_calibration_that_nothing_speaks_against_is_left_alone():
-    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2, np.ones(4))
+    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2)
     near = solve(prior, 0.0, [evidence(0.1, 0.1)])
     assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
     clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
@@ -54,9 +54,7 @@ def test_a_calibration_that_nothing_speaks_against_is_left_alone():
 
 
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
-    plain, wide = (
-        solve(Prior(NONE, np.ones((1, 1, 1)), np.ones(1)), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5)
-    )
+    plain, wide = (solve(Prior(NONE, np.ones((1, 1, 1))), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5))
     assert plain.mean == wide.mean and plain.inner == wide.inner
     expected = residual_variance() * (0.5 * 1e5 / 100) ** 2
     assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + expected, rel=0.1)
@@ -87,7 +85,7 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6), np.ones(1)), 0.0, sums.total())
+            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), 0.0, sums.total())
             sums.judge(solution.mean, solution.inner)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
@@ -106,6 +104,6 @@ def test_what_an_error_of_the_whole_recording_leaves():
 
 
 def test_an_earlier_posterior_is_the_start():
-    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)), np.ones(1))
+    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)))
     found = solve(prior, 0.0, [evidence(4.0, 1.0)])
     assert found.mean[0] == pytest.approx(3.0) and found.inner[0, 0] == pytest.approx(0.5)
