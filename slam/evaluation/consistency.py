@@ -114,7 +114,7 @@ def stretch_nees(
     values = np.full(len(first), np.nan)
     if len(usable):
         N, A = N[usable], A[usable]
-        G = np.zeros((len(usable), _DOF, 0))
+        G: Array = np.zeros((len(usable), _DOF, 0))
         if common is not None:
             ends = [(common[i], common[j]) for i, j in zip(first[usable], last[usable])]
             G = _shared(A, ends, N)
