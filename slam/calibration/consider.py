@@ -66,10 +66,15 @@ class RigUncertainty:
     Args:
         model: the rig's parameters.
         pixel_sigma: noise of uL, vL, uR [px].
+        applied: the correction (n,) that the path begins with.
+
+    Attributes:
+        accounted: the correction (n,) whose remains in the path are in the covariance.
     """
 
-    def __init__(self, model: RigModel, pixel_sigma: float) -> None:
+    def __init__(self, model: RigModel, pixel_sigma: float, applied: Array) -> None:
         self._model = model
+        self.accounted = applied
         self._noise = pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
         self._T_world: Array | None = None
@@ -128,23 +133,26 @@ class RigUncertainty:
         """Forget all landmarks but these (M,)."""
         self._landmarks = self._landmarks.select(np.isin(self._landmarks.ids, ids))
 
-    def path_keeps(self, step: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
-        """The applied correction changes by `step` (n,), but the path stays as the old correction made it.
+    def path_keeps(self, applied: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
+        """The correction becomes `applied` (n,), but the path stays as the one that is accounted for made it.
 
         Args:
-            step: of the parameters.
+            applied: the parameters.
             positions: gives the positions (M, 3) [m] of landmarks by their ids (M,).
             landmarks_follow: the landmarks move to where the new correction sees them from the present pose.
         """
-        if self._T_world is None:
-            return
-        self._pose[:, -1] += self._pose[:, :-2] @ step
-        marks = self._landmarks
-        if not landmarks_follow:
-            marks.by_rig[:, :, -1] += marks.by_rig[:, :, :-2] @ step
-        elif len(marks.ids):
-            local = transform(inverse(self._T_world), positions(marks.ids))
-            marks.by_rig[:, :, -1] = (-self._T_world[:3, :3] @ points_by_pose(local) @ self._pose[:, -1:])[:, :, 0]
+        step, pose, marks = applied - self.accounted, self._pose.copy(), self._landmarks
+        if self._T_world is not None and step.any():
+            by_rig = marks.by_rig.copy()
+            pose[:, -1] += pose[:, :-2] @ step
+            if not landmarks_follow:
+                by_rig[:, :, -1] += by_rig[:, :, :-2] @ step
+            elif len(marks.ids):
+                local = transform(inverse(self._T_world), positions(marks.ids))
+                by_rig[:, :, -1] = (-self._T_world[:3, :3] @ points_by_pose(local) @ pose[:, -1:])[:, :, 0]
+            marks = replace(marks, by_rig=by_rig)
+        # In one statement, so that an interrupt finds all of it done or nothing.
+        self._pose, self._landmarks, self.accounted = pose, marks, applied
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
@@ -182,11 +190,14 @@ class RigUncertainty:
         return adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose
 
     def _factor(self, covariance: Array) -> Array:
-        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept."""
+        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept.
+
+        It is the symmetric one: so its columns mean the same in all frames.
+        """
         n = self._columns
         factor = np.zeros((n, n))
         values, vectors = np.linalg.eigh(covariance)
-        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0))
+        factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
         factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
         return factor
 

@@ -13,13 +13,12 @@ from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence
 from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
-from slam.calibration.posterior import RigPosterior, Solution, solve
+from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
 from slam.calibration.prior import (
     as_delivered,
     as_found,
     focal_sigma,
     prior_information,
-    residual_variance,
     systematic_variance,
 )
 from slam.calibration.rows import row_evidence
@@ -70,16 +69,17 @@ class SelfCalibration:
             kept.require_fits(rig)
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
-            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance, kept.residual)
+            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance)
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
+        self._fields: Evidence | None = None  # of rows: parameters, and what they leave
         start = self._prior.covariances[-1] if kept is None else self._prior.covariances.mean(axis=0)
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         zoom = focal_sigma(self.model) > 0
         self._focal = zoom / zoom.sum()  # the focal lengths' common error by the parameters
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
-        self._solution = Solution(self._prior.mean, start, start, float(self._prior.residual[-1]))
+        self._solution = Solution(self._prior.mean, start, start, 1.0)
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = _CONFIGURED
         self._waiting: list[View] = []
@@ -156,7 +156,9 @@ class SelfCalibration:
         if len(view) < self.config.minimum_common:
             return
         some = np.linspace(0, len(view) - 1, min(len(view), _MOST_ROWS)).astype(int)
-        self._rows.add(row_evidence(self.model, view.points[some], view.vertical[some], self._solution.mean))
+        rows, fields = row_evidence(self.model, view.points[some], view.vertical[some], self._solution.mean)
+        self._rows.add(rows)
+        self._fields = fields if self._fields is None else self._fields + fields
         self._compare(view)
         if self.pairs or self._open is not None:
             self._update()
@@ -199,7 +201,8 @@ class SelfCalibration:
             return None
         rows, *motion = self._parts()
         moved = sum(motion[1:], motion[0])
-        return RecordingEvidence(rows + moved, moved)
+        assert self._fields is not None  # as there are rows
+        return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
     def _parts(self) -> list[Evidence]:
         """What rows and motion say, and the pair that is not complete."""
@@ -250,9 +253,9 @@ class SelfCalibration:
         found = self.evidence()
         assert found is not None  # as there are pairs
         if self._kept:
-            self._solution = solve(self._prior, residual_variance(), [found.whole.with_error(self._systematic)])
+            self._solution = solve(self._prior, found.residual, [found.whole.with_error(self._systematic)])
         else:
-            self._solution = solve(self._prior, residual_variance(), [found.motion], [found.whole])
+            self._solution = solve(self._prior, found.residual, [found.motion], [found.whole])
 
 
 def _mean_variance(changes: Array, covariance: Array) -> float:

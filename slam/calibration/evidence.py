@@ -48,14 +48,16 @@ class RecordingEvidence(NamedTuple):
     Attributes:
         whole: by its rows and its motion.
         motion: by its motion alone, which says how large the calibration's errors are: rows have errors of their own.
+        residual: scale of the residual fields by its rows, from 0 to 1.
     """
 
     whole: Evidence
     motion: Evidence
+    residual: float = 1.0
 
     def scaled(self, factor: float) -> RecordingEvidence:
         """The same with `factor` times the information."""
-        return RecordingEvidence(self.whole.scaled(factor), self.motion.scaled(factor))
+        return RecordingEvidence(self.whole.scaled(factor), self.motion.scaled(factor), self.residual)
 
 
 class Accumulator:

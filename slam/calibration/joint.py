@@ -41,7 +41,8 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
     variance, alone = systematic_variance(model, systematic), len(evidence) == 1
     known = [part.whole if alone else part.whole.with_error(variance) for part in evidence]
     scaled_by = [part.motion if alone else part.whole for part in evidence]
-    solution = solve(as_delivered(model), residual_variance(), scaled_by, known)
+    residual = max(part.residual for part in evidence)
+    solution = solve(as_delivered(model), residual, scaled_by, known)
     covariance = solution.covariance + (np.diag(variance) if alone else 0.0)
     posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
     return KeptCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
@@ -99,7 +100,7 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     for recording in evidence:
         part = recording.whole.with_error(variance)
         covariance = np.linalg.inv(np.linalg.inv(prior) + part.S)
-        moved = covariance @ part.cross
+        moved = recording.residual * covariance @ part.cross
         after = 1 / (np.diag(covariance) + residual_variance() * np.square(moved).sum(axis=1))
         said = np.where(after - before > _SAYS * before, after - before, np.nan)
         means.append(after * (covariance @ part.e) / said)

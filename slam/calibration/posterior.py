@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slam.calibration.evidence import Evidence
-from slam.calibration.prior import Prior
+from slam.calibration.prior import RESIDUAL_SCALES, Prior, residual_variance
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
@@ -101,7 +101,7 @@ def solve(
 
     Args:
         prior: of the parameters.
-        residual: variance of the residual fields' coefficients.
+        residual: scale of the residual fields, from 0 to 1 (see `residual_scale`).
         evidence: of the data, from which the prior's scales follow.
         known: what the parameters follow from; None where that is the same.
     """
@@ -113,8 +113,32 @@ def solve(
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
-    moved = np.tensordot(weights * prior.residual, covariances, axes=1) @ whole.cross
-    return Solution(prior.mean + step, inner, inner + residual * moved @ moved.T, float(weights @ prior.residual))
+    moved = residual * np.tensordot(weights, covariances, axes=1) @ whole.cross
+    return Solution(prior.mean + step, inner, inner + residual_variance() * moved @ moved.T, residual)
+
+
+def residual_scale(prior: Prior, rows: Evidence) -> float:
+    """How large the residual fields are, as a part of what they may be: what the parameters leave of the rows' errors.
+
+    The root mean square over the scales that may be, weighted by their marginal likelihood. Fields along the rows,
+    which nothing shows so directly, are taken to be as large as those across them. Errors of neighbouring frames are
+    taken for independent: where they are not, the fields seem larger, and the uncertainty does.
+
+    Args:
+        prior: of the parameters.
+        rows: evidence of the parameters and of the fields across the rows (n + k).
+    """
+    n = len(prior.mean)
+    known, shared = prior.information[-1] + rows.S[:n, :n], rows.S[:n, n:]
+    gain = np.linalg.solve(known, shared)
+    A = rows.S[n:, n:] - shared.T @ gain
+    g = rows.e[n:] - gain.T @ rows.e[:n] - (rows.S[n:, :n] - gain.T @ rows.S[:n, :n]) @ prior.mean
+    values, vectors = np.linalg.eigh(A)
+    variances = 2 * residual_variance() * np.square(RESIDUAL_SCALES)[:, None]  # of both cameras
+    added = 1 + variances * np.maximum(values, 0)
+    logs = 0.5 * np.sum(np.square(vectors.T @ g) * variances / added - np.log(added), axis=1)
+    weights = np.exp(logs - logs.max())
+    return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
 
 
 def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:

@@ -25,6 +25,9 @@ SIGMAS = {
 #: Root mean square over the image of what no lens model holds [focal lengths]: a fifth of a pixel at 1000 px.
 _RESIDUAL = 2e-4
 
+#: Parts of that which a rig's fields may be; equally probable before rows show it.
+RESIDUAL_SCALES = np.geomspace(0.05, 1.0, 7)
+
 #: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
 #: [focal lengths].
 MEAN_DISPARITY = 7e-4
@@ -59,12 +62,10 @@ class Prior:
     Attributes:
         mean: (n,).
         covariances: equally probable ones (K, n, n).
-        residual: scale of the residual fields with each of them (K,).
     """
 
     mean: Array
     covariances: Array
-    residual: Array
 
     @cached_property
     def information(self) -> Array:
@@ -83,22 +84,21 @@ def as_delivered(model: RigModel) -> Prior:
     drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
     scales, turned, zoomed = np.array(list(product(_SCALES, _OFFSETS, _FOCALS))).T
     wide = [s[:, None, None] ** 2 * covariance for s, covariance in ((scales, spread), (turned, drift), (zoomed, zoom))]
-    return Prior(np.zeros(len(model.names)), sum(wide), scales)
+    return Prior(np.zeros(len(model.names)), sum(wide))
 
 
-def as_found(model: RigModel, mean: Array, covariance: Array, residual: float) -> Prior:
+def as_found(model: RigModel, mean: Array, covariance: Array) -> Prior:
     """Of a rig whose earlier recordings are known; its cameras may have turned since.
 
     Args:
         model: the parameters' meaning.
         mean: what the recordings say (n,).
         covariance: how well (n, n).
-        residual: scale of the residual fields.
     """
     sigma = offset_sigma(model)
     turned = np.array(_OFFSETS)
     covariances = covariance + turned[:, None, None] ** 2 * np.outer(sigma, sigma)
-    return Prior(mean, covariances, np.full(len(turned), residual))
+    return Prior(mean, covariances)
 
 
 def prior_information(model: RigModel) -> Array:

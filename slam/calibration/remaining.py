@@ -26,9 +26,8 @@ class RemainingRigError:
 
     def __init__(self, calibration: SelfCalibration, pixel_sigma: float) -> None:
         self._calibration = calibration
-        self.uncertainty = RigUncertainty(calibration.model, pixel_sigma)
         self.given = calibration.applied
-        self._accounted = calibration.applied  # the correction whose remains in the path are in the covariance
+        self.uncertainty = RigUncertainty(calibration.model, pixel_sigma, self.given.parameters)
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
@@ -42,10 +41,7 @@ class RemainingRigError:
         """Correct what a back end was given before, if it can do that; returns the change, None where there is none."""
         applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
         if not (isinstance(backend, RevisingBackend) and backend.revises_path):
-            step = applied.parameters - self._accounted.parameters
-            if step.any():
-                self.uncertainty.path_keeps(step, backend.positions, landmarks_follow=revising)
-                self._accounted = applied
+            self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=revising)
         if not isinstance(backend, RevisingBackend) or applied is self.given:
             return None
         revision = Revision(self.given, applied)
@@ -68,5 +64,5 @@ class RemainingRigError:
         """
         if not self._calibration.config.enabled:
             return CommonError()
-        made_with = self._calibration.applied if as_given else self._accounted
-        return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with.parameters))
+        made_with = self._calibration.applied.parameters if as_given else self.uncertainty.accounted
+        return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with))

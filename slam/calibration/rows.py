@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from slam.calibration.evidence import Evidence
-from slam.calibration.model import RigModel
+from slam.calibration.model import RESIDUAL, RigModel
 from slam.calibration.robust import student_weights
 from slam.geometry.se3 import Array
 
 _LEAST_NOISE = 0.03  # of a row [px], the least that is believed
 
 
-def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> Evidence:
-    """The likelihood of the parameters from the vertical disparities of one frame.
+def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
+    """The likelihood of the parameters from the vertical disparities of one frame; and that of parameters and fields.
 
     Args:
         model: the parameters' meaning.
         points: ``(x, y, d)`` (N, 3) [px] of the matches, as measured.
         vertical: right row less left row (N,) [px], as measured.
         parameters: the values (n,) at which wrong matches are told from right ones.
+
+    Returns:
+        The evidence of the parameters (n), and of them with the right camera's residual fields of y after them (n + k).
+        The left camera's look the same but for their sign.
     """
-    A = model.vertical(points)
+    A, fields = model.vertical(points), model.residual_vertical(points)
     residual = vertical + A @ parameters
-    weighted = A * student_weights(residual**2, 1, _LEAST_NOISE)[:, None]
-    return Evidence(weighted.T @ A, -(weighted.T @ vertical), weighted.T @ model.residual_vertical(points))
+    weights = student_weights(residual**2, 1, _LEAST_NOISE)[:, None]
+    both = np.column_stack([A, fields[:, -len(RESIDUAL) :]])
+    weighted, n = both * weights, A.shape[1]
+    S, e = weighted.T @ both, -(weighted.T @ vertical)
+    return Evidence(S[:n, :n], e[:n], weighted[:, :n].T @ fields), Evidence(S, e, np.zeros((len(e), 0)))

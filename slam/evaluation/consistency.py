@@ -9,7 +9,8 @@ old place is measured again the former may not be positive definite; such stretc
 Truth has errors of its own. `TruthNoise` gives each true pose an independent one, the first included: the turn of a
 recording's first true pose would otherwise count as an error of the whole path. What is the same in all poses, a turn
 between the axes of the truth's sensor and the camera's, is found from all stretches of one length by least squares and
-taken out. Stretches over which the truth contradicts itself are not judged (`slam.evaluation.doubtful_truth`).
+taken out, of the rig's errors as well. Stretches over which the truth contradicts itself are not judged
+(`slam.evaluation.doubtful_truth`).
 """
 
 from __future__ import annotations
@@ -110,14 +111,21 @@ def stretch_nees(
     finite = np.isfinite(N).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
     usable = np.flatnonzero(finite & ~doubtful(true, noise, first, last))
     usable = usable[np.linalg.eigvalsh(N[usable])[:, 0] > _SMALLEST]
-    P = N
-    if common is not None:
-        P = N + np.array([_shared(a, common[i], common[j]) for a, i, j in zip(A, first, last)]).reshape(N.shape)
     values = np.full(len(first), np.nan)
     if len(usable):
-        r = _remounted(residuals[usable], A[usable], P[usable], noise.mounting)
-        values[usable] = nees(r, P[usable])
+        N, A = N[usable], A[usable]
+        G: Array = np.zeros((len(usable), _DOF, 0))
+        if common is not None:
+            ends = [(common[i], common[j]) for i, j in zip(first[usable], last[usable])]
+            G = _shared(A, ends, N)
+        errors = _remounted(np.concatenate([residuals[usable, :, None], G], axis=2), A, _with(N, G), noise.mounting)
+        values[usable] = nees(errors[:, :, 0], _with(N, errors[:, :, 1:]))
     return values
+
+
+def _with(N: Array, G: Array) -> Array:
+    """Covariances (M, 6, 6) and what common errors (M, 6, k) of unit variance add to them."""
+    return np.asarray(N + G @ np.swapaxes(G, 1, 2))
 
 
 def _truth_covariances(true: Trajectory, noise: TruthNoise) -> Array:
@@ -130,31 +138,38 @@ def _truth_covariances(true: Trajectory, noise: TruthNoise) -> Array:
     return Q
 
 
-def _remounted(residuals: Array, A: Array, P: Array, mounting: float) -> Array:
-    """Residuals (M, 6) without what a constant rotation between the truth's axes and the camera's explains of them.
+def _remounted(errors: Array, A: Array, P: Array, mounting: float) -> Array:
+    """Errors (M, 6, k) without what a constant rotation between the truth's axes and the camera's explains of them.
 
-    With ``T_true = T exp(w)`` for all poses, a relative pose is off by ``(1 − A) w``.
+    With ``T_true = T exp(w)`` for all poses, a relative pose is off by ``(1 − A) w``. The rig's errors are treated as
+    the residuals are: else a turn of the rig, that the rotation explains, would count in the covariance alone.
 
     Args:
-        residuals: of relative poses (M, 6).
+        errors: of relative poses (M, 6, k), a column for each kind.
         A: adjoints (M, 6, 6) of their inverses.
-        P: their covariances (M, 6, 6).
+        P: covariances of the first column (M, 6, 6).
         mounting: standard deviation of each axis of w beforehand [rad].
     """
     if not mounting:
-        return residuals
+        return errors
     J = (np.eye(_DOF) - A)[:, :, :3]
     JW = np.swapaxes(np.linalg.solve(P, J), 1, 2)
     information = np.tensordot(JW, J, axes=((0, 2), (0, 1))) + np.eye(3) / mounting**2
-    return residuals - J @ np.linalg.solve(information, np.tensordot(JW, residuals, axes=((0, 2), (0, 1))))
+    return np.asarray(errors - J @ np.linalg.solve(information, np.tensordot(JW, errors, axes=((0, 2), (0, 1)))))
 
 
-def _shared(A: Array, first: CommonError, last: CommonError) -> Array:
-    """What errors that the poses at its ends share add to the covariance of a relative pose (6, 6)."""
-    if first.shares.shape == last.shares.shape:
-        relative = (last.shares - A @ first.shares) @ last.root
-        return np.asarray(relative @ relative.T)
-    return np.asarray(last.covariance - A @ first.covariance @ A.T)  # one is after a loop, where nothing is apart
+def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> Array:
+    """How relative poses (M) depend on errors of unit variance that the poses at their ends share (M, 6, k).
+
+    Where one end is after a loop nothing is apart: there the difference of the covariances is added to `N` (M, 6, 6).
+    """
+    G = np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
+    for row, (a, (first, last)) in enumerate(zip(A, ends)):
+        if first.shares.shape == last.shares.shape:
+            G[row, :, : last.root.shape[1]] = (last.shares - a @ first.shares) @ last.root
+        else:
+            N[row] += last.covariance - a @ first.covariance @ a.T
+    return G
 
 
 def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:

@@ -220,9 +220,11 @@ class _Problem:
                 if less <= cost:
                     poses, common, gain, cost = moved, common + half * change, cost - less, less
                     break
-            if gain < _CONVERGED or (less > cost and fresh):
+            if (gain < _CONVERGED and half == 1) or (
+                less > cost and fresh
+            ):  # a part of a step may gain little anywhere
                 break
-            fresh = less > cost or gain > _FAST * before
+            fresh = less > cost or half < 1 or gain > _FAST * before
             normal = self.normal(poses, common) if fresh else normal
         return poses, common, normal
 

@@ -131,7 +131,7 @@ def test_a_known_error_stays_in_a_path_that_is_not_revised():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(2, 6, 40)])
     ids = np.arange(40)
-    uncertainty = RigUncertainty(MODEL, 0.3)
+    uncertainty = RigUncertainty(MODEL, 0.3, error_of("right_cx", 0.0))
     none = np.zeros(0, np.int64)
     for T in path(10):
         uncertainty.observe(T, ids, points)

@@ -7,9 +7,12 @@ import pytest
 
 from slam.calibration import RigPosterior
 from slam.calibration.evidence import Accumulator, Evidence
-from slam.calibration.posterior import solve
-from slam.calibration.prior import Prior
+from slam.calibration.model import RigModel
+from slam.calibration.posterior import residual_scale, solve
+from slam.calibration.prior import Prior, as_delivered, residual_variance
+from slam.calibration.rows import row_evidence
 from slam.errors import CalibrationError
+from tests.slam.calibration.drives import CAR, parameters, residual_fields
 
 NONE = np.zeros(1)
 
@@ -43,7 +46,7 @@ def test_shapes_and_values_are_checked():
 
 
 def test_a_calibration_that_nothing_speaks_against_is_left_alone():
-    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2, np.ones(4))
+    prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2)
     near = solve(prior, 0.0, [evidence(0.1, 0.1)])
     assert abs(near.mean[0]) < 0.06  # one standard deviation from nothing
     clear = solve(prior, 0.0, [evidence(0.1, 0.01)])
@@ -51,11 +54,24 @@ def test_a_calibration_that_nothing_speaks_against_is_left_alone():
 
 
 def test_residual_fields_make_the_posterior_wider_and_leave_the_mean():
-    plain, wide = (
-        solve(Prior(NONE, np.ones((1, 1, 1)), np.ones(1)), 0.5**2, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 50.0)
-    )
+    plain, wide = (solve(Prior(NONE, np.ones((1, 1, 1))), 0.5, [evidence(1.0, 0.1, cross)]) for cross in (0.0, 1e5))
     assert plain.mean == wide.mean and plain.inner == wide.inner
-    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + 0.25**2, rel=0.1)  # 0.5 · 50 / 100
+    expected = residual_variance() * (0.5 * 1e5 / 100) ** 2
+    assert wide.covariance[0, 0] == pytest.approx(plain.inner[0, 0] + expected, rel=0.1)
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.3, 1.0])
+def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
+    model, rng = RigModel(CAR), np.random.default_rng(3)
+    fields, theta, rows = scale * residual_fields(rng), parameters(pitch=5e-4, yaw=3e-4), None
+    for _ in range(10):
+        xyz = [[-0.7, -0.2, 0.01], [0.7, 0.2, 0.05]]
+        points = model.focal * rng.uniform(*xyz, (300, 3))
+        vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
+        found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
+        rows = found if rows is None else rows + found
+    assert residual_scale(as_delivered(model), rows) == pytest.approx(scale, rel=0.4)
+    assert residual_scale(as_delivered(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])
@@ -69,7 +85,7 @@ def test_errors_that_last_are_counted_as_such(length):
         for x in errors:
             sums.add(evidence(x, 1.0))
         for _ in range(5):
-            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6), np.ones(1)), 0.0, sums.total())
+            solution = solve(Prior(NONE, np.full((1, 1, 1), 1e6)), 0.0, sums.total())
             sums.update_inflation(solution.mean, solution.inner)
         z.append(solution.mean[0] / np.sqrt(solution.covariance[0, 0]))
     # Half a block and less is counted in full; the prior on the inflation holds a part back.
@@ -88,6 +104,6 @@ def test_what_an_error_of_the_whole_recording_leaves():
 
 
 def test_an_earlier_posterior_is_the_start():
-    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)), np.ones(1))
+    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)))
     found = solve(prior, 0.0, [evidence(4.0, 1.0)])
     assert found.mean[0] == pytest.approx(3.0) and found.inner[0, 0] == pytest.approx(0.5)
