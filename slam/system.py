@@ -278,7 +278,12 @@ class StereoSlam:
             self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
         with stages.stage("atlas"):  # a place seen again corrects the path since
             estimate = self._rig_error.added_to(estimate)
-            step = replace(step, estimate=estimate, common=self._rig_error.common(as_given=False))
+            step = replace(
+                step,
+                estimate=estimate,
+                common=self._rig_error.common(as_given=False),
+                correction=self.calibration.applied,
+            )
             atlas, change = self._close_loops(step, change)
         common = self._rig_error.common(as_given=True)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
@@ -361,7 +366,9 @@ class StereoSlam:
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             rows = self.landmarks.moved(self.atlas.T_map_odom)
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, self.atlas)
+            keyframes = (k.corrected(self.calibration.applied, self.rig.rectified.rig) for k in self.atlas.keyframes)
+            atlas = replace(self.atlas, keyframes=tuple(keyframes))
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, atlas)
 
     @property
     def warnings(self) -> list[str]:
@@ -391,7 +398,7 @@ class StereoSlam:
         assert search is not None
         T, found = search.locate(features, index), None
         if T is None:
-            found = self._loop_closer.find(self.atlas, features, index)
+            found = self._loop_closer.find(self.atlas, features, self.calibration.applied, index)
             if found is None:
                 return False
             T = found.T_odom_left
@@ -414,7 +421,9 @@ class StereoSlam:
         Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
         positions, state = self._positions(landmarks.ids), self._last.state
-        found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
+        found = (
+            self._loop_closer.find(self.atlas, features, self.calibration.applied, index) if state.unmatched else None
+        )
         elsewhere = None if found is None else found.T_odom_left
         matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)
         if not matches.kidnapped:

@@ -28,7 +28,8 @@ class RemainingRigError:
         self._calibration = calibration
         self.uncertainty = RigUncertainty(calibration.model, pixel_sigma)
         self.given = calibration.applied
-        self._accounted = calibration.applied  # the correction whose remains in the path are in the covariance
+        self._last = calibration.applied
+        self._kept = 0 * calibration.applied.parameters  # changes of the correction that the path did not follow
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
@@ -41,11 +42,11 @@ class RemainingRigError:
     def revise(self, backend: Backend) -> Revision | None:
         """Correct what a back end was given before, if it can do that; returns the change, None where there is none."""
         applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
-        if not (isinstance(backend, RevisingBackend) and backend.revises_path):
-            step = applied.parameters - self._accounted.parameters
-            if step.any():
-                self.uncertainty.path_keeps(step, backend.positions, landmarks_follow=revising)
-                self._accounted = applied
+        step, kept = applied.parameters - self._last.parameters, self._kept
+        if step.any() and not (isinstance(backend, RevisingBackend) and backend.revises_path):
+            self.uncertainty.path_keeps(step, backend.positions, landmarks_follow=revising)
+            kept = kept + step
+        self._last, self._kept = applied, kept
         if not isinstance(backend, RevisingBackend) or applied is self.given:
             return None
         revision = Revision(self.given, applied)
@@ -68,5 +69,5 @@ class RemainingRigError:
         """
         if not self._calibration.config.enabled:
             return CommonError()
-        made_with = self._calibration.applied if as_given else self._accounted
-        return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with.parameters))
+        made_with = self._calibration.applied.parameters if as_given else self._kept
+        return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, CommonError, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import BoolArray, CommonError, Correction, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.errors import ConfigurationError
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
@@ -42,6 +42,7 @@ class Step:
         estimate: the camera's pose after the update.
         labels: which features move.
         common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
+        correction: that the features were corrected with; None where nothing is known of the rig.
     """
 
     index: int
@@ -56,6 +57,7 @@ class Step:
     estimate: Estimate
     labels: MotionLabels
     common: CommonError = field(default_factory=CommonError)
+    correction: Correction | None = None
 
 
 @dataclass(frozen=True)
