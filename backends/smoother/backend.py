@@ -216,8 +216,8 @@ class SmootherBackend:
 
     @property
     def revises_path(self) -> bool:
-        """See `slam.interfaces.RevisingBackend`: while no pose has left the problem."""
-        return self.measurement_log.history.first == 0
+        """See `slam.interfaces.RevisingBackend`: all poses are in the problem still, with their measurements."""
+        return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
 
     @one_blas_thread
     def revise(self, mend: Callable[[Array], Array]) -> None:
