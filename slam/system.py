@@ -331,7 +331,7 @@ class StereoSlam:
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose; in a known map, since it was found."""
         with self._stepping:
-            return self.atlas.path(self._path(), self._rig_error.common(as_given=False))
+            return self.atlas.path(self._path())
 
     def _path(self) -> Trajectory:
         """The path as the back end has it, in its own frame."""

@@ -180,22 +180,13 @@ class Atlas:
             covariances=R @ landmarks_by_pose(estimate, covariance) @ R.T,
         )
 
-    def path(self, path: Trajectory, rig: CommonError) -> Trajectory:
-        """A path in odom, taken to the map: without what it is known to be off by, and with the loops.
-
-        What that moves two keyframes by is shared out evenly in time between them.
-
-        Args:
-            path: from the back end.
-            rig: what is known of the rig by now.
-        """
-        if len(self) < 2 or not len(path) or (self.anchor is None and self.known):
-            return path
-        chain = self.chain(rig, path)
-        if self.anchor is None and not chain.known.any():
+    def path(self, path: Trajectory) -> Trajectory:
+        """A path in odom, taken to the map; what loops move two keyframes by is shared out evenly in time between."""
+        if self.anchor is None or not len(path):
             return path
         from slam.mapping.atlas.pose_graph import solve
 
+        chain = self.chain(self.anchor.rig, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
         stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))

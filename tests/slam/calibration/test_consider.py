@@ -127,24 +127,6 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
     np.testing.assert_array_equal(in_path, 0 * mean if system.backend.revises_path else mean)
 
 
-def test_the_final_path_is_corrected_by_what_is_known_at_the_end():
-    system, cloud, truth = StereoSlam(RIG, None, "ekf", config=CONFIG), Cloud(150), path(45)
-    delta, online = error_of("yaw", 3e-3), []
-    for k, T in enumerate(truth):
-        if k == 44:
-            known = system.calibration._solution
-            system.calibration._solution = replace(known, mean=delta, inner=1e-4 * known.inner)
-            system.calibration._motion_agrees = lambda: True
-        result = system.process_features(with_error(cloud.features(T, k / 30)[0], delta))
-        online.append(result.estimate.T_world_left)
-    final = system.trajectory().poses
-
-    def off(poses) -> float:
-        return float(np.linalg.norm((inverse(poses[0]) @ poses[-2])[:3, 3] - (inverse(truth[0]) @ truth[-2])[:3, 3]))
-
-    assert off(final) < 0.5 * off(np.array(online))
-
-
 def test_a_known_error_stays_in_a_path_that_is_not_revised():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(2, 6, 40)])
