@@ -58,7 +58,7 @@ class Keyframe:
         pixels, _ = rig.project_stereo(self.points.astype(float), jacobian=False)
         pixels = correction.rows(self.correction.undone(pixels))
         points = rig.triangulate(pixels[:, :2], pixels[:, [2, 1]])
-        points = np.where(np.isfinite(points).all(axis=1)[:, None], points, self.points).astype(np.float32)
+        points = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, self.points).astype(np.float32)
         return replace(self, points=points, correction=correction)
 
 

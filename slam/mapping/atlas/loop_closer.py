@@ -112,7 +112,8 @@ class LoopCloser:
         index = atlas.index.with_new(descriptors)
         kept = new if self._shelf is None else self._shelf.put(new)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
-        best = self._best_sighting(atlas, candidates, step.features, step.correction, step.index)
+        found = self._sightings(atlas, candidates, step.features, step.correction, step.index)
+        best = max(found, key=_inliers, default=None)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
 
     @one_blas_thread
@@ -244,17 +245,6 @@ class LoopCloser:
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
-
-    def _best_sighting(
-        self,
-        atlas: Atlas,
-        candidates: NDArray[np.intp],
-        features: StereoFeatures,
-        correction: Correction | None,
-        seed: int,
-    ) -> tuple[Loop, Sighting] | None:
-        """The candidate with which most features agree on a pose."""
-        return max(self._sightings(atlas, candidates, features, correction, seed), key=_inliers, default=None)
 
     def _sightings(
         self,
