@@ -338,6 +338,18 @@ class CommonError:
         return np.asarray(root @ root.T)
 
 
+class Correction(Protocol):
+    """What is known of the rig's error, for whoever holds measurements."""
+
+    def rows(self, z: Array) -> Array:
+        """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]."""
+        ...
+
+    def undone(self, z: Array) -> Array:
+        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
+        ...
+
+
 class Revision(Protocol):
     """A change of the rig's correction in the course of a run, for measurements that were corrected as before."""
 

@@ -161,7 +161,7 @@ class RevisingBackend(Protocol):
     """What a back end offers besides, where it can correct past measurements anew.
 
     Attributes:
-        revises_path: whether the path follows; else only the landmarks before the camera do.
+        revises_path: whether the whole path would follow now; else only what is near the camera does.
     """
 
     revises_path: bool

@@ -300,7 +300,8 @@ class StereoSlam:
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Step, Atlas, MapChange]:
         """The step with the rig's error in its estimate, and the atlas; after a loop the old landmarks are back."""
         estimate, common = self._rig_error.added_to(step.estimate), self._rig_error.common(as_given=False)
-        step, restarts = replace(step, estimate=estimate, common=common), len(self.restarted)
+        step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
+        restarts = len(self.restarted)
         atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
         if seen_again is not None:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
@@ -367,7 +368,9 @@ class StereoSlam:
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             rows = self.landmarks.moved(self.atlas.T_map_odom)
-            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, self.atlas)
+            keyframes = (k.corrected(self.calibration.applied, self.rig.rectified.rig) for k in self.atlas.keyframes)
+            atlas = replace(self.atlas, keyframes=tuple(keyframes))
+            return SavedMap.of(rows, estimate, self.frontend_name, self.world_frame, __version__, atlas)
 
     @property
     def warnings(self) -> list[str]:
@@ -397,7 +400,7 @@ class StereoSlam:
         assert search is not None
         T, found = search.locate(features, index), None
         if T is None:
-            found = self._loop_closer.find(self.atlas, features, index)
+            found = self._loop_closer.find(self.atlas, features, self.calibration.applied, index)
             if found is None:
                 return False
             T = found.T_odom_left
@@ -420,7 +423,9 @@ class StereoSlam:
         Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
         positions, state = self._positions(landmarks.ids), self._last.state
-        found = self._loop_closer.find(self.atlas, features, index) if state.unmatched else None
+        found = (
+            self._loop_closer.find(self.atlas, features, self.calibration.applied, index) if state.unmatched else None
+        )
         elsewhere = None if found is None else found.T_odom_left
         matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)
         if not matches.kidnapped:

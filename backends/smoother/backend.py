@@ -214,7 +214,10 @@ class SmootherBackend:
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
-    revises_path = True
+    @property
+    def revises_path(self) -> bool:
+        """See `slam.interfaces.RevisingBackend`: all poses are in the problem still, with their measurements."""
+        return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
 
     @one_blas_thread
     def revise(self, mend: Callable[[Array], Array]) -> None:

@@ -69,12 +69,12 @@ class RigUncertainty:
         applied: the correction (n,) that the path begins with.
 
     Attributes:
-        accounted: the correction (n,) whose remains in the path are in the covariance.
+        kept: the correction (n,) that the path was made with, as far as changes of it are in the covariance.
     """
 
     def __init__(self, model: RigModel, pixel_sigma: float, applied: Array) -> None:
         self._model = model
-        self.accounted = applied
+        self.kept, self._applied = applied, applied
         self._noise = pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
         self._T_world: Array | None = None
@@ -133,15 +133,19 @@ class RigUncertainty:
         """Forget all landmarks but these (M,)."""
         self._landmarks = self._landmarks.select(np.isin(self._landmarks.ids, ids))
 
+    def path_follows(self, applied: Array) -> None:
+        """The correction becomes `applied` (n,), and so does that of the path."""
+        self._applied = applied
+
     def path_keeps(self, applied: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
-        """The correction becomes `applied` (n,), but the path stays as the one that is accounted for made it.
+        """The correction becomes `applied` (n,), but the path stays as it is.
 
         Args:
             applied: the parameters.
             positions: gives the positions (M, 3) [m] of landmarks by their ids (M,).
             landmarks_follow: the landmarks move to where the new correction sees them from the present pose.
         """
-        step, pose, marks = applied - self.accounted, self._pose.copy(), self._landmarks
+        step, pose, marks = applied - self._applied, self._pose.copy(), self._landmarks
         if self._T_world is not None and step.any():
             by_rig = marks.by_rig.copy()
             pose[:, -1] += pose[:, :-2] @ step
@@ -152,7 +156,7 @@ class RigUncertainty:
                 by_rig[:, :, -1] = (-self._T_world[:3, :3] @ points_by_pose(local) @ pose[:, -1:])[:, :, 0]
             marks = replace(marks, by_rig=by_rig)
         # In one statement, so that an interrupt finds all of it done or nothing.
-        self._pose, self._landmarks, self.accounted = pose, marks, applied
+        self._pose, self._landmarks, self.kept, self._applied = pose, marks, self.kept + step, applied
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""

@@ -40,7 +40,9 @@ class RemainingRigError:
     def revise(self, backend: Backend) -> Revision | None:
         """Correct what a back end was given before, if it can do that; returns the change, None where there is none."""
         applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
-        if not (isinstance(backend, RevisingBackend) and backend.revises_path):
+        if isinstance(backend, RevisingBackend) and backend.revises_path:
+            self.uncertainty.path_follows(applied.parameters)
+        else:
             self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=revising)
         if not isinstance(backend, RevisingBackend) or applied is self.given:
             return None
@@ -64,5 +66,5 @@ class RemainingRigError:
         """
         if not self._calibration.config.enabled:
             return CommonError()
-        made_with = self._calibration.applied.parameters if as_given else self.uncertainty.accounted
+        made_with = self._calibration.applied.parameters if as_given else self.uncertainty.kept
         return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import CommonError, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import CommonError, Correction, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.object_data import MotionLabels
@@ -61,6 +61,7 @@ class Step:
         estimate: the camera's pose after the update.
         labels: which features move.
         common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
+        correction: that the features were corrected with.
     """
 
     index: int
@@ -75,6 +76,7 @@ class Step:
     estimate: Estimate
     labels: MotionLabels
     common: CommonError = field(default_factory=CommonError)
+    correction: Correction | None = None
 
 
 @dataclass(frozen=True)

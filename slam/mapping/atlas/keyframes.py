@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import IdArray, StereoFeatures
+from slam.data import Correction, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
@@ -31,6 +31,7 @@ class Keyframe:
         descriptors: theirs (F, D).
         laplacian: signs of their Laplacians (F,).
         landmarks: ids of the landmarks that they were in the back end's map (F,), −1 for none.
+        correction: of the rig's error, that the points were made with; None in a map of an earlier run.
     """
 
     frame: int
@@ -45,9 +46,20 @@ class Keyframe:
     descriptors: NDArray[np.float16]
     laplacian: NDArray[np.int8]
     landmarks: IdArray
+    correction: Correction | None = None
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def corrected(self, correction: Correction | None, rig: StereoRig) -> Keyframe:
+        """The same keyframe, its points by what is known of the rectified rig's error now."""
+        if self.correction is None or correction is None or self.correction is correction:
+            return self
+        pixels, _ = rig.project_stereo(self.points.astype(float), jacobian=False)
+        pixels = correction.rows(self.correction.undone(pixels))
+        points = rig.triangulate(pixels[:, :2], pixels[:, [2, 1]])
+        points = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, self.points).astype(np.float32)
+        return replace(self, points=points, correction=correction)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, CommonError, IdArray, StereoFeatures
+from slam.data import BoolArray, CommonError, Correction, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
@@ -113,30 +113,33 @@ class LoopCloser:
         index = atlas.index.with_new(descriptors)
         kept = new if self._file is None else self._file.put(new)
         atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
-        best = self._best_verified(atlas, candidates, step.features, step.index)
+        found = self._verified(atlas, candidates, step.features, step.correction, step.index)
+        best = max(found, key=_inliers, default=None)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
 
     @one_blas_thread
-    def find(self, atlas: Atlas, features: StereoFeatures, seed: int) -> Found | None:
+    def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
         """The keyframe whose place a camera sees that may be anywhere; None where no place is clear.
 
         Args:
             atlas: the places.
             features: of the frame.
+            correction: that they were corrected with.
             seed: of the random choice in the geometric check.
         """
         if not self._config.enabled or len(features) < self._config.inliers:
             return None
         features = self._rectify(features)
         likely = self._most_alike(atlas, features.descriptors, np.ones(len(atlas), bool))
-        loops = [loop for loop, _ in self._verified(atlas, self._ranked(atlas, likely, features), features, seed)]
-        if not loops:
+        likely = self._ranked(atlas, likely, features)
+        verified = self._verified(atlas, likely, features, correction, seed)
+        if not verified:
             return None
-        loop = max(loops, key=lambda one: one.inliers)
-        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other in loops):
+        loop, seen = max(verified, key=_inliers)
+        if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
             return None
         T_odom_keyframe = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
-        return Found(T_odom_keyframe @ loop.T_first_second, self._place(atlas.keyframes[loop.first], T_odom_keyframe))
+        return Found(T_odom_keyframe @ loop.T_first_second, self._place(seen.keyframe, T_odom_keyframe))
 
     def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
         """A keyframe's features as landmarks, where its pose is (4, 4)."""
@@ -204,6 +207,7 @@ class LoopCloser:
             np.clip(features.descriptors[rows], -_LARGEST, _LARGEST).astype(np.float16),
             features.laplacian[rows],
             landmark_of[rows],
+            step.correction,
         )
 
     def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray) -> NDArray[np.intp]:
@@ -243,15 +247,13 @@ class LoopCloser:
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
 
-    def _best_verified(
-        self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
-    ) -> tuple[Loop, Verified] | None:
-        """The candidate with which most features agree on a pose."""
-        found = self._verified(atlas, candidates, features, seed)
-        return max(found, key=lambda one: one[0].inliers, default=None)
-
     def _verified(
-        self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, seed: int
+        self,
+        atlas: Atlas,
+        candidates: NDArray[np.intp],
+        features: StereoFeatures,
+        correction: Correction | None,
+        seed: int,
     ) -> list[tuple[Loop, Verified]]:
         """The candidates with which enough features agree on a pose, as loops that end at the present camera.
 
@@ -260,7 +262,8 @@ class LoopCloser:
         X = self._rectified.T_left_rectified
         A, found = adjoint(X), []
         for k in candidates.tolist():
-            seen = verify(atlas.keyframes[k], features, self._rig, self._localizer, self._config, seed)
+            keyframe = atlas.keyframes[k].corrected(correction, self._rig)
+            seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
                 # Both poses have what their frames add, which is no more than what such measurements are off by.
                 T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
@@ -302,7 +305,7 @@ class LoopCloser:
             anchor=Anchor(solution.covariance, solution.common, rig),
             T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
         )
-        return atlas, self._returned(atlas.keyframes[loop.first], seen) if self._config.give_back else None
+        return atlas, self._returned(seen) if self._config.give_back else None
 
     def _agree(self, chain: Chain, before: Loop, loop: Loop) -> bool:
         """Whether two loops, a few keyframes one after the other, tell of the same return."""
@@ -320,9 +323,14 @@ class LoopCloser:
         _, P = chain.motion(last.second, loop.second)
         return bool(np.trace(P[3:, 3:]) > np.trace(loop.covariance[3:, 3:]))
 
-    def _returned(self, keyframe: Keyframe, seen: Verified) -> Returned:
+    def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's features that agree, in the coordinates of the present left camera."""
-        m, X, back = seen.matches, self._rectified.T_left_rectified, inverse(seen.T_keyframe_left)
+        keyframe, m, X, back = (
+            seen.keyframe,
+            seen.matches,
+            self._rectified.T_left_rectified,
+            inverse(seen.T_keyframe_left),
+        )
         points = keyframe.points[m.landmarks].astype(float)
         near, R = transform(back, points), back[:3, :3]
         J = points_by_pose(near)
@@ -330,6 +338,11 @@ class LoopCloser:
         P = X[:3, :3] @ (P + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
         symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
+
+
+def _inliers(one: tuple[Loop, Verified]) -> int:
+    """Number of features that agree."""
+    return one[0].inliers
 
 
 def _nearest(poses: Array, here: Array, depth: float, possible: BoolArray) -> NDArray[np.intp]:

@@ -30,12 +30,14 @@ class Verified:
     """A keyframe's place, seen again.
 
     Attributes:
+        keyframe: that shows it.
         T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
         covariance: its covariance (6, 6), perturbing on the right.
         noise: the part of it (6, 6) that is pixel noise of both frames.
         matches: the keyframe's features that agree, by their rows, and the present frame's.
     """
 
+    keyframe: Keyframe
     T_keyframe_left: Array
     covariance: Array
     noise: Array
@@ -80,7 +82,7 @@ def verify(
     T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
     slide = _SLIDE / rig.left.fu
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
-    return Verified(T, covariance, noise, Matches(ids.astype(np.intp), seen))
+    return Verified(keyframe, T, covariance, noise, Matches(ids.astype(np.intp), seen))
 
 
 def refined_pose(

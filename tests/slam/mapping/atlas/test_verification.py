@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from slam.calibration import RigModel
+from slam.calibration.correction import Revision, RigCorrection
 from slam.data import StereoFeatures
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
@@ -79,6 +83,28 @@ def test_the_pose_of_a_place_seen_again():
         assert np.linalg.norm(error[3:]) < 0.15 and np.linalg.norm(error[:3]) < 0.01
         nees.append(error @ np.linalg.solve(found.covariance, error))
     assert np.mean(nees) < 6.0  # features do not slide here, which the covariance allows for
+
+
+def test_an_old_keyframe_is_corrected_by_what_is_known_of_the_rig_now():
+    model, error = RigModel(RIG), np.zeros(len(RigModel.names))
+    error[[model.names.index("left_f"), model.names.index("right_f")]] = 0.01
+    nothing, known = RigCorrection(model, 0 * error), RigCorrection(model, error)
+    points, descriptors = world(0)
+    old = keyframe(wrong(view(np.eye(4), points, descriptors, 0), nothing, known))
+    old = replace(old, correction=nothing)
+    seen = view(MOVED, points, descriptors, 1)
+    errors = []
+    for one in (old, old.corrected(known, RIG)):
+        found = verify(one, seen, RIG, LOCALIZER, AtlasConfig(), 1)
+        assert found is not None
+        errors.append(np.linalg.norm(log(inverse(MOVED) @ found.T_keyframe_left)[3:]))
+    assert errors[1] < 0.02 < 0.06 < errors[0]
+
+
+def wrong(features: StereoFeatures, nothing: RigCorrection, known: RigCorrection) -> StereoFeatures:
+    """Features as a rig measures them whose error is not corrected."""
+    z = Revision(known, nothing).rows(np.column_stack([features.uv_left, features.uv_right[:, 0]]))
+    return replace(features, uv_left=z[:, :2].copy(), uv_right=z[:, [2, 1]].copy())
 
 
 def test_least_squares_knows_how_sure_it_is():
