@@ -49,6 +49,8 @@ class PinholeCamera:
     distortion: tuple[float, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        if not isinstance(self.distortion, (tuple, list, np.ndarray)):
+            raise CalibrationError(f"distortion must be a tuple of coefficients, got {type(self.distortion).__name__}")
         values = (self.fu, self.fv, self.u0, self.v0, *self.distortion)
         if not all(isinstance(v, numbers.Real) for v in (*values, self.width, self.height)):
             raise CalibrationError(f"camera calibration is not of numbers: {values}")
