@@ -62,7 +62,7 @@ class PinholeCamera:
             raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
         if not (self.width <= _WIDEST and self.height <= _WIDEST):
             raise CalibrationError(f"image size must be at most {_WIDEST}, got {self.width}x{self.height}")
-        if self.model not in DISTORTION_MODELS:
+        if not isinstance(self.model, str) or self.model not in DISTORTION_MODELS:
             raise CalibrationError(f"unknown distortion model {self.model!r}: {', '.join(DISTORTION_MODELS)}")
         if len(self.distortion) not in DISTORTION_MODELS[self.model]:
             raise CalibrationError(

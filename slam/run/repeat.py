@@ -90,7 +90,7 @@ def load(
         SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
         ConfigurationError: its settings are not those of this version.
     """
-    file = path / CONFIG if path.is_dir() else path
+    file = path / CONFIG if os.path.isdir(path) else path  # noqa: PTH112 unlike Path's, without errors
     try:
         tree = _restored(read_object(file))
         if str(tree.get("command", "")).startswith("slam replay"):

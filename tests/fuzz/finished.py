@@ -27,9 +27,20 @@ _JSON = (
 def _left() -> dict[str, bytes]:
     """All files that a run, a comparison and a calibration leave."""
     with tempfile.TemporaryDirectory() as folder:
-        with elsewhere(Path(folder)):
+        with elsewhere(Path(folder)), patch("slam.commands.compare.LocalScheduler", _Here):
             for words in (
-                ["run", SEQUENCE, "--out", "run", "--record", "a.npz", "--save-map", "a.map", "--no-picture", "--quiet"],
+                [
+                    "run",
+                    SEQUENCE,
+                    "--out",
+                    "run",
+                    "--record",
+                    "a.npz",
+                    "--save-map",
+                    "a.map",
+                    "--no-picture",
+                    "--quiet",
+                ],
                 ["compare", SEQUENCE, "--out", "compared", "--workers", "1", "--quiet"],
             ):
                 assert call(words)[0] == 0
@@ -45,9 +56,8 @@ def commands(rng: np.random.Generator, folder: Path) -> None:
     for _ in range(int(rng.integers(3))):
         path = folder / choose(rng, files(folder))
         _change(rng, path)
-    with elsewhere(folder):
-        with patch("slam.commands.compare.LocalScheduler", _Here):
-            require_status(*call(words))
+    with elsewhere(folder), patch("slam.commands.compare.LocalScheduler", _Here):
+        require_status(*call(words))
 
 
 class _Here:
@@ -71,7 +81,9 @@ def _words(rng: np.random.Generator) -> tuple[list[str], Any]:
         return ["run", "--config", which, "--out", "again", "--quiet", "--no-picture", *more], _only("run/config.json")
     if kind == 1:
         out = choose(rng, ("a.png", "a.svg", "a.pdf", "a.x", "", "run", *RELATIVE))
-        more = choose(rng, ([], ["run"], ["compared"], ["--figure", choose(rng, ("path", "map", "errors", "time", "x"))]))
+        more = choose(
+            rng, ([], ["run"], ["compared"], ["--figure", choose(rng, ("path", "map", "errors", "time", "x"))])
+        )
         return ["plot", "run", "--out", out, *more], _below("run")
     if kind == 2:
         return ["view", "run", "--to", choose(rng, ("a.rrd", "", "run", *RELATIVE))], _below("run")
@@ -105,7 +117,9 @@ def _change(rng: np.random.Generator, path: Path) -> None:
     if kind == 0:
         path.unlink()
         if rng.random() < 0.7:
-            choose(rng, (os.mkfifo, os.mkdir, lambda p: os.symlink("/dev/zero", p), lambda p: os.symlink(p.name, p)))(path)
+            choose(rng, (os.mkfifo, os.mkdir, lambda p: os.symlink("/dev/zero", p), lambda p: os.symlink(p.name, p)))(
+                path
+            )
     elif path.suffix == ".json" and kind < 6:
         tree = json.loads(data)
         path.write_bytes(choose(rng, _JSON) if kind == 1 else json.dumps(_hostile(rng, tree), default=str).encode())

@@ -136,7 +136,9 @@ def _run(mine: Any, folder: Path) -> None:
     """A run with its files: the rows of the frames before are whole."""
     out, done = folder / "out", []
     sequence: Any = Scripted(None, 0)
-    options = RunOptions(f"{__name__}:made", "none", SystemConfig(), out, record=folder / "a.npz", save_map=folder / "a.map")
+    options = RunOptions(
+        f"{__name__}:made", "none", SystemConfig(), out, record=folder / "a.npz", save_map=folder / "a.map"
+    )
     try:
         with patch(f"{__name__}.made", lambda *_, **__: mine):
             run(sequence, options, lambda r: done.append(r.index), frontend=_Frontend())  # type: ignore[arg-type]

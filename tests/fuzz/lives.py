@@ -88,7 +88,10 @@ class _Life:
         save_map(path, self.system)
         loaded = load_map(path)
         if self.rng.random() < 0.6:
-            self.system, self.known = StereoSlam(self.rig, None, self.backend, config=self.config, known_map=loaded), True
+            self.system, self.known = (
+                StereoSlam(self.rig, None, self.backend, config=self.config, known_map=loaded),
+                True,
+            )
 
     def interrupt(self) -> None:
         try:

@@ -30,7 +30,9 @@ _LENGTHS = (0.0, 1e-9, 1e-3, 0.1, 1.0, 50.0, 300.0, 1e4, 1e9, 1e300, -1.0, np.na
 def rigs(rng: np.random.Generator, folder: Path) -> None:
     """A rig of hostile numbers; one that is accepted can be rectified, corrected, written and used."""
     cameras = [_camera(rng) for _ in range(2)]
-    R = choose(rng, (np.eye(3), np.diag([1.0, -1, -1]), _turned(rng, 0.02), _turned(rng, 3.0), np.zeros((3, 3)), -np.eye(3)))
+    R = choose(
+        rng, (np.eye(3), np.diag([1.0, -1, -1]), _turned(rng, 0.02), _turned(rng, 3.0), np.zeros((3, 3)), -np.eye(3))
+    )
     b = np.array([-0.1, 0.0, 0.0]) if rng.random() < 0.5 else choose(rng, _LENGTHS) * rng.standard_normal(3)
     rig = StereoRig(*cameras, choose(rng, (R, R, R, choose(rng, VALUES))), choose(rng, (b, b, b, choose(rng, VALUES))))
     points = rng.uniform((-2, -2, 1), (2, 2, 9), (5, 3))
@@ -85,7 +87,9 @@ def trajectories(rng: np.random.Generator, folder: Path) -> None:
             getattr(own, f"write_{form}")(path)
             if rng.random() < 0.6:
                 data = path.read_bytes()
-                path.write_bytes(broken_bytes(rng, data) if rng.random() < 0.4 else broken_text(rng, data.decode()).encode())
+                path.write_bytes(
+                    broken_bytes(rng, data) if rng.random() < 0.4 else broken_text(rng, data.decode()).encode()
+                )
             own = getattr(Trajectory, f"read_{form}")(path)
         paths.append(own)
         repr(own), own._repr_html_(), own.length
@@ -101,9 +105,13 @@ def _poses(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     n = int(rng.integers(0, 12))
     stamps = 0.1 * np.arange(n) * choose(rng, (1.0, 1.0, 1e9, 1e-12, 1e300, np.nan, -1.0))
     poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, 3] = np.cumsum(rng.standard_normal((n, 3)), 0) * choose(rng, (1.0, 1.0, 0.0, 1e-300, 1e9, 1e200, np.inf))
+    poses[:, :3, 3] = np.cumsum(rng.standard_normal((n, 3)), 0) * choose(
+        rng, (1.0, 1.0, 0.0, 1e-300, 1e9, 1e200, np.inf)
+    )
     if n and rng.random() < 0.3:
-        poses[int(rng.integers(n))] = choose(rng, (0 * np.eye(4), -np.eye(4), 1e300 * np.eye(4), np.ones((4, 4)), 2 * np.eye(4)))
+        poses[int(rng.integers(n))] = choose(
+            rng, (0 * np.eye(4), -np.eye(4), 1e300 * np.eye(4), np.ones((4, 4)), 2 * np.eye(4))
+        )
     return stamps, poses
 
 
