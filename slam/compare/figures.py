@@ -16,6 +16,7 @@ from slam.compare.measure import Metric
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.compare.trial import SERIES
+from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate, chi_square_band
 from slam.files import read_numbers
 from slam.geometry.se3 import Array
@@ -87,8 +88,15 @@ def example(group: Group) -> dict[str, Run]:
 
 
 def read_series(run: Run) -> dict[str, Array]:
-    """A run's columns of `SERIES_COLUMNS`."""
-    return dict(zip(SERIES_COLUMNS, read_numbers(run.folder / SERIES, len(SERIES_COLUMNS)).T))
+    """A run's columns of `SERIES_COLUMNS`.
+
+    Raises:
+        SlamError: the file cannot be read, or has no row.
+    """
+    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
+    if not len(rows):
+        raise SlamError(f"{run.folder / SERIES}: has no row")
+    return dict(zip(SERIES_COLUMNS, rows.T))
 
 
 def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:

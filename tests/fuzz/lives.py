@@ -27,7 +27,8 @@ from tests.slam.test_interrupted import Lines
 
 _FRAMES = 40
 _SETTINGS = (
-    [], [], ["atlas.on_disk=true"], ["atlas.enabled=false"], ["map.max_landmarks=30"], ["self_calibration.enabled=false"],
+    [], [], ["atlas.on_disk=true"], ["atlas.enabled=false"], ["map.max_landmarks=30"],
+    ["self_calibration.enabled=false"],
     ["atlas.agreeing=1", "atlas.inliers=5", "atlas.return_depths=0.5"], ["map.lost_after=2"], ["objects.mode=off"],
     ["atlas.keyframe_share=1.0", "atlas.features=5"], ["association.consistency_sigmas=0.5"],
 )  # fmt: skip

@@ -79,7 +79,7 @@ def trajectories(rng: np.random.Generator, folder: Path) -> None:
     """Paths of hostile poses, read from hostile files, compared with each other."""
     path = folder / "path.txt"
     paths = []
-    for k in range(2):
+    for _ in range(2):
         stamps, poses = _poses(rng)
         own = Trajectory(stamps, poses)
         if rng.random() < 0.5:

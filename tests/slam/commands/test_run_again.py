@@ -109,7 +109,7 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
 
 
 def test_no_config_and_no_sequence(tmp_path):
-    with pytest.raises(SlamError, match="config.json: No such file"):
+    with pytest.raises(SlamError, match=r"config\.json: No such file"):
         load(tmp_path)
     with pytest.raises(SlamError, match="name a sequence"):
         slam("run")
@@ -142,7 +142,7 @@ def test_runs_have_folders_of_their_own(here):
 def test_another_run_is_not_overwritten_without_being_told(here):
     slam("run", WORLD, "--frames", "0:2", "--out", "mine", "-q", "--no-picture")
     before = (here / "mine/config.json").read_bytes()
-    with pytest.raises(SlamError, match=".: holds runs in folders of their own, such as mine; give --out NAME"):
+    with pytest.raises(SlamError, match=r"\.: holds runs in folders of their own, such as mine; give --out NAME"):
         slam("run", WORLD, "--frames", "0:2", "--out", ".", "-q")
     for words in (["run", WORLD, "--frames", "0:3"], ["run", "--config", "mine"]):
         with pytest.raises(SlamError, match="mine: holds a run already; give another --out, or --overwrite"):
