@@ -70,8 +70,10 @@ def _require_types(
     rig: StereoRig, config: SystemConfig | None, known_map: SavedMap | None, rig_prior: KeptCalibration | None
 ) -> None:
     """Raise ConfigurationError where a system is given something else than it is documented to take."""
-    kinds = {"rig": (rig, StereoRig), "config": (config, SystemConfig)}
-    kinds |= {"known_map": (known_map, SavedMap), "rig_prior": (rig_prior, KeptCalibration)}
+    kinds: dict[str, tuple[object, type]] = {
+        "rig": (rig, StereoRig), "config": (config, SystemConfig),
+        "known_map": (known_map, SavedMap), "rig_prior": (rig_prior, KeptCalibration),
+    }  # fmt: skip
     for name, (value, kind) in kinds.items():
         if not isinstance(value, kind) and (value is not None or name == "rig"):
             raise ConfigurationError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")

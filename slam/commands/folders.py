@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from slam.errors import SlamError
@@ -45,8 +44,7 @@ def require_free(out: Path) -> None:
     """Raise SlamError where a folder holds a run or a comparison, or one of its folders does."""
     if _holds_run(out):
         raise SlamError(f"{out}: holds a run already; give another --out, or --overwrite to replace it")
-    with os.scandir(out) if out.is_dir() else nullcontext([]) as inside:
-        runs = next((entry.name for entry in inside if entry.is_dir() and _holds_run(Path(entry.path))), None)
+    runs = next((folder.name for folder in out.iterdir() if _holds_run(folder)), None) if out.is_dir() else None
     if runs is not None:
         raise SlamError(f"{out}: holds runs in folders of their own, such as {runs}; give --out {out / 'NAME'}")
 
