@@ -31,7 +31,7 @@ from slam.compare.trial import (
 )
 from slam.errors import SlamError
 from slam.files import read_object
-from slam.run.outputs import write_json
+from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"
@@ -163,11 +163,12 @@ def _keep(
     folder = out / RUNS / trial.folder
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    for name, content in files.items():
-        (part / name).write_bytes(content)
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    with naming_folder(folder):
+        part.mkdir(parents=True)
+        for name, content in files.items():
+            (part / name).write_bytes(content)
+        shutil.rmtree(folder, ignore_errors=True)
+        part.rename(folder)
     if on_done is not None:
         on_done(trial)
 
