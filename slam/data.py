@@ -176,6 +176,8 @@ class Observations:
     uv_right: Array
 
     def __post_init__(self) -> None:
+        if not all(isinstance(a, np.ndarray) and a.ndim for a in (self.ids, self.uv_left, self.uv_right)):
+            raise MeasurementError("observations: ids and pixels must be arrays with a row for each landmark")
         n = len(self.ids)
         if self.uv_left.shape != (n, 2) or self.uv_right.shape != (n, 2):
             raise MeasurementError(

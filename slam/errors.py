@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from traceback import extract_tb
+
 _LONGEST = 600  # characters of a message
 
 
@@ -10,6 +13,13 @@ def one_line(text: str, length: int = _LONGEST) -> str:
     if len(text) > length:
         text = f"{text[: 2 * length // 3]} … {text[-(length // 3) :]}"
     return "".join(c if c.isprintable() else " " if c in "\n\t" else repr(c)[1:-1] for c in text).strip()
+
+
+def cause(error: BaseException) -> str:
+    """An exception of somebody else's code in words, and the line that raised it."""
+    place = extract_tb(error.__traceback__)[-1]
+    text = f": {error}" if str(error) else ""
+    return f"{type(error).__name__}{text} ({Path(place.filename).name}, line {place.lineno})"
 
 
 class SlamError(Exception):
@@ -49,3 +59,7 @@ class MeasurementError(SlamError):
 
 class CopyError(SlamError, TypeError):
     """An object can be neither copied nor pickled; the message says what to do instead."""
+
+
+class PartError(SlamError):
+    """A back end or front end from elsewhere raised an exception of its own, which is the ``__cause__``."""

@@ -6,22 +6,28 @@ beside their place and moved there: a full disk or a kill leaves the old file or
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.errors import SequenceError, SlamError
+
+Array = NDArray[np.float64]
 
 _MEBI = 2**20
 
 #: Most bytes of a text file: tables of stamps and poses, calibrations.
 TEXT_LIMIT = 128 * _MEBI
+_JSON_LIMIT = 16 * _MEBI
+_LARGEST = 1e15  # number in a table: stamps in nanoseconds are larger, but no table of ours has them
 
 
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
@@ -39,7 +45,7 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
         descriptor = os.open(path, os.O_RDONLY | _not_blocking())
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
-    except ValueError as fault:  # a NUL or a lone surrogate in the name
+    except (ValueError, TypeError) as fault:  # a NUL or a lone surrogate in the name; no name at all
         raise error(f"{path}: no possible file name") from fault
     try:
         status = os.fstat(descriptor)
@@ -59,6 +65,39 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
 def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] = SequenceError) -> str:
     """The text of a regular file in UTF-8, a byte order mark left out, other bytes replaced; raises as `read_bytes`."""
     return read_bytes(path, limit, error).decode("utf-8-sig", errors="replace")
+
+
+def read_object(path: str | Path, error: type[SlamError] = SlamError) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        SlamError: of type `error`, where the file cannot be read, or holds something else.
+    """
+    text = read_text(path, _JSON_LIMIT, error)
+    try:
+        tree = json.loads(text)
+    except (ValueError, RecursionError) as fault:
+        raise error(f"{path}: no valid JSON: {fault}") from fault
+    if not isinstance(tree, dict):
+        raise error(f"{path}: must hold an object, not a {type(tree).__name__}")
+    return tree
+
+
+def read_numbers(path: str | Path, columns: int, error: type[SlamError] = SlamError) -> Array:
+    """The rows of a CSV file below its header (N, columns), NaN for an empty cell.
+
+    Raises:
+        SlamError: of type `error`, where the file cannot be read, or a row has another number of cells, or one that is
+            no number up to `_LARGEST`.
+    """
+    try:
+        rows = [[float(cell or "nan") for cell in line.split(",")] for line in read_text(path).splitlines()[1:]]
+        table = np.array(rows, float).reshape(len(rows), columns)
+    except ValueError as fault:
+        raise error(f"{path}: no table of {columns} columns of numbers: {fault}") from fault
+    if (np.abs(table) > _LARGEST).any():
+        raise error(f"{path}: a number is far too large")
+    return table
 
 
 def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
@@ -116,7 +155,7 @@ def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:
     Raises:
         SlamError: of type `error`, where there is no such home, or the text can be no path.
     """
-    if "\0" in str(text):
+    if "\0" in str(text) or not isinstance(text, (str, os.PathLike)):
         raise error(f"{text}: no possible file name")
     try:
         return Path(text).expanduser()

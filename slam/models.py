@@ -145,5 +145,5 @@ def models_for(kind: str) -> EstimatorModels:
     """
     try:
         return KINDS[kind]
-    except KeyError:
+    except (KeyError, TypeError):
         raise ConfigurationError(unknown("kind of motion", kind, KINDS)) from None

@@ -17,7 +17,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     ''
     """
     by_case = {other.lower(): other for other in known}
-    near = get_close_matches(name.lower(), by_case, 1, _LIKE)
+    near = get_close_matches(str(name).lower(), by_case, 1, _LIKE)
     return f" (did you mean {by_case[near[0]]!r}?)" if near else ""
 
 

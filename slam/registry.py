@@ -15,10 +15,9 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from traceback import extract_tb
 from typing import Any
 
-from slam.errors import ConfigurationError, SlamError, UnknownNameError
+from slam.errors import ConfigurationError, SlamError, UnknownNameError, cause
 from slam.naming import unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
@@ -68,7 +67,7 @@ def resolve(role: str, name: str) -> Any:
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {error}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {_cause(error)}") from error
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {cause(error)}") from error
 
 
 def create(role: str, name: str, rig: Any, **options: Any) -> Any:
@@ -86,14 +85,18 @@ def create(role: str, name: str, rig: Any, **options: Any) -> Any:
     except SlamError:
         raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        raise ConfigurationError(f"{what} {name!r} cannot be created: {_cause(error)}") from error
-    missing = [method for method in _METHODS[role] if not callable(getattr(created, method, None))]
-    if missing:
-        raise ConfigurationError(f"{what} {name!r} is none: it lacks {', '.join(missing)}")
-    return created
+        raise ConfigurationError(f"{what} {name!r} cannot be created: {cause(error)}") from error
+    return require_methods(role, created, repr(name))
 
 
-def _cause(error: BaseException) -> str:
-    """An exception in words, and the line that raised it."""
-    place = extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
+def require_methods(role: str, part: Any, name: str = "") -> Any:
+    """An object that is given as a back end or front end; None, for no front end, goes through.
+
+    Raises:
+        ConfigurationError: it lacks methods of its protocol (they are named).
+    """
+    missing = [method for method in _METHODS[role] if not callable(getattr(part, method, None))]
+    if missing and (part is not None or role == "backends"):
+        what = role[:-1].replace("end", " end")
+        raise ConfigurationError(f"{what} {name or type(part).__name__} is none: it lacks {', '.join(missing)}")
+    return part

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from slam.errors import ConfigurationError
@@ -25,6 +25,8 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
     Raises:
         ConfigurationError: a text is not of that form, or its section or key is unknown.
     """
+    if isinstance(settings, str) or not all(isinstance(setting, str) for setting in _listed(settings)):
+        raise ConfigurationError("settings must be a list of texts section.key=value")
     for setting in settings:
         if len(setting) > _LONGEST:
             raise ConfigurationError(f"setting {setting!r} is longer than {_LONGEST} characters")
@@ -32,6 +34,11 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
         if not equals:
             raise ConfigurationError(f"setting {setting!r} is not of the form section.key=value")
         _set(tree, path.strip().split("."), _value(text.strip()), setting)
+
+
+def _listed(settings: Any) -> list[Any]:
+    """What can be gone through as a list; something that is no text where it cannot."""
+    return list(settings) if isinstance(settings, Iterable) else [None]
 
 
 def _value(text: str) -> Any:

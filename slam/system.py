@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import overload
 
@@ -13,6 +14,7 @@ from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfC
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame, UpdateReport
 from slam.errors import ConfigurationError, MeasurementError, SlamError
+from slam.foreign import named_failures
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
@@ -40,6 +42,19 @@ from slam.tracking.state import TrackingState
 
 #: How far from its row a front end looks for a feature's partner, where it does not say [px].
 _ROWS = 1.5
+
+
+def _require_types(
+    rig: StereoRig, config: SystemConfig | None, prior_map: SavedMap | None, rig_prior: KeptCalibration | None
+) -> None:
+    """Raise ConfigurationError where a system is given something else than it is documented to take."""
+    kinds: dict[str, tuple[object, type]] = {
+        "rig": (rig, StereoRig), "config": (config, SystemConfig),
+        "prior_map": (prior_map, SavedMap), "rig_prior": (rig_prior, KeptCalibration),
+    }  # fmt: skip
+    for name, (value, kind) in kinds.items():
+        if not isinstance(value, kind) and (value is not None or name == "rig"):
+            raise ConfigurationError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
 
 
 class StereoSlam:
@@ -86,6 +101,7 @@ class StereoSlam:
         rig_prior: KeptCalibration | None = None,
     ) -> None:
         keep_freed_memory()
+        _require_types(rig, config, prior_map, rig_prior)
         names = [name if isinstance(name, str) else None for name in (frontend, backend)]
         self.rig = rig
         c = config or SystemConfig.for_kind(kind, *names)
@@ -93,12 +109,14 @@ class StereoSlam:
             c = replace(c, map=replace(c.map, max_landmarks=len(prior_map)))
         self.config = c
         self.frontend: Frontend | None = (
-            registry.create("frontends", frontend, rig, **c.frontend) if isinstance(frontend, str) else frontend
+            registry.create("frontends", frontend, rig, **c.frontend)
+            if isinstance(frontend, str)
+            else registry.require_methods("frontends", frontend)
         )
         self.backend: Backend = (
             registry.create("backends", backend, rig, models=c.models, **c.backend)
             if isinstance(backend, str)
-            else backend
+            else registry.require_methods("backends", backend)
         )
         self.landmarks: LandmarkRows | None = None  # of the last step that was completed
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
@@ -154,7 +172,7 @@ class StereoSlam:
         frame = self._frame(left, right, stamp)
         with self._stepping:
             _, features, milliseconds = self._extract(frame)
-            result = self._step(features)
+            result = self._step(features, frame.index)
             return replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
     def _frame(self, left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None) -> StereoFrame:
@@ -178,10 +196,13 @@ class StereoSlam:
         Raises:
             As `process`, at the frame whose step fails.
         """
+        if not isinstance(frames, Iterable):
+            raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
         extracted = map(self._extract, frames)
         depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
         for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
-            result = self.process_features(features)
+            with self._stepping:
+                result = self._step(features, frame.index)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
     @one_blas_thread
@@ -189,8 +210,10 @@ class StereoSlam:
         """A frame, its features, and how long these took [ms]."""
         if self.frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
+        if not hasattr(frame, "index"):
+            raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
-        with self._extracting, stages.stage("extract"):
+        with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", self.frontend):
             features = self.frontend.extract(frame)
         self._input_warnings.look(frame, features)
         return frame, features, stages.milliseconds
@@ -205,14 +228,23 @@ class StereoSlam:
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
             SlamError: another thread is using the system; or back end or front end give something else than their
-                protocols say.
+                protocols say, or raise an exception of their own, which is its cause then (`PartError`).
         """
         with self._stepping:
-            return self._step(features)
+            return self._step(features, self._last.index + 1)
+
+    def _step(self, features: StereoFeatures, number: int) -> FrameResult:
+        """`process_features`, in the only thread; `number` is the frame's in its sequence."""
+        with self._named(f"frame {number}"):
+            return self._whole_step(features)
+
+    def _named(self, place: str) -> AbstractContextManager[None]:
+        """Exceptions of parts from elsewhere say what failed, and where."""
+        return named_failures(place, self.backend, self.frontend)
 
     @one_blas_thread
-    def _step(self, features: StereoFeatures) -> FrameResult:
-        """`process_features`, in the only thread."""
+    def _whole_step(self, features: StereoFeatures) -> FrameResult:
+        """A step."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
         self._roll_back()
         index, stages, search = self._last.index + 1, self._stages, self._relocalizer.search
@@ -279,8 +311,7 @@ class StereoSlam:
 
     def _estimate_pose(self, report: UpdateReport) -> Estimate:
         """The camera's pose, after an update; what the rig's error does to it is taken down."""
-        estimate = self.backend.estimate(landmarks=False)
-        require_estimate(estimate, self.backend)
+        estimate = require_estimate(self.backend.estimate(landmarks=False), self.backend)
         self._rig_error.uncertainty.observe(estimate.T_world_left, report.used, self._positions(report.used))
         return estimate
 
@@ -316,7 +347,7 @@ class StereoSlam:
         stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step, `estimate`
         and `snapshot` do this by themselves; without such an exception there is nothing to do.
         """
-        with self._stepping:
+        with self._stepping, self._named("taking a step back"):
             self._roll_back()
 
     def _roll_back(self) -> None:
@@ -332,7 +363,7 @@ class StereoSlam:
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """The left camera's path: the latest estimate of each frame's pose; in a prior map, since it was found."""
-        with self._stepping:
+        with self._stepping, self._named("the path"):
             return self.atlas.path(self._path())
 
     def _path(self) -> Trajectory:
@@ -341,7 +372,7 @@ class StereoSlam:
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
-        with self._stepping:
+        with self._stepping, self._named("the estimate"):
             return self._estimate()
 
     def _estimate(self) -> Estimate:
@@ -350,7 +381,7 @@ class StereoSlam:
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
-        estimate = self._rig_error.added_to(self.backend.estimate())
+        estimate = self._rig_error.added_to(require_estimate(self.backend.estimate(), self.backend))
         return self.atlas.estimate(estimate, self._rig_error.common(as_given=False))
 
     def snapshot(self) -> SavedMap:
@@ -361,7 +392,7 @@ class StereoSlam:
         """
         from slam import __version__
 
-        with self._stepping:
+        with self._stepping, self._named("the map"):
             if self._relocalizer.search is not None:
                 return self._relocalizer.search.known
             estimate = self._estimate() if self.landmarks is not None else None

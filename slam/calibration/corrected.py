@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slam.calibration.model import LENS, RigModel, lens_change
+from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, so3_exp
@@ -69,6 +70,8 @@ def _camera(
     seen = ideal.normalise(rectify(pixels))
     good = np.isfinite(seen).all(axis=1)
     pixels, seen = pixels[good], seen[good]
+    if 2 * len(pixels) < 4 + max(len(camera.distortion), 4):
+        raise CalibrationError("the camera's pixels have no rays: its distortion cannot be undone")
     true = seen + np.stack(lens_change(*seen.T), axis=1) @ theta
     rays = np.column_stack([true, np.ones(len(true))]) @ R
     distortion = camera.distortion or (0.0,) * 4

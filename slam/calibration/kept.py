@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -135,7 +136,7 @@ def load_calibration(path: str | Path) -> KeptCalibration:
         CalibrationError: the file cannot be read, or is something else.
     """
     file = expanded(path, CalibrationError)
-    file = file / _SUMMARY if file.is_dir() else file
+    file = file / _SUMMARY if os.path.isdir(file) else file  # noqa: PTH112 unlike Path's, without errors
     text = read_text(file, _LIMIT, CalibrationError)
     try:
         tree = json.loads(text)

@@ -8,6 +8,7 @@ import sys
 import threading
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,7 +41,7 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import Stopped, catch_signals, whole_frames
-from slam.errors import SlamError, one_line
+from slam.errors import PartError, SlamError, one_line
 from slam.files import reason
 
 if TYPE_CHECKING:
@@ -58,14 +59,23 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number."""
+    """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number.
+
+    With the environment variable SLAM_DEBUG, errors show their traceback instead.
+    """
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
     catch_signals()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma
+            stream.reconfigure(errors="backslashreplace")
     try:
         app(prog_name="slam")
     except SlamError as error:
-        _end(f"slam: {error}", 2)
+        if os.environ.get("SLAM_DEBUG"):
+            raise
+        foreign = isinstance(error, PartError)
+        _end(f"slam: {error}{'; with SLAM_DEBUG=1 there is a traceback' if foreign else ''}", 2)
     except BrokenPipeError:  # whoever read the output has gone
         _end("", 1)
     except OSError as error:

@@ -41,9 +41,16 @@ def run_folder(out: Path | None, sequence: str, backend: str, overwrite: bool = 
 
 
 def require_free(out: Path) -> None:
-    """Raise SlamError where a folder holds a run or a comparison."""
-    if any((out / mark).exists() for mark in _MARKS):
+    """Raise SlamError where a folder holds a run or a comparison, or one of its folders does."""
+    if _holds_run(out):
         raise SlamError(f"{out}: holds a run already; give another --out, or --overwrite to replace it")
+    runs = next((folder.name for folder in out.iterdir() if _holds_run(folder)), None) if out.is_dir() else None
+    if runs is not None:
+        raise SlamError(f"{out}: holds runs in folders of their own, such as {runs}; give --out {out / 'NAME'}")
+
+
+def _holds_run(folder: Path) -> bool:
+    return any((folder / mark).exists() for mark in _MARKS)
 
 
 def _claimed(name: str) -> Path:

@@ -16,7 +16,9 @@ from slam.compare.measure import Metric
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.compare.trial import SERIES
+from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate, chi_square_band
+from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import widths
@@ -86,9 +88,15 @@ def example(group: Group) -> dict[str, Run]:
 
 
 def read_series(run: Run) -> dict[str, Array]:
-    """A run's columns of `SERIES_COLUMNS`."""
-    rows = np.genfromtxt(run.folder / SERIES, delimiter=",", skip_header=1, ndmin=2)
-    return dict(zip(SERIES_COLUMNS, rows.reshape(-1, len(SERIES_COLUMNS)).T))
+    """A run's columns of `SERIES_COLUMNS`.
+
+    Raises:
+        SlamError: the file cannot be read, or has no row.
+    """
+    rows = read_numbers(run.folder / SERIES, len(SERIES_COLUMNS))
+    if not len(rows):
+        raise SlamError(f"{run.folder / SERIES}: has no row")
+    return dict(zip(SERIES_COLUMNS, rows.T))
 
 
 def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:
@@ -221,11 +229,7 @@ def map_data(group: Group, most: int = 700) -> dict[str, Any]:
 def _landmarks(folder: Path, own: Trajectory, most: int) -> dict[str, Any]:
     """Positions and the axes of the 2σ ellipsoids of the best-known landmarks near the path."""
     file = folder / "landmarks.csv"
-    rows = (
-        np.genfromtxt(file, delimiter=",", skip_header=1, ndmin=2).reshape(-1, 12)
-        if file.exists()
-        else np.zeros((0, 12))
-    )
+    rows = read_numbers(file, 12) if file.exists() else np.zeros((0, 12))
     positions, upper = rows[:, 1:4], rows[:, 4:10]
     extent = max(float(np.ptp(own.positions, axis=0).max()), 1.0)
     distance = np.linalg.norm(positions - own.positions.mean(axis=0), axis=1)

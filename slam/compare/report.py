@@ -35,6 +35,7 @@ from slam.compare.wording import (
     shown_spread,
     worth_saying,
 )
+from slam.files import read_object
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -74,7 +75,7 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         run_columns=(*RUN_COLUMNS, *_run_keys(runs)),
         run_rows=[_run_row(run, _run_keys(runs)) for run in runs],
         command=_command(plan),
-        versions=json.loads((out / SWEEP).read_text(encoding="utf-8"))["versions"],
+        versions=read_object(out / SWEEP)["versions"],
         settings=_settings(every),
         script=_script(),
     )
@@ -242,7 +243,7 @@ def _settings(every: Sequence[Group]) -> str:
             file = next((r.folder / "config.json" for r in runs if (r.folder / "config.json").exists()), None)
             name = f"{group.variant.name} · {backend}"
             if file is not None and name not in shown:
-                shown[name] = json.loads(file.read_text(encoding="utf-8"))
+                shown[name] = read_object(file)
     return json.dumps(shown, indent=1)
 
 

@@ -30,7 +30,8 @@ from slam.compare.trial import (
     run_trial,
 )
 from slam.errors import SlamError
-from slam.run.outputs import write_json
+from slam.files import read_object
+from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
 
 RUNS, SWEEP = "runs", "sweep.json"
@@ -122,13 +123,20 @@ def read_run(trial: Trial, out: Path) -> Run:
         SlamError: it is not there, or cannot be read.
     """
     folder = out / RUNS / trial.folder
+    result, timing = read_object(folder / RESULT), folder / TIMING
+    outcome = result.get("outcome")
+    if not isinstance(outcome, str):
+        raise SlamError(f"{folder / RESULT}: does not say how the run ended")
+    milliseconds = _figures(read_object(timing), timing) if timing.exists() else {}
+    return Run(trial, outcome, _figures(result.get("metrics"), folder / RESULT), milliseconds, folder)
+
+
+def _figures(tree: Any, file: Path) -> dict[str, float]:
+    """Numbers by name; raises SlamError where they are none."""
     try:
-        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-        timing = folder / TIMING
-        milliseconds = json.loads(timing.read_text(encoding="utf-8")) if timing.exists() else {}
-    except (OSError, ValueError) as error:
-        raise SlamError(f"{folder}: cannot be read as a run of a comparison: {error}") from error
-    return Run(trial, result["outcome"], result["metrics"], milliseconds, folder)
+        return {name: float(value) for name, value in tree.items()}
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise SlamError(f"{file}: its figures are no numbers by name") from error
 
 
 def _arguments(plan: Plan, trial: Trial, out: Path) -> tuple[Trial, bytes | None]:
@@ -155,11 +163,12 @@ def _keep(
     folder = out / RUNS / trial.folder
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    for name, content in files.items():
-        (part / name).write_bytes(content)
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    with naming_folder(folder):
+        part.mkdir(parents=True)
+        for name, content in files.items():
+            (part / name).write_bytes(content)
+        shutil.rmtree(folder, ignore_errors=True)
+        part.rename(folder)
     if on_done is not None:
         on_done(trial)
 
@@ -174,8 +183,10 @@ def _is_done(trial: Trial, out: Path) -> bool:
     if not path.exists():
         return False
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))["trial"]
-    except (OSError, ValueError, KeyError):
+        before = read_object(path).get("trial")
+    except SlamError:
+        return False
+    if before is None:
         return False
     if before != json.loads(json.dumps(asdict(trial))):
         raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
@@ -195,10 +206,9 @@ def _prepare(plan: Plan, out: Path) -> None:
 
 
 def _require_same_versions(path: Path) -> None:
-    try:
-        before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["versions"]
-    except (OSError, ValueError, KeyError) as error:
-        raise SlamError(f"{path}: cannot be read as that of a comparison: {error}") from error
+    before = read_object(path).get("versions")
+    if not isinstance(before, dict):
+        raise SlamError(f"{path}: not that of a comparison")
     now = running_code()
     changed = [name for name, version in now.items() if before.get(name) != version]
     if changed:

@@ -68,7 +68,7 @@ class Group:
 
     def differences(self, metric: Metric) -> dict[str, Difference]:
         """Each other back end against the first, by name, p adjusted over all figures of all groups."""
-        return self.compared[metric.key]
+        return self.compared.get(metric.key, {})  # none with one back end
 
 
 def groups(plan: Plan, runs: Sequence[Run]) -> list[Group]:

@@ -10,6 +10,7 @@ from slam.errors import TrajectoryError
 from slam.geometry.se3 import Array, nearest_rotation, so3_exp
 from slam.geometry.trajectory import Trajectory
 
+_FARTHEST = 1e100  # position [m] whose square is a number
 _STILL = 1e-12  # [m²] product of the two spreads: less than a micrometre each is no motion
 _COLLINEAR = 1e-12  # second singular value by the first, below which positions lie on a line
 
@@ -53,13 +54,13 @@ def align_positions(
     the turn nearest to none. The result is a proper rotation in every case, and depends on nothing but the input.
 
     Raises:
-        TrajectoryError: shapes differ, there is no position, or one is not finite.
+        TrajectoryError: shapes differ, there is no position, or one is not finite or impossibly large.
     """
     source, target = np.asarray(source, float), np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or not len(source):
         raise TrajectoryError(f"alignment: positions {source.shape} and {target.shape} do not go together")
-    if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise TrajectoryError("alignment: a position is not finite")
+    if not (np.abs(source).max() <= _FARTHEST and np.abs(target).max() <= _FARTHEST):
+        raise TrajectoryError("alignment: a position is not finite, or impossibly large")
     centre_s, centre_t = source.mean(axis=0), target.mean(axis=0)
     s, t = source - centre_s, target - centre_t
     dimensions = source.shape[1]

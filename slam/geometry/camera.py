@@ -49,6 +49,8 @@ class PinholeCamera:
     distortion: tuple[float, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        if not isinstance(self.distortion, (tuple, list, np.ndarray)):
+            raise CalibrationError(f"distortion must be a tuple of coefficients, got {type(self.distortion).__name__}")
         values = (self.fu, self.fv, self.u0, self.v0, *self.distortion)
         if not all(isinstance(v, numbers.Real) for v in (*values, self.width, self.height)):
             raise CalibrationError(f"camera calibration is not of numbers: {values}")
@@ -60,7 +62,7 @@ class PinholeCamera:
             raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
         if not (self.width <= _WIDEST and self.height <= _WIDEST):
             raise CalibrationError(f"image size must be at most {_WIDEST}, got {self.width}x{self.height}")
-        if self.model not in DISTORTION_MODELS:
+        if not isinstance(self.model, str) or self.model not in DISTORTION_MODELS:
             raise CalibrationError(f"unknown distortion model {self.model!r}: {', '.join(DISTORTION_MODELS)}")
         if len(self.distortion) not in DISTORTION_MODELS[self.model]:
             raise CalibrationError(

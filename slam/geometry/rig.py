@@ -50,6 +50,8 @@ class StereoRig:
     b: Array
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.left, PinholeCamera) and isinstance(self.right, PinholeCamera)):
+            raise CalibrationError("a stereo rig is made of two PinholeCamera")
         try:
             R, b = np.array(self.R, float), np.array(self.b, float).reshape(-1)
         except (TypeError, ValueError, OverflowError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,8 @@ def frame_range(start: int, stop: int | None, length: int) -> tuple[int, int]:
     Raises:
         SequenceError: `start` is negative or not before the end, or `stop` is not after `start`.
     """
+    if not all(isinstance(number, Integral) for number in (start, length if stop is None else stop)):
+        raise SequenceError(f"frames are asked for by whole numbers, not {start!r} to {stop!r}")
     end = length if stop is None else min(stop, length)
     if start < 0 or start >= length or end <= start:
         asked = f"{start}:{'' if stop is None else stop}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slam.errors import TrajectoryError
-from slam.files import read_text
+from slam.files import read_text, write_text
 from slam.geometry.se3 import Array, pose, quaternion, rotation_from_quaternion
 from slam.showing import card, count, path_svg, widest
 
@@ -35,6 +35,14 @@ class Trajectory:
     poses: Array
 
     def __post_init__(self) -> None:
+        try:
+            stamps, poses = np.asarray(self.stamps, float), np.asarray(self.poses, float)
+        except (TypeError, ValueError, OverflowError):
+            raise TrajectoryError("trajectory: stamps and poses must be arrays of numbers") from None
+        object.__setattr__(self, "stamps", stamps)
+        object.__setattr__(self, "poses", poses)
+        if stamps.ndim != 1:
+            raise TrajectoryError(f"trajectory: stamps must be an array (N,), got {stamps.shape}")
         if self.poses.shape != (len(self.stamps), 4, 4):
             raise TrajectoryError(f"trajectory: {len(self.stamps)} stamps, poses {self.poses.shape}")
         if not (np.isfinite(self.stamps).all() and np.isfinite(self.poses).all()):
@@ -106,22 +114,20 @@ class Trajectory:
 
     def write_tum(self, path: str | Path) -> None:
         """Write ``stamp tx ty tz qx qy qz qw`` lines."""
-        with Path(path).open("w", encoding="ascii") as file:
-            file.writelines(tum_line(s, T) for s, T in zip(self.stamps, self.poses))
+        write_text(path, "".join(tum_line(s, T) for s, T in zip(self.stamps, self.poses)))
 
     def write_kitti(self, path: str | Path) -> None:
         """Write rows of twelve numbers, the upper (3, 4) of each pose; stamps are lost."""
-        np.savetxt(path, self.poses[:, :3].reshape(-1, 12), fmt="%.9e")
+        rows = self.poses[:, :3].reshape(-1, 12).tolist()
+        write_text(path, "".join(" ".join(f"{x:.9e}" for x in row) + "\n" for row in rows))
 
     def write_euroc(self, path: str | Path) -> None:
         """Write EuRoC's CSV: ``timestamp [ns], position, quaternion w x y z``."""
         q = quaternion(self.poses[:, :3, :3])[:, [3, 0, 1, 2]]
-        with Path(path).open("w", encoding="ascii") as file:
-            file.write(
-                "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
-            )
-            for stamp, p, qi in zip(self.stamps, self.positions, q):
-                file.write(",".join([str(round(stamp * 1e9)), *(f"{x:.9f}" for x in (*p, *qi))]) + "\n")
+        head = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
+        rows = zip(self.stamps.tolist(), self.positions, q)
+        lines = (",".join([f"{s * 1e9:.0f}", *(f"{x:.9f}" for x in (*p, *qi))]) + "\n" for s, p, qi in rows)
+        write_text(path, head + "".join(lines))
 
     @classmethod
     def read_tum(cls, path: str | Path) -> Trajectory:

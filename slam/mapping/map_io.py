@@ -98,7 +98,8 @@ class SavedMap:
     loops: tuple[Loop, ...] = ()
 
     def __post_init__(self) -> None:
-        if any(np.ndim(getattr(self, name)) == 0 for name in _TYPES if name != "seen_from"):
+        arrays = [getattr(self, name) for name in _TYPES if name != "seen_from" or self.seen_from is not None]
+        if not all(isinstance(a, np.ndarray) and a.ndim for a in arrays):
             raise SlamError(f"{self.source}: an array has the wrong number of dimensions")
         n = len(self.ids)
         if self.seen_from is None:

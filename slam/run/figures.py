@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
-from slam.files import read_text
+from slam.files import read_object, read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.schema import STAGES
@@ -88,7 +87,7 @@ class RunData:
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
         truth, final = folder / "truth.txt", Trajectory.read_tum(folder / "trajectory_final.txt")
-        config = json.loads(read_text(folder / "config.json"))
+        config = read_object(folder / "config.json")
         return cls(
             name,
             Trajectory.read_tum(folder / "trajectory.txt"),

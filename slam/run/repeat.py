@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import platform
@@ -14,6 +13,7 @@ from typing import Any
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
+from slam.files import read_object
 
 CONFIG = "config.json"
 _NO_FILES = ("synthetic:", "camera:")
@@ -90,9 +90,9 @@ def load(
         SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
         ConfigurationError: its settings are not those of this version.
     """
-    file = path / CONFIG if path.is_dir() else path
+    file = path / CONFIG if os.path.isdir(path) else path  # noqa: PTH112 unlike Path's, without errors
     try:
-        tree = _restored(json.loads(file.read_text(encoding="utf-8")))
+        tree = _restored(read_object(file))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
         source, known, kept = tree.get("source") or {}, tree.get("prior_map"), tree.get("calibration")
@@ -108,10 +108,9 @@ def load(
         )
         config = SystemConfig.from_json(tree["settings"])
         names = str(tree["frontend"]), str(tree["backend"])
+        stop = None if stop is None else int(stop)
         return Repeat(origin, *names, config, int(start), stop, dict(tree.get("versions", {})))
-    except OSError as error:
-        raise SlamError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
 
 

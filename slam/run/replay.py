@@ -27,6 +27,7 @@ from slam.data import (
     UpdateStatus,
 )
 from slam.errors import MeasurementError
+from slam.foreign import named_failures
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -34,6 +35,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, RevisingBackend
 from slam.landmarks import LandmarkRows
 from slam.models import EstimatorModels
+from slam.tracking.answer_check import require_estimate, require_prediction, require_report
 from slam.tracking.association import AssociationConfig
 
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
@@ -304,10 +306,13 @@ def replay(
 
     Raises:
         MeasurementError: the recording is not consistent: an unknown id, or one that is in the map already.
+        PartError: a back end from elsewhere raised an exception of its own.
     """
     config = association or AssociationConfig()
     for k, frame in enumerate(recording):
-        yield _step(recording, backend, k, frame, config if guess else None)
+        with named_failures(f"frame {frame.number}", backend):
+            result = _step(recording, backend, k, frame, config if guess else None)
+        yield result
 
 
 def _step(
@@ -318,14 +323,16 @@ def _step(
     if frame.revision is not None and isinstance(backend, RevisingBackend):
         backend.revise(frame.revision.rows)
     prediction = backend.predict(frame.stamp)
+    require_prediction(prediction, backend)
     times.append(time.perf_counter())
     guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
     times.append(time.perf_counter())
     report = backend.update(frame.observed, guess)
+    require_report(report, backend)
     times.append(time.perf_counter())
     _keep_map(backend, frame)
     times.append(time.perf_counter())
-    estimate = backend.estimate(landmarks=False)
+    estimate = require_estimate(backend.estimate(landmarks=False), backend)
     times.append(time.perf_counter())
     first = bool(len(recording.added)) and k == recording.added.frame[0]
     status, reason = _status(report, first)

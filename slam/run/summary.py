@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.data import CommonError, Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
+from slam.foreign import named_failures
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
@@ -20,6 +21,7 @@ from slam.runtime.compile_clock import compile_clock, working_time
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
+from slam.tracking.answer_check import require_estimate
 
 
 @dataclass
@@ -82,11 +84,13 @@ class Replayed:
 
     def trajectory(self) -> Trajectory:
         """The back end's final estimate of every frame's pose."""
-        return self.backend.trajectory()
+        with named_failures("the path", self.backend):
+            return self.backend.trajectory()
 
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
-        return self.backend.estimate()
+        with named_failures("the estimate", self.backend):
+            return require_estimate(self.backend.estimate(), self.backend)
 
     @property
     def landmarks(self) -> LandmarkRows:

@@ -63,8 +63,8 @@ def _kalibr_camera(camera: PinholeCamera) -> dict[str, object]:
     """A camera of a camchain."""
     return {
         "camera_model": "pinhole",
-        "intrinsics": [camera.fu, camera.fv, camera.u0, camera.v0],
+        "intrinsics": [float(x) for x in (camera.fu, camera.fv, camera.u0, camera.v0)],
         "distortion_model": _FISHEYE if camera.model == _FISHEYE else "radtan",
-        "distortion_coeffs": list(camera.distortion or (0.0,) * 4),
-        "resolution": [camera.width, camera.height],
+        "distortion_coeffs": [float(x) for x in camera.distortion or (0.0,) * 4],
+        "resolution": [int(camera.width), int(camera.height)],
     }

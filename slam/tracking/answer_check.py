@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Patches, Prediction, UpdateReport
+from slam.checks import LATEST_STAMP
+from slam.data import Estimate, IdArray, Patches, Prediction, UpdateReport, UpdateStatus
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
+
+_REPORT = {"status": UpdateStatus, "reason": str, "used": np.ndarray, "rejected": np.ndarray, "nis": Real, "dof": Real}
 
 
 def require_prediction(prediction: Any, owner: object) -> None:
@@ -30,20 +34,33 @@ def require_report(report: Any, owner: object) -> None:
     """Check what `Backend.update` of `owner` gave.
 
     Raises:
-        SlamError: it is no `UpdateReport`.
+        SlamError: it is no `UpdateReport`, or one of its values is of another type than documented.
     """
-    _require_kind(report, UpdateReport, f"{type(owner).__name__}.update")
+    what = f"{type(owner).__name__}.update"
+    _require_kind(report, UpdateReport, what)
+    for name, kind in _REPORT.items():
+        _require_kind(getattr(report, name), kind, f"{what}: {name}")
+    for name in ("used", "rejected"):
+        ids = getattr(report, name)
+        if ids.ndim != 1 or ids.dtype.kind not in "iu":
+            raise SlamError(f"{what}: {name} must be an array (N,) of ids, got {ids.dtype} {ids.shape}")
 
 
-def require_estimate(estimate: Any, owner: object) -> None:
-    """Check the pose that `Backend.estimate` of `owner` gave.
+def require_estimate(estimate: Any, owner: object) -> Estimate:
+    """What `Backend.estimate` of `owner` gave.
 
     Raises:
-        SlamError: it is no `Estimate`, or pose or covariance are of another shape or not finite.
+        SlamError: it is no `Estimate`, or pose, landmarks or covariances are of another shape or not finite.
     """
     what = f"{type(owner).__name__}.estimate"
     _require_kind(estimate, Estimate, what)
     _require_belief(estimate, what)
+    n = len(estimate.ids)
+    for name, shape in {"ids": (n,), "positions": (n, 3), "covariances": (n, 3, 3)}.items():
+        _require_shape(getattr(estimate, name), shape, f"{what}: {name}")
+        if not np.isfinite(getattr(estimate, name)).all():
+            raise SlamError(f"{what}: a value of {name} is not finite")
+    return estimate
 
 
 def require_positions(positions: Any, ids: IdArray, owner: object) -> Array:
@@ -90,6 +107,11 @@ def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array
 
 
 def _require_belief(belief: Prediction | Estimate, what: str) -> None:
+    """A stamp, ids, a pose and its covariance."""
+    _require_kind(belief.stamp, Real, f"{what}: the stamp")
+    if not abs(belief.stamp) <= LATEST_STAMP:
+        raise SlamError(f"{what}: the stamp must be within {LATEST_STAMP:g} s")
+    _require_kind(belief.ids, np.ndarray, f"{what}: ids")
     for name, value, side in (("the pose", belief.T_world_left, 4), ("the covariance", belief.covariance, 6)):
         _require_shape(value, (side, side), f"{what}: {name}")
         if not np.isfinite(value).all():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -107,7 +108,7 @@ class WorldSequence:
 
     def frame(self, k: int) -> StereoFrame:
         """Images of frame k."""
-        return self._recorder.record(self._source(k), k, float(self._stamps[k]))
+        return self._recorder.record(self._source(k), int(k), float(self._stamps[int(k)]))
 
     def depth(self, k: int) -> np.ndarray:
         """True distance along the left camera's axis in frame k (H, W) float32 [m], 0 where nothing is."""
@@ -134,7 +135,7 @@ class WorldSequence:
         """Features of frame k with their truth, without images."""
         source = self._source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
-        seen = simulate(self.world, self._looks, self._model, source, float(self._stamps[k]), rng)
+        seen = simulate(self.world, self._looks, self._model, source, float(self._stamps[int(k)]), rng)
         return self.faults.spoil(source, seen, self.rig, rng)
 
     @cached_property
@@ -157,6 +158,6 @@ class WorldSequence:
 
     def _source(self, k: int) -> int:
         """The world's frame that is frame k of the recording."""
-        if not 0 <= k < len(self):
+        if not isinstance(k, Integral) or not 0 <= k < len(self):
             raise SequenceError(f"{self.name}: there is no frame {k}; it has {len(self)}")
-        return int(self._kept[k])
+        return int(self._kept[int(k)])

@@ -15,7 +15,7 @@ import slam
 from frontends.surf import SurfFrontend
 from slam.config import SystemConfig
 from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
-from slam.errors import SlamError
+from slam.errors import PartError, SlamError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
@@ -180,8 +180,8 @@ def front_ends(rng: np.random.Generator, folder: Path) -> None:
             _check(system.process(_dimmed(rng, frame)))
         except SlamError as error:
             require_line(error)
-        except _Defect:
-            pass
+            if isinstance(error, PartError) and not isinstance(error.__cause__, _Defect):
+                raise Broken("an answer was not looked at") from error
         if backend == "ekf" and rng.random() < 0.2:
             system = pickle.loads(pickle.dumps(system)) if rng.random() < 0.5 else copy.deepcopy(system)
     assert isinstance(system.frontend, _Misbehaving)
@@ -268,7 +268,7 @@ SUBJECTS = (
     Subject("images of features", "features with images of other sizes and types, three kinds of rig",
             "a sound result or one line", images_of_features, short=20),
     Subject("front ends", "front ends whose features, patches and aligned pixels are wrong, or that raise",
-            "a sound result, one line, or their own exception; later frames are taken", front_ends, short=15),
+            "a sound result or one line; later frames are taken", front_ends, short=15),
     Subject("interrupts", "interrupts at any line of a step with images, then copies", "the next frames are tracked",
             interrupts, short=6),
     Subject("same bytes", "images, some dark or without a right one; copies, one thread or two, overlap or none",

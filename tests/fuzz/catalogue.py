@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
-from tests.fuzz import agreement, aligning, bookkeeping, commands, library, live, readers, runs, saved, settings
+from tests.fuzz import (
+    agreement,
+    aligning,
+    bookkeeping,
+    commands,
+    finished,
+    foreign,
+    library,
+    live,
+    lives,
+    readers,
+    runs,
+    saved,
+    settings,
+    values,
+)
 
 SUBJECTS = (
     *readers.SUBJECTS,
     *settings.SUBJECTS,
     *saved.SUBJECTS,
     *commands.SUBJECTS,
+    *finished.SUBJECTS,
     *runs.SUBJECTS,
+    *values.SUBJECTS,
     *library.SUBJECTS,
+    *lives.SUBJECTS,
+    *foreign.SUBJECTS,
     *aligning.SUBJECTS,
     *live.SUBJECTS,
     *agreement.SUBJECTS,

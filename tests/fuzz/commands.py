@@ -26,14 +26,18 @@ _RANGES = (
 )  # fmt: skip
 
 #: Paths that lead nowhere outside of the folder that a case works in.
-_RELATIVE = tuple(path for path in PATHS if not path.startswith(("/", "~", "..")))
+RELATIVE = tuple(path for path in PATHS if not path.startswith(("/", "~", "..")))
 
 
 def command(rng: np.random.Generator, folder: Path) -> None:
     """One command line."""
     arguments = _arguments(rng, folder)
-    with _elsewhere(folder):
-        status, printed = _call(arguments)
+    with elsewhere(folder):
+        require_status(*call(arguments))
+
+
+def require_status(status: int, printed: str) -> None:
+    """Raise where a command ended with anything but an exit status of 0, or 2 and one line."""
     if status == 0:
         return
     lines = printed.strip().splitlines()
@@ -64,10 +68,10 @@ def _arguments(rng: np.random.Generator, folder: Path) -> list[str]:
         return ["view", choose(rng, (out, *PATHS)), "--to", str(folder / "a.rrd")]
     if name == "nothing":
         return [choose(rng, (*PATHS, "--x", "list"))]
-    values: dict[str, Any] = {"--frames": (*_RANGES,), "--out": (out, *_RELATIVE)}
+    values: dict[str, Any] = {"--frames": (*_RANGES,), "--out": (out, *RELATIVE)}
     if name == "run":
         (folder / "device").symlink_to("/dev/full")  # never a device itself: a fault would replace it
-        paths = (*_RELATIVE, str(folder / "device"), str(folder), str(folder / ("x" * 250)))
+        paths = (*RELATIVE, str(folder / "device"), str(folder), str(folder / ("x" * 250)))
         key = choose(rng, ("map.grid", "models.pixel_sigma", "frontend.features", "backend.iterations"))
         values |= dict.fromkeys(("--record", "--save-map", "--map"), paths)
         values |= dict.fromkeys(("--kind", "--format"), PATHS)
@@ -81,7 +85,7 @@ def _arguments(rng: np.random.Generator, folder: Path) -> list[str]:
     return [name, sequence, "--out", place, "--quiet", *options]
 
 
-def _call(arguments: list[str]) -> tuple[int, str]:
+def call(arguments: list[str]) -> tuple[int, str]:
     """Exit status and what was printed on standard error; signals are left as they were."""
     printed, shown = io.StringIO(), io.StringIO()
     with patch.object(sys, "argv", ["slam", *arguments]), redirect_stderr(printed), redirect_stdout(shown):
@@ -93,7 +97,7 @@ def _call(arguments: list[str]) -> tuple[int, str]:
 
 
 @contextmanager
-def _elsewhere(folder: Path) -> Iterator[None]:
+def elsewhere(folder: Path) -> Iterator[None]:
     """Work in a case's folder, so that relative paths lead nowhere else, and leave signals as they were."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {n: signal.getsignal(n) for n in numbers}

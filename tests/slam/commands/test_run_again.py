@@ -93,9 +93,11 @@ def test_a_prior_map_is_found_again(here):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "not the config.json"),
+        ("", "config.json: no valid JSON"),
         ("{}", "not the config.json"),
-        ("[]", "not the config.json"),
+        ("[]", "config.json: must hold an object, not a list"),
+        ("[" * 50_000, "config.json: no valid JSON"),
+        ('{"frames": [1e999, 2], "settings": {}, "frontend": "surf", "backend": "ekf"}', "not the config.json"),
         ('{"frames": [0, null], "settings": {"colour": 1}, "frontend": "surf", "backend": "ekf"}', "colour"),
         ('{"command": "slam replay a.npz"}', "that of a replay; repeat it with: slam replay a.npz"),
     ],
@@ -107,7 +109,7 @@ def test_a_bad_config_is_one_line(tmp_path, text, words):
 
 
 def test_no_config_and_no_sequence(tmp_path):
-    with pytest.raises(SlamError, match="cannot be read: No such file"):
+    with pytest.raises(SlamError, match=r"config\.json: No such file"):
         load(tmp_path)
     with pytest.raises(SlamError, match="name a sequence"):
         slam("run")
@@ -140,6 +142,8 @@ def test_runs_have_folders_of_their_own(here):
 def test_another_run_is_not_overwritten_without_being_told(here):
     slam("run", WORLD, "--frames", "0:2", "--out", "mine", "-q", "--no-picture")
     before = (here / "mine/config.json").read_bytes()
+    with pytest.raises(SlamError, match=r"\.: holds runs in folders of their own, such as mine; give --out NAME"):
+        slam("run", WORLD, "--frames", "0:2", "--out", ".", "-q")
     for words in (["run", WORLD, "--frames", "0:3"], ["run", "--config", "mine"]):
         with pytest.raises(SlamError, match="mine: holds a run already; give another --out, or --overwrite"):
             slam(*words, "--out", "mine", "-q")

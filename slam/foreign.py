@@ -1,0 +1,44 @@
+"""Exceptions of back ends and front ends from elsewhere, in one line that names the part, the call and the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from traceback import walk_tb
+
+from slam.errors import PartError, SlamError, cause
+
+_OURS = ("slam", "backends", "frontends")
+
+
+@contextmanager
+def named_failures(place: str, *parts: object) -> Iterator[None]:
+    """Name what failed in an exception of a part from elsewhere; those of our own parts go on as they are.
+
+    Args:
+        place: what is being done, for the message.
+        parts: the back end, the front end.
+
+    Raises:
+        PartError: chained from the exception.
+    """
+    try:
+        yield
+    except SlamError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a foreign class does
+        foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in (*_OURS, "builtins")]
+        if not foreign:
+            raise
+        part, call = next(((part, f".{call}") for part in foreign if (call := _call(error, part))), (foreign[0], ""))
+        raise PartError(f"{place}: {type(part).__name__}{call} failed: {cause(error)}") from error
+
+
+def _call(error: BaseException, part: object) -> str:
+    """The method of `part` that raised an exception, or was called wrongly; empty for none."""
+    for frame, _ in walk_tb(error.__traceback__):
+        first = frame.f_code.co_varnames[:1]
+        if first and frame.f_locals.get(first[0]) is part:
+            return frame.f_code.co_name
+    name, dot, rest = str(error).partition(".")
+    return rest.partition("(")[0] if dot and isinstance(error, TypeError) and name == type(part).__qualname__ else ""
