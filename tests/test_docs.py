@@ -227,6 +227,17 @@ def commands(page, *languages):
                 words = words[end + 1 :]
 
 
+@each_page
+def test_what_a_shell_would_take_for_itself_is_quoted(page):
+    shown = [
+        *blocks(page, "sh", "shell", "bash", "console"),
+        *(span for span in spans(page) if span.startswith("slam ")),
+    ]
+    for line in "\n".join(shown).replace("$?", "").splitlines():
+        words = shlex.split(line.partition(" #")[0], posix=False)  # these keep their quotes
+        assert not [word for word in words if re.search(r"[?*]|(?<!&)&(?!&)", word) and word[0] not in "'\""], line
+
+
 def options_of(command):
     return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
 
@@ -331,8 +342,13 @@ def test_names_of_the_code_in_the_text_exist(page):
 @each_page
 def test_python_in_pages_is_python(page):
     for block in blocks(page, "python"):
-        if not block.startswith("--8<--"):
-            ast.parse(block)
+        ast.parse(block)
+
+
+@pytest.mark.parametrize("file", sorted((DOCS / "examples").glob("*.py")), ids=lambda file: file.stem)
+def test_pages_show_the_examples_as_they_are_tested(file):
+    shown = [block for page in PAGES for block in blocks(page, "python")]
+    assert shown.count(file.read_text(encoding="utf-8")) == 1
 
 
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.
@@ -365,7 +381,7 @@ def reader_has(name):
 @each_page
 def test_python_in_pages_runs(page, tmp_path, monkeypatch):
     name = page.relative_to(ROOT).as_posix()
-    parts = [block for block in blocks(page, "python") if not block.startswith("--8<--")]
+    parts = blocks(page, "python")
     if not parts or name in ELSEWHERE:
         return
     monkeypatch.chdir(tmp_path)
