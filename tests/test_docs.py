@@ -165,6 +165,8 @@ def test_the_figures_in_the_readme_are_those_of_the_results_page():
         for cell, value in zip(cells, own):
             digits = len(cell.partition(".")[2])
             assert cell == (f"{float(value):.{digits}f}" if digits else value), (name, backend, cell, value)
+    times = [int(row[7]) for row in table_rows(section, 8)[1:]]
+    assert f"[{min(times)} to {max(times)} ms]" in readme
 
 
 def test_the_figures_of_worlds_in_the_readme_are_those_of_the_results_page():

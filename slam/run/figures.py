@@ -221,23 +221,6 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     _save(figure, path)
 
 
-def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
-    """Position error over time of each run, component by component, inside the ±3σ that the run claims."""
-    figure, axes = _figure(3, (9.0, 2.3), rows=True)
-    for colour, width, run in zip(_COLOURS, widths(len(runs), 1.2), runs):
-        t, error, sigma = position_errors(run, truth)
-        error, band = 100 * error, 300 * sigma
-        for axis, component, label in zip(axes, range(3), ("right", "down", "forward")):
-            axis.fill_between(t, -band[:, component], band[:, component], color=colour, alpha=0.15, lw=0)
-            axis.plot(t, error[:, component], color=colour, lw=width, label=run.name)
-            axis.set_ylabel(f"{label} [cm]")
-            axis.axhline(0, color="0.6", lw=0.5)
-    axes[0].set_title("Error of the position, online (band: ±3σ as claimed)")
-    axes[0].legend(loc="upper left", fontsize=8, frameon=False)
-    axes[-1].set_xlabel("time [s]")
-    _save(figure, path)
-
-
 def widths(count: int, last: float) -> list[float]:
     """Widths of lines, the first the widest: where lines coincide, each is seen beside the one drawn over it."""
     return [last * (1 + 1.2 * (count - 1 - i)) for i in range(count)]
@@ -301,13 +284,10 @@ def _limit_to_most(axis: Axes, run: RunData) -> None:
     axis.set_ylim(low[1] - margin, high[1] + margin)
 
 
-def _figure(count: int, size: tuple[float, float], rows: bool = False) -> tuple[Any, list[Any]]:
+def _figure(count: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
     import matplotlib.pyplot as plt
 
-    shape = (count, 1) if rows else (1, count)
-    figure, axes = plt.subplots(
-        *shape, figsize=(size[0] * shape[1], size[1] * shape[0]), squeeze=False, layout="constrained", sharex=rows
-    )
+    figure, axes = plt.subplots(1, count, figsize=(size[0] * count, size[1]), squeeze=False, layout="constrained")
     return figure, list(axes.ravel())
 
 
