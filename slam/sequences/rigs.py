@@ -60,7 +60,7 @@ def load_rig(
         CalibrationError: a file is missing, unreadable or of no known form, or the rig is impossible.
         ConfigurationError: an option that is none.
 
-    Example:
+    Examples:
         >>> import slam
         >>> rig = slam.load_rig("calibration.yaml")  # doctest: +SKIP
     """
