@@ -106,7 +106,7 @@ def _draw_object(
 def _draw_label(
     picture: np.ndarray, thing: MovingObject, corners: Array, scale: int, labels: list[tuple[int, int, int, int]]
 ) -> None:
-    """Number and speed of a body above its box, clear of `labels`: rectangles drawn before, to which its own is added."""
+    """Number and speed of a body above its box, clear of the `labels` drawn before; its rectangle is added to them."""
     import cv2
 
     if not np.isfinite(corners).all():
