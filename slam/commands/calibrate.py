@@ -10,7 +10,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam.calibration.model import RigModel
 from slam.commands.display import Progress
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
@@ -19,9 +18,6 @@ from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 
-#: What a parameter of each unit is multiplied by in the table, and its unit there; of pure numbers by name.
-_SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}
-_SHARES = {"f": "%", "aspect": "%", "down": "% of baseline", "forward": "% of baseline"}
 _COLUMNS = 3  # most recordings with a column of their own
 
 
@@ -47,19 +43,18 @@ def calibrate(
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
-    sequences = [open_sequence(text, format=format) for text in texts]
-    done = run(sequences, targets, show, settings, frames)
+    done = run([open_sequence(text, format=format) for text in texts], targets, show, settings, frames)
     if done.warning:
         logging.getLogger(__name__).warning("%s", done.warning)
     if not quiet:
-        _print(done, RigModel(sequences[0].rig).focal)
+        _print(done)
         if targets.opencv is not None or targets.kalibr is not None:
             print(f"The corrected calibration holds the corrections to {done.off:.3f} px, and no uncertainty.")
         print(f"Use it: slam run SEQUENCE --calibration {targets.out}")
 
 
-def _print(done: Calibrated, focal: float) -> None:
-    """The table, and what it says; `focal` is the focal length of the rectified pair [px]."""
+def _print(done: Calibrated) -> None:
+    """The table, and what it says."""
     console, joint = Console(), done.kept.posterior
     shown = done.found if len(done.found) <= _COLUMNS else ()
     table = Table(title="corrections: mean ± standard deviation", show_lines=False)
@@ -72,7 +67,7 @@ def _print(done: Calibrated, focal: float) -> None:
         table.add_column("apart", justify="right")
     for row, name in enumerate(joint.names):
         beliefs = [joint, *(one.posterior for one in shown)]
-        factor, unit = _unit(name, RigModel.units[row], focal)
+        factor, unit = done.units[row]
         cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
         table.add_row(name, unit, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
     console.print(table)
@@ -86,11 +81,3 @@ def _print(done: Calibrated, focal: float) -> None:
 def _sigmas(difference: float) -> str:
     """A difference in standard deviations; a dash where there is none."""
     return f"{difference:.1f} σ" if np.isfinite(difference) else "–"
-
-
-def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
-    """What a parameter is multiplied by to be shown, and the unit that it then has."""
-    if unit == "focal lengths":
-        return focal, "px"
-    share = _SHARES.get(name.removeprefix("left_").removeprefix("right_"))
-    return (100.0, share) if share else _SHOWN[unit]
