@@ -27,7 +27,8 @@ from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.evaluation.association_truth import AssociationScore, SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
-from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.figures import RunData, draw_map_3d, draw_top_view
+from slam.run.plots import plot
 from slam.run.runner import RunOptions, run
 from slam.sequences import Sequence, open_sequence
 
@@ -154,7 +155,7 @@ def main() -> int:
     runs = [RunData.read(arguments.out / backend, backend) for backend in BACKENDS]
     draw_map_3d(runs, arguments.out / "map_3d.png")
     draw_top_view(runs, sequence.ground_truth, arguments.out / "top_view.png")
-    draw_errors(runs, sequence.ground_truth, arguments.out / "errors.png")
+    plot(runs, arguments.out / "errors.png", "errors")
     draw_map_over_time([arguments.out / backend for backend in BACKENDS], arguments.out / "map.png")
     print(markdown(HEADER, rows, 2))
     write_json(arguments.out / "table.json", HEADER, rows)

@@ -20,7 +20,8 @@ from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler, available_cores
 from slam.compare.sweep import Run, sweep
-from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.figures import RunData, draw_map_3d, draw_top_view
+from slam.run.plots import plot
 from slam.sequences import open_sequence
 
 HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",
@@ -58,8 +59,7 @@ def main() -> int:
     truth = open_sequence(next(plan.trials_of(CLOSED_LOOP)).source).ground_truth
     draw_map_3d(data, arguments.out / "map_3d.png")
     draw_top_view(data, truth, arguments.out / "top_view.png")
-    if truth is not None:
-        draw_errors(data, truth, arguments.out / "errors.png")
+    plot(data, arguments.out / "errors.png", "errors")
     return 0
 
 

@@ -82,7 +82,7 @@ class StereoSlam:
         ConfigurationError: a setting is unknown or out of range.
         SlamError: the map is of another front end.
 
-    Example:
+    Examples:
         >>> import slam
         >>> sequence = slam.open_sequence("synthetic:desk?frames=3")
         >>> system = slam.StereoSlam(sequence.rig, backend="ekf")

@@ -165,6 +165,8 @@ def test_the_figures_in_the_readme_are_those_of_the_results_page():
         for cell, value in zip(cells, own):
             digits = len(cell.partition(".")[2])
             assert cell == (f"{float(value):.{digits}f}" if digits else value), (name, backend, cell, value)
+    times = [int(row[7]) for row in table_rows(section, 8)[1:]]
+    assert f"[{min(times)} to {max(times)} ms]" in readme
 
 
 def test_the_figures_of_worlds_in_the_readme_are_those_of_the_results_page():
@@ -225,6 +227,17 @@ def commands(page, *languages):
                 end = next((i for i, word in enumerate(words) if word in ("&&", "|", ";")), len(words))
                 yield words[:end]
                 words = words[end + 1 :]
+
+
+@each_page
+def test_what_a_shell_would_take_for_itself_is_quoted(page):
+    shown = [
+        *blocks(page, "sh", "shell", "bash", "console"),
+        *(span for span in spans(page) if span.startswith("slam ")),
+    ]
+    for line in "\n".join(shown).replace("$?", "").splitlines():
+        words = shlex.split(line.partition(" #")[0], posix=False)  # these keep their quotes
+        assert not [word for word in words if re.search(r"[?*]|(?<!&)&(?!&)", word) and word[0] not in "'\""], line
 
 
 def options_of(command):
@@ -331,8 +344,13 @@ def test_names_of_the_code_in_the_text_exist(page):
 @each_page
 def test_python_in_pages_is_python(page):
     for block in blocks(page, "python"):
-        if not block.startswith("--8<--"):
-            ast.parse(block)
+        ast.parse(block)
+
+
+@pytest.mark.parametrize("file", sorted((DOCS / "examples").glob("*.py")), ids=lambda file: file.stem)
+def test_pages_show_the_examples_as_they_are_tested(file):
+    shown = [block for page in PAGES for block in blocks(page, "python")]
+    assert shown.count(file.read_text(encoding="utf-8")) == 1
 
 
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.
@@ -365,7 +383,7 @@ def reader_has(name):
 @each_page
 def test_python_in_pages_runs(page, tmp_path, monkeypatch):
     name = page.relative_to(ROOT).as_posix()
-    parts = [block for block in blocks(page, "python") if not block.startswith("--8<--")]
+    parts = blocks(page, "python")
     if not parts or name in ELSEWHERE:
         return
     monkeypatch.chdir(tmp_path)

@@ -34,7 +34,7 @@ STAND_INS = {
     "path/to/kitti_or_euroc_folder": "euroc",
     "path/to/drive_1": "synthetic:street",
     "path/to/drive_2": "synthetic:street?layout=1",
-    "truth.txt": "results/trajectory.txt",
+    "truth.txt": "mine_ekf/trajectory.txt",
 }
 #: Options that get another value, or (None) are left out with theirs.
 SHORTER = {"--trials": "1", "--seeds": "1", "--scheduler": None}

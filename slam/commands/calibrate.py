@@ -8,7 +8,6 @@ from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from slam.commands.display import Progress
@@ -19,7 +18,6 @@ from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 
-_UNIT = 1e-3  # of the table
 _COLUMNS = 3  # most recordings with a column of their own
 
 
@@ -59,8 +57,9 @@ def _print(done: Calibrated) -> None:
     """The table, and what it says."""
     console, joint = Console(), done.kept.posterior
     shown = done.found if len(done.found) <= _COLUMNS else ()
-    table = Table(title=escape("corrections [thousandths]: mean ± standard deviation"), show_lines=False)
+    table = Table(title="corrections: mean ± standard deviation", show_lines=False)
     table.add_column("parameter")
+    table.add_column("unit")
     table.add_column("all", justify="right", no_wrap=True)
     for number in range(1, len(shown) + 1):
         table.add_column(f"({number})", justify="right", no_wrap=True)
@@ -68,8 +67,9 @@ def _print(done: Calibrated) -> None:
         table.add_column("apart", justify="right")
     for row, name in enumerate(joint.names):
         beliefs = [joint, *(one.posterior for one in shown)]
-        cells = [_cell(float(p.mean[row]), float(p.sigma[row])) for p in beliefs]
-        table.add_row(name, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
+        factor, unit = done.units[row]
+        cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
+        table.add_row(name, unit, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
     console.print(table)
     for number, one in enumerate(done.found, 1):
         tells = "" if one.evidence is not None else ": no motion that shows anything, left out"
@@ -81,8 +81,3 @@ def _print(done: Calibrated) -> None:
 def _sigmas(difference: float) -> str:
     """A difference in standard deviations; a dash where there is none."""
     return f"{difference:.1f} σ" if np.isfinite(difference) else "–"
-
-
-def _cell(mean: float, sigma: float) -> str:
-    """A mean with its standard deviation."""
-    return f"{mean / _UNIT:.2f} ± {sigma / _UNIT:.2f}"

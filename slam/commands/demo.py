@@ -9,8 +9,9 @@ from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
 from slam.files import write_png
 from slam.run.drawing import draw_objects, with_legend
-from slam.run.figures import RunData, draw_errors, draw_map_3d, draw_top_view
+from slam.run.figures import RunData, draw_map_3d, draw_top_view
 from slam.run.outputs import write_json
+from slam.run.plots import plot
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
@@ -45,8 +46,7 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
     truth = open_sequence(world).ground_truth
     draw_top_view(runs, truth, out / "top_view.png")
     draw_map_3d(runs, out / "map_3d.png")
-    if truth is not None:
-        draw_errors(runs, truth, out / "errors.png")
+    plot(runs, out / "errors.png", "errors")
     if last is not None:
         frame = next(iter(open_sequence(world).frames(frames - 1)))
         write_png(out / "frame.png", with_legend(draw_objects(frame.left, last, open_sequence(world).rig)))

@@ -85,7 +85,7 @@ def headline(differences: Sequence[Difference], other: str) -> list[Line]:
         names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
         if names:
             lines.append(Line(f"{other}: {', '.join(names)}", "", verdict))
-    return lines
+    return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
 
 
 def sentence(d: Difference, reference: str, other: str) -> str:

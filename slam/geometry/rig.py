@@ -121,7 +121,7 @@ class StereoRig:
         Raises:
             CalibrationError: neither or both of T and baseline are given, or a value is impossible.
 
-        Example:
+        Examples:
             >>> K = [[450, 0, 319.5], [0, 450, 239.5], [0, 0, 1]]
             >>> StereoRig.from_pinhole(K, baseline=0.12, size=(640, 480)).baseline
             0.12

@@ -41,9 +41,7 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     picture = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = max(1, round(width / picture.shape[1]))
     picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    labels: list[tuple[int, int, int, int]] = []
-    for thing in result.objects:
-        _draw_object(picture, thing, result, rig, scale, labels)
+    corners = [_draw_object(picture, thing, result, rig, scale) for thing in result.objects]
     moving = np.zeros(len(result.features), bool)
     moving[result.moving_features] = True
     beacons = result.matched_features[~moving[result.matched_features]]
@@ -54,6 +52,9 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     for u, v in result.features.uv_left[moving]:
         cv2.circle(picture, _pixel(u, v, scale), radius + 1, _RING, 1, cv2.LINE_AA)
         cv2.circle(picture, _pixel(u, v, scale), radius, _MOVING, 2, cv2.LINE_AA)
+    labels: list[tuple[int, int, int, int]] = []
+    for thing, pixels in zip(result.objects, corners):  # over all else
+        _draw_label(picture, thing, pixels, scale, labels)
     return picture
 
 
@@ -83,15 +84,9 @@ def with_legend(picture: np.ndarray) -> np.ndarray:
 
 
 def _draw_object(
-    picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int,
-    labels: list[tuple[int, int, int, int]],
-) -> None:  # fmt: skip
-    """Box, axes, number and speed of one body; a dashed box alone, called not seen, where it is not measured.
-
-    `labels` are the rectangles of the labels drawn before; the new one is put clear of them, and appended.
-    """
-    import cv2
-
+    picture: np.ndarray, thing: MovingObject, result: FrameResult, rig: StereoRig, scale: int
+) -> Array:  # fmt: skip
+    """Box and axes of one body, a dashed box alone where it is not measured; returns the box's corners (8, 2) [px]."""
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
     lower, upper = thing.extent
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
@@ -105,15 +100,24 @@ def _draw_object(
     for axis, axis_colour in enumerate(_AXES if measured else ()):
         ends = np.linspace(np.zeros(3), length * np.eye(3)[axis], _PARTS)
         _line(picture, rig, transform(T_left_object, ends), axis_colour, 2 * thickness, scale)
-    top = rig.left.project(transform(T_left_object, corners))
-    if np.isfinite(top).all():
-        u, v = top.min(axis=0)
-        speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
-        state = f"{speed:.2f} m/s" if thing.moving else "at rest"
-        text = f"{thing.id}  {state if measured else 'not seen'}"
-        at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
-        cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
-        cv2.putText(picture, text, at, _FONT, _TEXT, colour, 1, cv2.LINE_AA)
+    return rig.left.project(transform(T_left_object, corners))
+
+
+def _draw_label(
+    picture: np.ndarray, thing: MovingObject, corners: Array, scale: int, labels: list[tuple[int, int, int, int]]
+) -> None:
+    """Number and speed of a body above its box, clear of the `labels` drawn before; its rectangle is added to them."""
+    import cv2
+
+    if not np.isfinite(corners).all():
+        return
+    u, v = corners.min(axis=0)
+    speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
+    state = f"{speed:.2f} m/s" if thing.moving else "at rest"
+    text = f"{thing.id}  {state if thing.estimate.measured else 'not seen'}"
+    at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
+    cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
+    cv2.putText(picture, text, at, _FONT, _TEXT, _BOXES[(thing.id - 1) % len(_BOXES)], 1, cv2.LINE_AA)
 
 
 def _clear_place(

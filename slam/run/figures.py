@@ -160,16 +160,18 @@ def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> 
 
 
 def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
-    """The map from above with the 2σ ellipses of its landmarks, and the path."""
+    """The map from above, the path, and the 2σ ellipses of the landmarks that are well known."""
     from matplotlib.collections import EllipseCollection
 
     plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
     values, vectors = np.linalg.eigh(plane) if len(plane) else (np.zeros((0, 2)), np.zeros((0, 2, 2)))
     width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    known = np.isin(np.arange(len(run.positions)), well_known(run))  # the others would cover these
     for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
+        sure = rows & known
         ellipses = EllipseCollection(
-            width[rows, 1], width[rows, 0], angle[rows], units="xy", offsets=run.positions[rows][:, [0, 2]],
+            width[sure, 1], width[sure, 0], angle[sure], units="xy", offsets=run.positions[sure][:, [0, 2]],
             offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
         )  # fmt: skip
         axis.add_collection(ellipses)
@@ -201,7 +203,7 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     for i, run in enumerate(runs):
         axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
-        near = _near_rows(run)[-most:]
+        near = well_known(run)[-most:]
         for row in near:
             values, vectors = np.linalg.eigh(run.covariances[row])
             shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]
@@ -215,23 +217,6 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
         axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
         axis.set_aspect("equal")
         axis.view_init(elev=25, azim=-65)
-    _save(figure, path)
-
-
-def draw_errors(runs: list[RunData], truth: Trajectory, path: Path) -> None:
-    """Position error over time of each run, component by component, inside the ±3σ that the run claims."""
-    figure, axes = _figure(3, (9.0, 2.3), rows=True)
-    for colour, width, run in zip(_COLOURS, widths(len(runs), 1.2), runs):
-        t, error, sigma = position_errors(run, truth)
-        error, band = 100 * error, 300 * sigma
-        for axis, component, label in zip(axes, range(3), ("right", "down", "forward")):
-            axis.fill_between(t, -band[:, component], band[:, component], color=colour, alpha=0.15, lw=0)
-            axis.plot(t, error[:, component], color=colour, lw=width, label=run.name)
-            axis.set_ylabel(f"{label} [cm]")
-            axis.axhline(0, color="0.6", lw=0.5)
-    axes[0].set_title("Error of the position, online (band: ±3σ as claimed)")
-    axes[0].legend(loc="upper left", fontsize=8, frameon=False)
-    axes[-1].set_xlabel("time [s]")
     _save(figure, path)
 
 
@@ -280,30 +265,28 @@ def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
     axis.indicate_inset_zoom(inset, edgecolor="0.5")
 
 
-def _near_rows(run: RunData) -> np.ndarray:
-    """Landmarks that are well known and near the path, most recent last: others would spoil the picture's scale."""
+def well_known(run: RunData) -> np.ndarray:
+    """Rows of landmarks that are well known and near the path, most recent last: others spoil a picture's scale."""
     size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
-    extent = max(float(np.ptp(run.online.positions, axis=0).max()), 1.0)
     distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0  # where the camera hardly moved, or was lost
+    extent = max(float(np.ptp(run.online.positions, axis=0).max()), scene, 1.0)
     return np.flatnonzero((size < 0.2 * extent) & (distance < 2.0 * extent + 3.0))
 
 
 def _limit_to_most(axis: Axes, run: RunData) -> None:
     """Axis limits that hold the path and the well-known landmarks."""
-    points = np.concatenate([run.online.positions, run.positions[_near_rows(run)]])[:, [0, 2]]
+    points = np.concatenate([run.online.positions, run.positions[well_known(run)]])[:, [0, 2]]
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.05 * float((high - low).max()) + 0.1
     axis.set_xlim(low[0] - margin, high[0] + margin)
     axis.set_ylim(low[1] - margin, high[1] + margin)
 
 
-def _figure(count: int, size: tuple[float, float], rows: bool = False) -> tuple[Any, list[Any]]:
+def _figure(count: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
     import matplotlib.pyplot as plt
 
-    shape = (count, 1) if rows else (1, count)
-    figure, axes = plt.subplots(
-        *shape, figsize=(size[0] * shape[1], size[1] * shape[0]), squeeze=False, layout="constrained", sharex=rows
-    )
+    figure, axes = plt.subplots(1, count, figsize=(size[0] * count, size[1]), squeeze=False, layout="constrained")
     return figure, list(axes.ravel())
 
 

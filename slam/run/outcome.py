@@ -15,7 +15,9 @@ from slam.tracking.state import ENOUGH_FEATURES
 _TRACKED = "tracked"
 
 
-def outcome(record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_map: bool = False) -> str:
+def outcome(
+    record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_map: bool = False, dropped: int = 0
+) -> str:
     """What to say of a run in which most frames were not tracked, with the likely cause; empty for others.
 
     Args:
@@ -23,12 +25,13 @@ def outcome(record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_
         rig: the cameras.
         warnings: what looked wrong with the images and their times; the first is taken for the cause.
         in_map: the run began in the map of an earlier one.
+        dropped: frames of a live run that came too late.
     """
     frames, tracked = len(record.statuses) - 1, record.statuses[1:].count(_TRACKED)
     if frames < 1 or 2 * tracked >= frames:
         return ""
     how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
-    return f"{how} tracked; likely cause: {warnings[0] if warnings else _cause(record, rig, in_map)}"
+    return f"{how} tracked; likely cause: {warnings[0] if warnings else _cause(record, rig, in_map, dropped)}"
 
 
 def nothing_tracked(summary: dict[str, Any]) -> bool:
@@ -36,7 +39,7 @@ def nothing_tracked(summary: dict[str, Any]) -> bool:
     return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
 
 
-def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
+def _cause(record: RunRecord, rig: StereoRig, in_map: bool, dropped: int) -> str:
     """The first step that gave too little, and what to look at."""
     features, stereo = np.median(record.features, axis=0)
     if features < ENOUGH_FEATURES:
@@ -48,7 +51,12 @@ def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
             f"in the median frame {stereo:.0f} of {features:.0f} features are found in the right image: check that the "
             "images are of two cameras, the left one first, and the calibration"
         )
+    if dropped > len(record.statuses):
+        return (
+            f"{dropped} frames were dropped, so the others are far apart: make a frame cheaper (smaller images, --set "
+            "objects.mode=off), or move more slowly"
+        )
     return baseline_doubt(rig) or (
-        "features are found in both images, but not again in the next frame: a vehicle's camera (then say --kind "
-        "driving), frames too far apart, images that are not in order of time, or the calibration of another camera"
+        "features are found in both images, but not again in the next frame: a vehicle's camera without --kind "
+        "driving, frames too far apart, images that are not in order of time, or the calibration of another camera"
     )

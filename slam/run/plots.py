@@ -16,7 +16,7 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
-from slam.run.figures import RunData, draw_map, position_errors, widths
+from slam.run.figures import RunData, draw_map, position_errors, well_known, widths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +34,7 @@ _BANDS = ("-", "--", ":", "-.")  # lines around bands: of equal ones both are se
 _TRUTH = "0.25"
 _AXES = ("right", "down", "forward")
 _MOST_MAPS = 3  # side by side in the summary
+_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "slam", "pdf.fonttype": 42}
 
 #: What a file of a format says of itself: nothing that changes from run to run.
@@ -85,7 +86,7 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
         FigureCanvasAgg(figure)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=110, metadata=_METADATA[path.suffix.lower()])
+            figure.savefig(path, dpi=110, metadata={"Title": _title(runs), **_METADATA[path.suffix.lower()]})
         except OSError as error:
             raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
 
@@ -146,16 +147,34 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
         axis.plot(*path.positions[:, [0, 2]].T, color=colour, lw=width, alpha=0.75, label=run.name)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
     axis.set(title="Path, online, from above (dot: start)", xlabel="right [m]", ylabel="forward [m]")
-    axis.set_aspect("equal", adjustable="datalim")
+    if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in paths])):
+        axis.set_aspect("equal", adjustable="datalim")
     axis.legend(fontsize=8, frameon=False)
     axis.grid(color="0.9", lw=0.5)
+
+
+def _stretch(axis: Axes, points: np.ndarray) -> bool:
+    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
+    extent = np.ptp(points, axis=0)
+    narrow = int(np.argmin(extent))
+    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
+        return False
+    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
+    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
+    if narrow == 0:
+        axis.set(xlim=(middle - half, middle + half), xlabel=f"{axis.get_xlabel()}, on a scale of its own")
+    else:
+        axis.set(ylim=(middle - half, middle + half), ylabel=f"{axis.get_ylabel()}, on a scale of its own")
+    return True
 
 
 def _map_panel(axis: Axes, run: RunData) -> None:
     """The map from above with ellipses."""
     draw_map(axis, run, run.truth)
     _widen(axis)
-    axis.set_title(f"Map of {run.name}: {len(run.positions)} landmarks, 2σ ellipses")
+    known, every = len(well_known(run)), len(run.positions)
+    of = "" if known == every else f" of {known}"
+    axis.set_title(f"Map of {run.name}: {every} landmarks, 2σ ellipses{of}")
     axis.legend(fontsize=7, frameon=True, framealpha=0.8, edgecolor="none")
 
 
@@ -171,7 +190,8 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     """Errors of the position with the claimed ±3σ; where no truth is known the band alone."""
     known = any(run.truth is not None for run in runs)
     series = [_errors_of(run) for run in runs]
-    factor, unit = _unit(max((float(np.nanmax(np.abs(error), initial=0.0)) for _, error, _ in series), default=0.0))
+    shown = [error if known else sigma for _, error, sigma in series]
+    factor, unit = _unit(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
     styles = zip(_repeated(_COLOURS, len(runs)), _repeated(_BANDS, len(runs)), widths(len(runs), 1.1))
     for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
         for axis, e, s in zip(axes, factor * error.T, 3 * factor * sigma.T):
@@ -208,7 +228,7 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     axis.set(xlim=(0, 1.18 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin), title="Median time of each stage")
-    axis.figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    axis.figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
 
 
 def _errors_of(run: RunData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -242,8 +262,10 @@ def _unit(largest: float) -> tuple[float, str]:
 
 
 def _title(runs: Sequence[RunData]) -> str:
-    """Sequence and frames."""
+    """Sequence, frames, and how many of these were not tracked; the first one never is."""
+    lost = {run.name: sum(status != "tracked" for status in run.status[1:]) for run in runs}
     frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
+    frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
 
 

@@ -296,6 +296,7 @@ def _finish(
     live: LiveFrames | None = None,
 ) -> dict[str, Any]:
     """Write the last files, each whether or not another fails, and return the summary."""
+    warnings = getattr(system, "warnings", ())
     summary: dict[str, Any] = {
         "sequence": sequence.name,
         "format": sequence.format,
@@ -304,8 +305,8 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "tracking": outcome(record, sequence.rig, getattr(system, "warnings", ()), options.prior_map is not None),
-        "warnings": [*sequence.warnings, *getattr(system, "warnings", ())],
+        "tracking": outcome(record, sequence.rig, warnings, options.prior_map is not None, live.dropped if live else 0),
+        "warnings": [*sequence.warnings, *warnings],
     }
     if live is not None:
         summary["live"] = live_frames(live, record)

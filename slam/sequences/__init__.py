@@ -152,7 +152,7 @@ def _world_meant(text: str) -> str:
     from slam import worlds
 
     name, mark, query = text.partition("?")
-    return f" (did you mean {_SYNTHETIC}{name}{mark}{query}?)" if name in worlds.names() else ""
+    return f" (did you mean '{_SYNTHETIC}{name}{mark}{query}'?)" if name in worlds.names() else ""
 
 
 def _detect(folder: Path, options: dict[str, str]) -> str:
@@ -183,7 +183,7 @@ def _two_cameras(folder: Path) -> str:
             if path.suffix.lower() in VIDEO_SUFFIXES or images > 1:
                 names.append(path.name)
     two = names if len(names) == 2 else [name for name in names if not Path(name).suffix]
-    return f"; say which is which: {folder.name}?left={two[0]}&right={two[1]}" if len(two) == 2 else ""
+    return f"; say which is which: '{folder.name}?left={two[0]}&right={two[1]}'" if len(two) == 2 else ""
 
 
 def _is_ros(path: Path) -> bool:

@@ -71,16 +71,21 @@ class CameraSequence:
         except BaseException:
             self._cameras.release()
             raise
+        if self._cameras.have_an_end:  # a file is played from its first image; what a device has given is over
+            self._cameras.release()
+            self._cameras = None
 
     def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
-        """Those that are named, or of the working folder, before a camera is opened in vain."""
+        """Those that are named, or that lie beside a file that is played, or in the working folder."""
+        first = Path(self._addresses[0])
+        folder = first.absolute().parent if devices.plays_a_file(self._addresses[0]) else Path.cwd()
         try:
-            return rigs.calibration_files(Path.cwd(), options)
+            return rigs.calibration_files(folder, options)
         except CalibrationError:
             if "calibration" in options:
                 raise
-            missing = f"{self.name}: there is no calibration.yaml or the like in {Path.cwd()}"
-            raise CalibrationError(f"{missing}; name the file: {self.name}?calibration=FILE") from None
+            missing = f"{self.name}: there is no calibration.yaml or the like in {folder}"
+            raise CalibrationError(f"{missing}; name the file: '{self.name}?calibration=FILE'") from None
 
     def __len__(self) -> int:
         raise TypeError(f"{self.name}: a camera has no number of frames")

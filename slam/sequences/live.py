@@ -30,7 +30,7 @@ class LiveFrames:
         dropped: number of frames that were replaced by a newer one before they were taken.
         clock_waited: how long the clock has waited for reading, in total [s].
 
-    Example:
+    Examples:
         >>> import slam
         >>> sequence = slam.open_sequence("synthetic:desk?frames=3&width=160&height=120")
         >>> live = slam.LiveFrames(sequence)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -59,7 +60,7 @@ def load_rig(
         CalibrationError: a file is missing, unreadable or of no known form, or the rig is impossible.
         ConfigurationError: an option that is none.
 
-    Example:
+    Examples:
         >>> import slam
         >>> rig = slam.load_rig("calibration.yaml")  # doctest: +SKIP
     """
@@ -130,11 +131,19 @@ def _kitti_rig(path: Path, prefix: str, size: Size | None) -> StereoRig:
 def calibration_files(folder: Path, options: Mapping[str, str]) -> list[Path]:
     """The file, or the two files, by the option ``calibration`` (names joined by a comma) or under usual names.
 
+    Args:
+        folder: of the sequence, or of the file that it is; of a camera the working folder. Names are relative to it.
+        options: those that are given.
+
     Raises:
         CalibrationError: there is none.
     """
     if "calibration" in options:
-        return [folder / expanded(name, CalibrationError) for name in options["calibration"].split(",")]
+        files = [folder / expanded(name, CalibrationError) for name in options["calibration"].split(",")]
+        for name, file in zip(options["calibration"].split(","), files):
+            if not os.path.exists(file) and os.path.exists(name):  # noqa: PTH110 false for what can be no name, too
+                raise CalibrationError(f"{file}: there is no such file; calibration={name} is relative to {folder}")
+        return files
     found = _usual(folder, (*((name,) for name in _ONE_FILE), *_TWO_FILES))
     if not found:
         raise CalibrationError(f"{folder}: the calibration is missing: calibration.yaml, or add calibration=FILE")

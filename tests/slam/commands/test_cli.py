@@ -125,7 +125,7 @@ def test_unknown_world(slam_command, tmp_path):
 
 
 def test_a_world_without_its_mark(slam_command, tmp_path):
-    fails_with_one_line(slam_command("run", "aisle", "--out", tmp_path / "out"), "did you mean synthetic:aisle?")
+    fails_with_one_line(slam_command("run", "aisle", "--out", tmp_path / "out"), "did you mean 'synthetic:aisle'?")
 
 
 def test_a_format_of_folders_does_not_go_with_a_world(slam_command, tmp_path):

@@ -4,6 +4,7 @@ import logging
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from slam.commands.plot import leave_picture, plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import RunData, position_errors
-from slam.run.plots import KINDS, _in_one_world, read_runs
+from slam.run.figures import RunData, position_errors, well_known
+from slam.run.plots import KINDS, _in_one_world, _stretch, read_runs
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
@@ -93,6 +94,36 @@ def test_a_run_without_truth_or_objects_is_drawn(runs, tmp_path, kind):
     (tmp_path / "a" / "truth.txt").unlink()
     plot_runs([tmp_path / "a"], tmp_path / "a.png", kind)
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_a_pdf_is_named_after_its_sequence(runs, tmp_path):
+    plot_runs([runs / "a"], tmp_path / "a.pdf", "path")
+    assert b"/Title (aisle" in (tmp_path / "a.pdf").read_bytes()
+
+
+@pytest.mark.parametrize("across", [0, 1])
+def test_a_straight_path_has_a_scale_of_its_own_across(across):
+    from matplotlib.figure import Figure
+
+    axis = Figure().subplots()
+    points = np.zeros((30, 2))
+    points[:, 1 - across] = np.arange(30)
+    assert not _stretch(axis, 0 * points)
+    assert _stretch(axis, points)
+    assert np.ptp((axis.get_xlim, axis.get_ylim)[across]()) == pytest.approx(0.01 * 29 * 1.2)
+    assert (axis.get_xlabel, axis.get_ylabel)[across]().endswith("a scale of its own")
+    points[:, across] = 3 * np.sin(np.arange(30))
+    assert not _stretch(axis, points)
+
+
+def test_ellipses_of_landmarks_that_are_hardly_known_are_left_out(runs):
+    """A lost camera's landmarks: all are far for a path so short, and a few cover the others."""
+    data = RunData.read(runs / "a", "a")
+    data = replace(data, positions=30 * data.positions, covariances=data.covariances.copy())
+    data.covariances[:3] = 100 * np.eye(3)
+    known = well_known(data)
+    assert len(known) > len(data.positions) // 2
+    assert not np.isin([0, 1, 2], known).any()
 
 
 def test_frames_without_a_pose_have_no_deviation(runs, tmp_path):

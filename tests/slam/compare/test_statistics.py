@@ -292,6 +292,12 @@ def test_a_headline_names_all_that_is_certain_in_both_directions_and_what_is_ope
     assert rest == "smoother: landmark error median"
 
 
+def test_a_headline_without_any_error_says_why():
+    tracked = difference(BY_KEY["tracked"], np.ones(1), np.ones(1))
+    (line,) = headline([tracked], "smoother")
+    assert (line.badge, line.text) == ("no pair", "smoother: errors (the true path is not known)")
+
+
 def test_runs_that_failed_are_a_difference_of_their_own():
     """Five of six fail: what completes more often is certain only where every pair says so."""
     all_failed = difference(COMPLETED, np.ones(6), np.zeros(6))

@@ -31,6 +31,13 @@ def test_fewer_than_half_are_told(tracked, words):
         ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median frame)"),
         ((200, 3), 0.12, {}, "in the median frame 3 of 200 features are found in the right image"),
         ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
+        (
+            (200, 150),
+            0.12,
+            {"dropped": 40},
+            "40 frames were dropped, so the others are far apart: make a frame cheaper",
+        ),
+        ((200, 150), 0.12, {"dropped": 9}, "features are found in both images, but not again in the next frame"),
         ((200, 150), 0.12, {}, "features are found in both images, but not again in the next frame"),
         ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
         ((200, 3), 0.12, {"warnings": ["left and right look swapped", "more"]}, "left and right look swapped"),

@@ -56,7 +56,7 @@ def test_two_folders_of_images_by_other_names_are_named(tmp_path: Path) -> None:
             (tmp_path / name / f"{k}.png").write_bytes(b"")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "summary.png").write_bytes(b"")
-    with pytest.raises(SequenceError, match=rf"say which is which: {tmp_path.name}\?left=cam_l&right=cam_r$"):
+    with pytest.raises(SequenceError, match=rf"say which is which: '{tmp_path.name}\?left=cam_l&right=cam_r'$"):
         open_sequence(tmp_path)
 
 
