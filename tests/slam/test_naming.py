@@ -23,8 +23,8 @@ def test_only_a_similar_name_is_suggested():
     [
         ("synthetic:asle", "'aisle'"),
         ("synthetic:aisle?frmes=3", "'frames'"),
-        ("aisle", "synthetic:aisle?"),
-        ("aisle?frames=3", "synthetic:aisle?frames=3?"),
+        ("aisle", "'synthetic:aisle'?"),
+        ("aisle?frames=3", "'synthetic:aisle?frames=3'?"),
     ],
 )
 def test_a_world_is_suggested(sequence, meant):
