@@ -287,8 +287,9 @@ class _Normal:
         solver = splu(coo_array(entries, shape=(size, size)).tocsc(), permc_spec="MMD_AT_PLUS_A", options=_SYMMETRIC)
         flat = border[1:].reshape(size, m)
         through = solver.solve(flat) if m else flat
-        CW = np.swapaxes(C, 1, 2) @ W
-        inner = np.linalg.inv(np.eye(m) + (CW @ C).sum(axis=0) - flat.T @ through)
+        follow = np.concatenate([np.zeros((1, 6, m)), through.reshape(count - 1, 6, m)])
+        rest = C - A @ follow[a] - B @ follow[b]  # squares of what poses cannot follow; no difference of large squares
+        inner = np.linalg.inv(np.eye(m) + np.tensordot(rest, W @ rest, axes=((0, 1), (0, 1))))
         return cls(solver, flat, through, inner)
 
     def step(self, right: Array, right_common: Array) -> tuple[Array, Array]:
@@ -318,8 +319,13 @@ _SYMMETRIC = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
 
 
 def _root_of_information(covariances: Array) -> Array:
-    """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), which rounding may have made none."""
-    scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) + LEAST_VARIANCE)
+    """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), which rounding may have made none.
+
+    The noise of single steps has no positive part in some directions (see `slam.mapping.atlas.keyframes`): they get the
+    least variance, as the normal equations of steps that are exact are singular to rounding.
+    """
+    covariances = covariances + LEAST_VARIANCE * np.eye(6)
+    scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     values, vectors = np.linalg.eigh(covariances / (scale[:, :, None] * scale[:, None, :]))
     return np.asarray(
         np.swapaxes(vectors / np.sqrt(np.maximum(values, LEAST_VARIANCE))[:, None, :], 1, 2) / scale[:, None, :]

@@ -170,6 +170,29 @@ def test_a_stretch_that_nothing_is_known_of_is_bridged_by_a_loop():
     assert solution.disagreement.max() < 25
 
 
+def test_steps_without_noise_leave_a_covariance():
+    rng, true, nees = np.random.default_rng(6), circle(), []
+    for _ in range(20):
+        common, errors = 1e-3 * rng.normal(size=(len(true), 6, 8)), rng.normal(size=8)
+        some = [*range(10, 16), *range(50, 56)]  # keyframes one after the other that all close a loop
+        steps = np.tile(np.diag(SIGMAS**2), (len(true), 1, 1))
+        steps[some, :, 2:] = steps[some, 2:, :] = 0
+        odom = [true[0]]
+        for k in range(1, len(true)):
+            noise = common[k] @ errors + np.sqrt(np.diagonal(steps[k])) * rng.normal(size=6)
+            odom.append(odom[-1] @ inverse(true[k - 1]) @ true[k] @ exp(-noise))
+        P = np.diag(np.repeat([1e-3, 0.02], 3) ** 2)
+        loops = [
+            Loop(k, k + 40, inverse(true[k]) @ true[k + 40] @ exp(np.linalg.cholesky(P) @ rng.normal(size=6)), P, 50)
+            for k in range(9, 16)
+        ]
+        solution = solve(Chain(np.array(odom), steps, common), loops, np.array(odom))
+        assert np.linalg.eigvalsh(solution.covariance)[0] > 0
+        error = np.concatenate([log(inverse(solution.poses[-1]) @ true[-1]), errors - solution.common])
+        nees.append(error @ np.linalg.solve(solution.covariance, error))
+    assert 10 < np.mean(nees) < 22  # 14 is right, with a deviation of 1.2
+
+
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_shared_out_keeps_the_ends(share: float):
     rng = np.random.default_rng(3)
