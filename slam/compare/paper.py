@@ -14,6 +14,7 @@ from slam.compare.statistics import LEVEL, Difference
 from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
 from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
+from slam.files import whole_file, write_text
 
 TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
 
@@ -38,10 +39,10 @@ def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
     every = groups(plan, runs)
     tests = count_tests(every)
     tables = [table for group in every for table in (means_table(group), differences_table(group, tests))]
-    _write(out / TABLES, _HEAD.format("booktabs") + "\n" + "\n".join(tables))
+    write_text(out / TABLES, _HEAD.format("booktabs") + "\n" + "\n".join(tables))
     (out / FOLDER).mkdir(exist_ok=True)
     shown = [text for group in every for text in _figures(group, out / FOLDER)]
-    _write(out / FIGURES, _HEAD.format("graphicx") + "\n" + "\n".join(shown))
+    write_text(out / FIGURES, _HEAD.format("graphicx") + "\n" + "\n".join(shown))
 
 
 def means_table(group: Group) -> str:
@@ -91,9 +92,8 @@ def _figures(group: Group, folder: Path) -> Iterable[str]:
     for picture in pictures(group):
         name = f"{_label(group)}_{picture.name}"
         caption = f"{_what(group)}: {_lower(latex(picture.caption))} {_given(group)}."
-        part = folder / f"{name}.pdf.part"
-        part.write_bytes(as_pdf(picture.draw(), f"{picture.title}: {group.sequence}, {group.mode}"))
-        part.replace(folder / f"{name}.pdf")
+        with whole_file(folder / f"{name}.pdf") as file:
+            file.write(as_pdf(picture.draw(), f"{picture.title}: {group.sequence}, {group.mode}"))
         yield (
             "\\begin{figure}\n  \\centering\n"
             f"  \\includegraphics[width=\\linewidth]{{{FOLDER}/{name}}}\n"
@@ -153,9 +153,3 @@ def _label(group: Group) -> str:
 def _lower(text: str) -> str:
     """A sentence that goes on after a colon; abbreviations stay."""
     return text if text[1:2].isupper() else text[0].lower() + text[1:]
-
-
-def _write(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)

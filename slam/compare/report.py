@@ -35,7 +35,7 @@ from slam.compare.wording import (
     shown_spread,
     worth_saying,
 )
-from slam.files import read_object
+from slam.files import read_object, write_text
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -80,9 +80,7 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         script=_script(),
     )
     path = out / "report.html"
-    part = path.with_suffix(".html.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    write_text(path, text)
     return path
 
 

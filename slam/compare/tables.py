@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from slam.compare.measure import BY_KEY, COMPLETED, METRICS, UNTRACKED, Metric, 
 from slam.compare.plan import Plan, Variant
 from slam.compare.statistics import Difference, adjusted, difference, interval
 from slam.compare.sweep import Run
+from slam.files import write_text
 from slam.geometry.se3 import Array
 
 
@@ -160,9 +162,6 @@ def _number(value: float | None) -> str:
 
 def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table at once or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
-    part.replace(path)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
+    write_text(path, text.getvalue())
