@@ -34,7 +34,7 @@ from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
 BACKENDS = ("ekf", "smoother")
-QUICK = ("map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off")  # settings of short runs
+QUICK = ("map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off")  # settings of quick runs
 ROW_TEXTS = 2
 HEADER = (
     "path", "back end", "frames", "keyframes", "loops", "false", "refused", "places found again [%]",

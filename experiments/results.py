@@ -28,6 +28,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from experiments import loops
 from slam.compare.revision import made_with
 from slam.run.repeat import versions
 
@@ -95,7 +96,10 @@ EXPERIMENTS = (
     Experiment("alignment", "Features aligned to their first sight"),
     Experiment("informative", "How many measurements a frame needs", "", ("informative.png",)),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
-    Experiment("loops", "Long drives that come back: loops closed"),
+    Experiment(
+        "loops", "Long drives that come back: loops closed",
+        arguments=("--paths", "00", "05", "06", "07", "09", "--set", *loops.QUICK),
+    ),
     Experiment(
         "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
         arguments=("--wrong", "0", "0.05", "0.1", "0.2"),
