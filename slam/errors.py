@@ -15,10 +15,18 @@ def one_line(text: str, length: int = _LONGEST) -> str:
     return "".join(c if c.isprintable() else " " if c in "\n\t" else repr(c)[1:-1] for c in text).strip()
 
 
+def text_of(error: BaseException) -> str:
+    """What an exception says; nothing where it fails to."""
+    try:
+        return str(error)
+    except Exception:  # noqa: BLE001 (a class from elsewhere)
+        return ""
+
+
 def cause(error: BaseException) -> str:
     """An exception of somebody else's code in words, and the line that raised it."""
     place = extract_tb(error.__traceback__)[-1]
-    text = f": {error}" if str(error) else ""
+    text = f": {said}" if (said := text_of(error)) else ""
     return f"{type(error).__name__}{text} ({Path(place.filename).name}, line {place.lineno})"
 
 

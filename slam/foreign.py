@@ -6,14 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from traceback import walk_tb
 
-from slam.errors import PartError, SlamError, cause
+from slam.errors import PartError, SlamError, cause, text_of
 
 _OURS = ("slam", "backends", "frontends")
 
 
 @contextmanager
 def named_failures(place: str, *parts: object) -> Iterator[None]:
-    """Name what failed in an exception of a part from elsewhere; those of our own parts go on as they are.
+    """Name what failed in an exception of a part from elsewhere, or in one that its answer may have caused.
+
+    Exceptions go on as they are where all parts are our own.
 
     Args:
         place: what is being done, for the message.
@@ -28,10 +30,17 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:  # whatever a foreign class does
         foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in (*_OURS, "builtins")]
-        if not foreign:
+        if not foreign or (isinstance(error, SystemExit) and not any(_raised_by(part, error) for part in foreign)):
             raise
         part, call = next(((part, f".{call}") for part in foreign if (call := _call(error, part))), (foreign[0], ""))
-        raise PartError(f"{place}: {type(part).__name__}{call} failed: {cause(error)}") from error
+        failed = "failed" if call else "may have failed"  # what it answered may have broken something of ours
+        raise PartError(f"{place}: {type(part).__name__}{call} {failed}: {cause(error)}") from error
+
+
+def _raised_by(part: object, error: BaseException) -> bool:
+    """Whether the module of `part` raised an exception itself, unlike a signal's handler elsewhere."""
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    return frame.f_globals.get("__name__") == type(part).__module__
 
 
 def _call(error: BaseException, part: object) -> str:
@@ -40,5 +49,5 @@ def _call(error: BaseException, part: object) -> str:
         first = frame.f_code.co_varnames[:1]
         if first and frame.f_locals.get(first[0]) is part:
             return frame.f_code.co_name
-    name, dot, rest = str(error).partition(".")
+    name, dot, rest = text_of(error).partition(".")
     return rest.partition("(")[0] if dot and isinstance(error, TypeError) and name == type(part).__qualname__ else ""

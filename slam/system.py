@@ -423,7 +423,7 @@ class StereoSlam:
         change = self._rig_error.apply(self.backend)
         if change is not None:
             self.objects.revise(change.rows)
-        return self._rig_error.revise(self.backend)
+        return self._rig_error.revise(self.backend, restarted=bool(self._relocalizer.past))
 
     def _locate(self, features: StereoFeatures, index: int) -> bool:
         """Look for the camera in the map that the system was started with; where it is found, the back end starts."""

@@ -217,6 +217,7 @@ class SmootherBackend:
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: all poses are in the problem still, with their measurements."""
+        self._commit()  # poses may leave with it
         return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
 
     @one_blas_thread

@@ -79,7 +79,7 @@ class SelfCalibration:
         zoom = focal_sigma(self.model) > 0
         self._focal = zoom / zoom.sum()  # the focal lengths' common error by the parameters
         self._unknown = _mean_variance(self._far, np.linalg.inv(prior_information(self.model)))
-        self._solution = Solution(self._prior.mean, start, start, 1.0)
+        self._solution = Solution(self._prior.mean, start, start, 1.0 if kept is None else kept.residual)
         self._variances = np.log(np.square([config.pixel_sigma, config.disparity_sigma]))  # and of how many pairs
         self._scattered = _CONFIGURED
         self._waiting: list[View] = []

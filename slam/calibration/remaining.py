@@ -37,10 +37,15 @@ class RemainingRigError:
         """
         return self._calibration.apply(_REVISION if isinstance(backend, RevisingBackend) else 0.0)
 
-    def revise(self, backend: Backend) -> Revision | None:
-        """Correct what a back end was given before, if it can do that; returns the change, None where there is none."""
+    def revise(self, backend: Backend, restarted: bool) -> Revision | None:
+        """Correct what a back end was given before, if it can do that; returns the change, None where there is none.
+
+        Args:
+            backend: the present one.
+            restarted: the path has a part of an earlier back end, which stays as it is.
+        """
         applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
-        if isinstance(backend, RevisingBackend) and backend.revises_path:
+        if not restarted and isinstance(backend, RevisingBackend) and backend.revises_path:
             self.uncertainty.path_follows(applied.parameters)
         else:
             self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=revising)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -44,13 +45,17 @@ def require_free(out: Path) -> None:
     """Raise SlamError where a folder holds a run or a comparison, or one of its folders does."""
     if _holds_run(out):
         raise SlamError(f"{out}: holds a run already; give another --out, or --overwrite to replace it")
-    runs = next((folder.name for folder in out.iterdir() if _holds_run(folder)), None) if out.is_dir() else None
+    try:
+        folders = list(out.iterdir()) if out.is_dir() else []
+    except OSError as error:
+        raise SlamError(f"cannot read {out}: {error.strerror or error}") from error
+    runs = next((folder.name for folder in folders if _holds_run(folder)), None)
     if runs is not None:
         raise SlamError(f"{out}: holds runs in folders of their own, such as {runs}; give --out {out / 'NAME'}")
 
 
 def _holds_run(folder: Path) -> bool:
-    return any((folder / mark).exists() for mark in _MARKS)
+    return any(os.path.exists(folder / mark) for mark in _MARKS)  # noqa: PTH110 (False where it may not be read)
 
 
 def _claimed(name: str) -> Path:

@@ -100,6 +100,18 @@ def test_records_are_bounded_by_the_lag():
     assert (late <= 1.3 * early + 5).all(), (early, late)
 
 
+def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
+    backend, known = SmootherBackend(RIG, MODELS, lag=12, window=12), set()
+    answers = []
+    for k, (stamp, _, seen) in enumerate(drive(30, points=300)):
+        step(backend, stamp, seen, known)
+        backend.predict(stamp + 0.5 * DT)  # a frame that waits
+        answers.append(backend.revises_path)
+        backend.revise(lambda z: z)
+        assert backend.revises_path == answers[-1], k
+    assert answers[0] and not answers[-1]
+
+
 def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
     """All that is measured is relative; the smoother must not wander about within what it does not know."""
     models = replace(MODELS, initial_position_sigma=10.0, initial_rotation_sigma=0.1)

@@ -57,6 +57,22 @@ def test_a_failing_back_end_is_named_and_the_cause_is_kept(method, error):
     assert raised.value.__cause__ is error
 
 
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("nothing to say")
+
+
+def test_an_exception_that_cannot_be_shown_is_named_all_the_same():
+    system = StereoSlam(RIG, "surf", Failing("update", MuteError()))
+    with pytest.raises(PartError, match=r"^frame 0: Failing.fails failed: MuteError \("):
+        system.process(LEFT, RIGHT, 0.0)
+
+
+def test_a_program_that_ends_itself_while_a_part_works_ends():
+    with pytest.raises(SystemExit), named_failures("frame 0", Failing("update", ValueError())):
+        exec("raise SystemExit(0)", {"__name__": "handler_of_a_signal"})
+
+
 def test_a_front_end_that_stops_does_not_end_the_frames():
     system = StereoSlam(RIG, Blind(RIG), "ekf")
     frames = [system._frame(LEFT, RIGHT, 0.0)]

@@ -35,6 +35,7 @@ def test_what_is_kept_corrects_from_the_first_frame_and_goes_on_being_learnt(fir
     kept = slam.load_calibration(tmp_path / "rig.json")
     np.testing.assert_array_equal(kept.posterior.mean, first.posterior.mean)
     assert kept.rig == first.kept().rig
+    assert SelfCalibration(CAR, SelfCalibrationConfig(), kept).kept().residual == kept.residual < 1
     second = SelfCalibration(CAR, SelfCalibrationConfig(), kept)
     np.testing.assert_array_equal(second.applied.parameters, first.posterior.mean)
     assert (second.posterior.sigma > 0.999 * first.posterior.sigma).all()  # the cameras may have turned since

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slam.commands.cli import app
+from slam.commands.folders import require_free
 from slam.errors import SlamError
 from slam.run.repeat import changed_versions, load, portable
 
@@ -137,6 +138,18 @@ def test_runs_have_folders_of_their_own(here):
     with pytest.raises(SlamError, match="70:80"):
         slam("run", WORLD, "--frames", "70:80", "-q")
     assert len(list((here / "results").iterdir())) == 2  # what was not begun leaves no folder
+
+
+def test_folders_that_may_not_be_read_are_no_runs(here, monkeypatch):
+    def refuse(path, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    (here / "mine" / "private").mkdir(parents=True)
+    monkeypatch.setattr("pathlib.Path.exists", refuse)
+    require_free(here / "mine")
+    monkeypatch.setattr("pathlib.Path.iterdir", refuse)
+    with pytest.raises(SlamError, match=r"cannot read .*mine: Permission denied"):
+        require_free(here / "mine")
 
 
 def test_another_run_is_not_overwritten_without_being_told(here):
