@@ -206,8 +206,10 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
     """The paths from above: true, without loops, and as estimated at the end; loops as circles."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(runs), figsize=(5 * len(runs), 5), squeeze=False, layout="constrained")
-    for axis, ((name, backend), run) in zip(axes[0], runs.items()):
+    rows = len({backend for _, backend in runs})  # the runs are in order of their paths
+    shape = (rows, len(runs) // rows)
+    figure, axes = plt.subplots(*shape, figsize=(4 * shape[1], 4 * shape[0]), squeeze=False, layout="constrained")
+    for axis, ((name, backend), run) in zip(axes.T.flat, runs.items()):
         for poses, style, label in (
             (run.truth, "k--", "true"), (run.odometry, "C1-", "without loops"), (run.final.poses, "C0-", "with loops"),
         ):  # fmt: skip
