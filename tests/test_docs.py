@@ -124,7 +124,7 @@ def test_a_recording_as_the_guide_has_it_opens(tmp_path):
         (tmp_path / side).mkdir()
         for k in range(3):
             cv2.imwrite(str(tmp_path / side / f"{k:06}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
-    code = re.search(r"```python\n(file = cv2.*?)```", (DOCS / "guide.md").read_text(), re.S).group(1)
+    code = re.search(r"```python\n(import cv2\n\nfile = cv2.*?)```", (DOCS / "guide.md").read_text(), re.S).group(1)
     code = code.replace('"calibration.yaml"', repr(str(tmp_path / "calibration.yaml")))
     exec(code, {"cv2": cv2, "M1": K, "D1": D, "M2": K, "D2": D, "R": np.eye(3), "T": np.array([-0.12, 0, 0])})
     sequence = slam.open_sequence(f"{tmp_path}?fps=30")

@@ -51,7 +51,7 @@ class _Notice(event.Listener):
         first = compile_clock.start()
         if not self._said:
             self._said = True
-            _LOG.info("compiling kernels, about half a minute, once; `slam warm-up` does that beforehand")
+            _LOG.info("compiling kernels, once for each back end, half a minute or more; `slam warm-up` does it before")
         if first:
             self._collects = gc.isenabled()
             gc.disable()
