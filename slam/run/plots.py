@@ -223,9 +223,9 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
         axis.barh(rows, width, left=left, height=0.6, color=_STAGE_COLOURS.get(stage, "0.5"), label=stage)
         left += width
     for row, total in zip(rows, left):
-        axis.text(total, row, f" {total:.3g} ms", va="center", fontsize=8)
+        axis.text(total, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize=8)
     axis.set_yticks(rows, [run.name for run in runs])
-    axis.set(xlim=(0, 1.18 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
+    axis.set(xlim=(0, 1.25 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin), title="Median time of each stage")
     axis.figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
