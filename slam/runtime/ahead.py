@@ -5,9 +5,12 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import TypeVar
 
 T = TypeVar("T")
+
+_LOOK = 0.1  # [s] between two looks for a signal
 
 
 class _End:
@@ -15,6 +18,13 @@ class _End:
 
     def __init__(self, error: BaseException | None = None) -> None:
         self.error = error
+
+
+def _next(ready: queue.Queue[T]) -> T:
+    """The next item of a queue. A signal that comes just before the wait takes effect at the next look."""
+    while True:
+        with suppress(queue.Empty):
+            return ready.get(timeout=_LOOK)
 
 
 def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
@@ -40,7 +50,7 @@ def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
     thread = threading.Thread(target=work, name="ahead", daemon=True)
     thread.start()
     try:
-        while not isinstance(item := ready.get(), _End):
+        while not isinstance(item := _next(ready), _End):
             places.release()
             yield item
         if item.error is not None:
