@@ -44,6 +44,7 @@ def pose_fit():
     return module.PoseFit
 
 
+@pytest.mark.slow
 def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
     lines = [line for line in (DOCS / "examples" / "pose_fit.py").read_text().splitlines() if line.strip()]
     assert len(lines) <= 50
@@ -81,6 +82,7 @@ def test_the_back_end_in_50_lines_keeps_the_map():
         backend.predict(0.0)
 
 
+@pytest.mark.slow
 def test_two_streams_of_arrays_are_followed(capsys):
     spec = importlib.util.spec_from_file_location("two_streams", DOCS / "examples" / "two_streams.py")
     module = importlib.util.module_from_spec(spec)
@@ -92,6 +94,7 @@ def test_two_streams_of_arrays_are_followed(capsys):
     assert capsys.readouterr().out.count("tracked") == 3
 
 
+@pytest.mark.slow
 def test_the_webcam_in_15_lines_writes_a_path(tmp_path, monkeypatch, capsys):
     import cv2
 

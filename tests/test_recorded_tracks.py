@@ -33,6 +33,7 @@ def test_the_first_frames_are_not_rejected(slam_data, name):
     assert off < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
 @pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_far_tracks_alone_do_not_make_it_run_away(slam_data, name, wrong):

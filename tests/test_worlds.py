@@ -61,6 +61,7 @@ def test_rendered_world(world, backend, tmp_path):
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < RENDERED[world]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_faults_are_survived(backend, tmp_path):
     """Black frames, a missing right image, missing frames: the run goes on, and its status says what happened."""

@@ -23,6 +23,7 @@ def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
     assert "0 times; failed updates: 0" in table(checkpoints)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_rounds_past_the_same_landmarks(name):
     """Two rounds: the second adds next to no landmark, and comes back to where the first began."""

@@ -39,6 +39,7 @@ def monte_carlo(name, make, **options):
     return np.mean(pose, axis=0), np.mean(velocity, axis=0)
 
 
+@pytest.mark.slow
 @BOTH
 def test_nees_of_a_box_before_a_moving_camera(name):
     """Pose NEES inside its 95 % band. The box moves less than the model allows for, so velocity NEES only has its top.
@@ -52,6 +53,7 @@ def test_nees_of_a_box_before_a_moving_camera(name):
     assert 2 < velocity[list(LATEST)].mean() < high
 
 
+@pytest.mark.slow
 @BOTH
 def test_nees_of_a_car(name):
     """A car at 15 m that moves just as the model says. Its depth is known to 4 % only: linearisation costs something.

@@ -45,6 +45,7 @@ def euroc(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_good_folder_of_noise_runs_and_says_that_nothing_was_tracked(euroc, tmp_path):
     done = in_a_new_process("run", euroc, "--out", tmp_path / "out")
     assert done.returncode == 1, done.stderr

@@ -139,6 +139,7 @@ def write_small(out):
     return {path.name: path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_tables_and_figures_have_the_same_bytes_in_any_process(tmp_path):
     here = write_small(tmp_path / "here")
     environment = {**os.environ, "PYTHONHASHSEED": "7"}

@@ -95,6 +95,7 @@ def test_a_cluster_leaves_the_same_tables(done, tmp_path):
     assert tables(tmp_path) == tables(done[0])
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again_and_what_is_not_is(done, tmp_path):
     out = tmp_path / "again"
     shutil.copytree(done[0], out)

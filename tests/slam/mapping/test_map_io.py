@@ -241,6 +241,7 @@ def test_there_is_no_map_before_the_first_frame():
         StereoSlam(RIG, None, "ekf").snapshot()
 
 
+@pytest.mark.slow
 def test_the_command_saves_and_starts_and_refuses(slam_command, tmp_path):
     kept = str(tmp_path / "desk.map")
     run = ("run", "synthetic:desk?seed=1", "--quiet", "--out")

@@ -132,6 +132,7 @@ def test_left_images_alone_in_a_prior_map_go_on_beyond_it(backend):
     assert np.median(distances) < 6  # χ²₃: 2.4; they share the error of the camera's motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_desk_with_left_images_alone(backend):
     """100 frames of the simulated desk in a quarter of an earlier run's map."""

@@ -222,6 +222,7 @@ def test_devices_are_not_replaced(tmp_path, option):
 # --- signals ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ignored", [False, True])
 def test_a_closed_terminal_leaves_a_summary(tmp_path, ignored):
     """And where it is to be ignored, as `nohup` has it, the run goes on."""

@@ -227,6 +227,7 @@ def test_recordings_are_checked_when_made(recording):
         replace(recording, removed=np.arange(3))
 
 
+@pytest.mark.slow
 def test_the_command_records_and_replays(slam_command, tmp_path):
     file = tmp_path / "run.npz"
     done = slam_command("run", "synthetic:aisle?frames=4", "--record", file, "--out", tmp_path / "first", "--quiet")

@@ -146,6 +146,7 @@ def test_a_frame_that_cannot_be_recorded_ends_the_run_with_all_its_files(tmp_pat
     assert "frame 4" in json.loads((tmp_path / "summary.json").read_text())["ended"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
