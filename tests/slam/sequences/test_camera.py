@@ -254,10 +254,12 @@ def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scen
     monkeypatch.setattr(devices, "open_device", lambda *_: Watched(image, out / "frames.csv"))
     Watched.free.clear()
     Watched.sent.clear()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has its background jobs ignore it
     try:
         done = slam_command("run", "camera:0?wait=0", "--out", out, "--no-picture")
     finally:
         Watched.free.set()
+        signal.signal(signal.SIGINT, before)
     assert done.returncode == 0, done.stderr
     assert "frames dropped" in done.stdout
     summary = json.loads((out / "summary.json").read_text())
