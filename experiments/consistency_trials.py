@@ -20,7 +20,7 @@ from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
-from slam.run.replay import Recording
+from slam.run.recorded import Recording
 from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.worlds import open_world
 from slam.worlds.sequence import WorldSequence

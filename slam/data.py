@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from slam.geometry.arrays import BoolArray as BoolArray
 from slam.geometry.arrays import IdArray as IdArray
 from slam.geometry.arrays import IndexArray as IndexArray
 from slam.object_data import MovingObject
+from slam.rig_error import CommonError, Revision
 from slam.showing import count, of_shapes, point
 
 
@@ -312,52 +312,6 @@ class Estimate:
         """
         terms = {f"c{'xyz'[i]}{'xyz'[j]}": self.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
         return {"id": self.ids, **{"xyz"[i]: self.positions[:, i] for i in range(3)}, **terms}
-
-
-@dataclass(frozen=True)
-class CommonError:
-    """What poses are off by through the rig's error: ``shares @ (scale @ c + known)``, with the same c for all poses.
-
-    Attributes:
-        shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
-        scale: these errors by ones of unit variance, c, as they are known now (m, n).
-        known: the part of them that is known by now, but stays in poses of before (m,).
-    """
-
-    shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
-    scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    known: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def root(self) -> Array:
-        """A square root (m, n + 1) of the errors' covariance; that the known part was not corrected counts as well."""
-        return np.column_stack([self.scale, self.known])
-
-    @property
-    def covariance(self) -> Array:
-        """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.root
-        return np.asarray(root @ root.T)
-
-
-class Correction(Protocol):
-    """What is known of the rig's error, for whoever holds measurements."""
-
-    def rows(self, z: Array) -> Array:
-        """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]."""
-        ...
-
-    def undone(self, z: Array) -> Array:
-        """Measured rows (N, 3) of corrected ones: the inverse of `rows`."""
-        ...
-
-
-class Revision(Protocol):
-    """A change of the rig's correction in the course of a run, for measurements that were corrected as before."""
-
-    def rows(self, z: Array) -> Array:
-        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""
-        ...
 
 
 class FrameStatus(StrEnum):

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import CommonError, FrameResult, FrameStatus, Revision, UpdateStatus
+from slam.data import FrameResult, FrameStatus, UpdateStatus
 from slam.geometry.se3 import Array, inverse
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.mapper import MapChange
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
+from slam.rig_error import CommonError, Revision
 
 
 def frame_result(

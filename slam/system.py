@@ -14,6 +14,7 @@ from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfC
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame, UpdateReport
 from slam.errors import ConfigurationError, MeasurementError, SlamError
+from slam.extraction import Extractor, as_frame
 from slam.foreign import named_failures
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -35,13 +36,9 @@ from slam.runtime.stages import Stages
 from slam.showing import count
 from slam.tracking.answer_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.feature_check import usable
-from slam.tracking.input_warnings import InputWarnings
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.patch_alignment import Aligner, Anchors
 from slam.tracking.state import TrackingState
-
-#: How far from its row a front end looks for a feature's partner, where it does not say [px].
-_ROWS = 1.5
 
 
 def _require_types(
@@ -132,9 +129,8 @@ class StereoSlam:
         self._relocalizer = Relocalizer(rig, c.models, names[1], c.backend, self._localizer)
         self._last = Completed()
         self._stages = Stages()
-        rows = getattr(getattr(self.frontend, "config", None), "epipolar", _ROWS)
-        self._input_warnings = InputWarnings(rig, c.models, rows)
-        self._stepping, self._extracting = OneThread("this system"), OneThread("this system's front end")
+        self._extractor = Extractor(self.frontend, rig, c.models)
+        self._stepping = OneThread("this system")
         self._stamp = -np.inf  # that the back end was last advanced to [s]
         if prior_map is not None:
             prior_map.require_fits(self.frontend_name)
@@ -169,21 +165,11 @@ class StereoSlam:
             MeasurementError: images without a stamp, or a frame with one; or as `process_features`.
             SequenceError: the images are of another type or size than the rig's.
         """
-        frame = self._frame(left, right, stamp)
+        frame = as_frame(left, right, stamp, self._last.index + 1)
         with self._stepping:
-            _, features, milliseconds = self._extract(frame)
+            _, features, milliseconds = self._extractor.extract(self.frontend, frame)
             result = self._step(features, frame.index)
             return replace(result, milliseconds={**milliseconds, **result.milliseconds})
-
-    def _frame(self, left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None) -> StereoFrame:
-        """What `process` was given as a frame."""
-        if isinstance(left, StereoFrame):
-            if right is not None or stamp is not None:
-                raise MeasurementError("process: a frame has its right image and its stamp already")
-            return left
-        if stamp is None:
-            raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
-        return StereoFrame(self._last.index + 1, stamp, left, right)
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
@@ -198,25 +184,12 @@ class StereoSlam:
         """
         if not isinstance(frames, Iterable):
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
-        extracted = map(self._extract, frames)
+        extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
         depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
         for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
             with self._stepping:
                 result = self._step(features, frame.index)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
-
-    @one_blas_thread
-    def _extract(self, frame: StereoFrame) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
-        """A frame, its features, and how long these took [ms]."""
-        if self.frontend is None:
-            raise ConfigurationError("this system has no front end: use process_features")
-        if not hasattr(frame, "index"):
-            raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
-        stages = Stages()
-        with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", self.frontend):
-            features = self.frontend.extract(frame)
-        self._input_warnings.look(frame, features)
-        return frame, features, stages.milliseconds
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
@@ -406,7 +379,7 @@ class StereoSlam:
     @property
     def warnings(self) -> list[str]:
         """What looks wrong with images, stamps or baseline, a line each (see `slam.tracking.input_warnings`)."""
-        return list(self._input_warnings.lines)
+        return self._extractor.warnings
 
     def __getstate__(self) -> dict[str, object]:
         """What a copy holds; refused while another thread is in a step."""

@@ -23,36 +23,18 @@ MAY_IMPORT = {
     "evaluation": {"data", "geometry"},
     "system": {"objects", "mapping", "tracking", "calibration", "data", "geometry", "runtime"},
     "run": {
-        "system",
-        "calibration",
-        "objects",
-        "mapping",
-        "tracking",
-        "sequences",
-        "worlds",
-        "evaluation",
-        "data",
-        "geometry",
-        "runtime",
+        "system", "calibration", "objects", "mapping", "tracking", "sequences", "worlds", "evaluation", "data",
+        "geometry", "runtime",
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
     "testing": {"system", "worlds", "data", "geometry"},
     "commands": {
-        "compare",
-        "run",
-        "objects",
-        "system",
-        "sequences",
-        "worlds",
-        "evaluation",
-        "data",
-        "geometry",
-        "runtime",
+        "compare", "run", "objects", "system", "sequences", "worlds", "evaluation", "data", "geometry", "runtime",
     },
-}
+}  # fmt: skip
 
 #: The root's modules that make up the room "system"; all others belong to "data", what everybody needs.
-SYSTEM = {"system", "config", "results", "__init__"}
+SYSTEM = {"system", "config", "extraction", "results", "__init__"}
 
 
 def room_of(module: str) -> str:

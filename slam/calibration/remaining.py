@@ -5,8 +5,9 @@ from __future__ import annotations
 from slam.calibration.consider import RigUncertainty
 from slam.calibration.correction import Revision
 from slam.calibration.estimator import SelfCalibration
-from slam.data import CommonError, Estimate
+from slam.data import Estimate
 from slam.interfaces import Backend, RevisingBackend
+from slam.rig_error import CommonError
 
 #: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
 _REVISION = 0.5

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import threading
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slam.commands import completion
+from slam.commands.ending import one_line_errors
 from slam.commands.options import (
     BackendOption,
     CalibrationOption,
@@ -41,11 +41,9 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import Stopped, catch_signals, whole_frames
-from slam.errors import PartError, SlamError, one_line
-from slam.files import reason
 
 if TYPE_CHECKING:
-    from slam.run.replay import Recording
+    from slam.run.recorded import Recording
     from slam.run.runner import Watch
     from slam.sequences import Sequence
 
@@ -59,42 +57,15 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point: bad input is one line on standard error and exit status 2; a signal's is 128 + its number.
-
-    With the environment variable SLAM_DEBUG, errors show their traceback instead.
-    """
+    """Entry point; errors end as `slam.commands.ending` says."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
     catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma
             stream.reconfigure(errors="backslashreplace")
-    try:
+    with one_line_errors():
         app(prog_name="slam")
-    except SlamError as error:
-        if os.environ.get("SLAM_DEBUG"):
-            raise
-        foreign = isinstance(error, PartError)
-        _end(f"slam: {error}{'; with SLAM_DEBUG=1 there is a traceback' if foreign else ''}", 2)
-    except BrokenPipeError:  # whoever read the output has gone
-        _end("", 1)
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        _end(f"slam: {one_line(f'{place}{reason(error)}')}", 2)
-    except MemoryError:
-        _end("slam: there is not enough memory for this", 2)
-    except Stopped as stopped:
-        _end(f"slam: stopped by {stopped}; {stopped.leaves}", 128 + stopped.number)
-
-
-def _end(line: str, status: int) -> None:
-    """Say why, where there is still a terminal to say it on, and end."""
-    with suppress(OSError):
-        if line:
-            print(line, file=sys.stderr, flush=True)
-        else:
-            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 Python flushes it at the end
-    sys.exit(status)
 
 
 def _print_version(wanted: bool) -> None:

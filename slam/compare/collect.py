@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.compare.frames import count_one
 from slam.compare.measure import object_figures
-from slam.data import CommonError, FrameResult, FrameStatus, IdArray
+from slam.data import FrameResult, FrameStatus, IdArray
 from slam.errors import TrajectoryError
 from slam.evaluation.association_truth import SurfacePoints, TrueWorld
 from slam.evaluation.consistency import STRETCHES, stretch_nees
@@ -20,6 +20,7 @@ from slam.geometry.alignment import Alignment
 from slam.geometry.se3 import Array, inverse, nearest_rotation, rotation_angle
 from slam.geometry.stamps import pair
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.rig_error import CommonError
 from slam.sequences import Sequence
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]

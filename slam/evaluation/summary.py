@@ -7,7 +7,6 @@ from typing import Protocol
 
 import numpy as np
 
-from slam.data import CommonError
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import consistency_figures
 from slam.evaluation.metrics import (
@@ -19,6 +18,7 @@ from slam.evaluation.metrics import (
 )
 from slam.geometry.se3 import Array, inverse, rotation_angle
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.rig_error import CommonError
 
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import CommonError, Correction, Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.se3 import Array
 from slam.landmarks import LandmarkRows
 from slam.object_data import MotionLabels
+from slam.rig_error import CommonError, Correction
 from slam.tracking.localizer import LandmarkMatches
 from slam.tracking.patch_alignment import Aligned, Anchors
 from slam.tracking.state import TrackingState

@@ -3,7 +3,7 @@
 Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
 ``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where
 earlier frames were corrected anew ``corrections``, and, where the true path is known, ``truth_stamps`` and
-``truth_poses``. Meanings: `slam.run.replay.Recording`.
+``truth_poses``. Meanings: `slam.run.recorded.Recording`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_models import ObjectModels
-from slam.run.replay import RecordedRows, Recording
+from slam.run.recorded import RecordedRows, Recording
 
 _FORMAT = "surf-stereo-slam recording"
 _VERSION = 2

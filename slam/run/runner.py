@@ -23,9 +23,10 @@ from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.last_files import LastFiles
 from slam.run.outcome import outcome
 from slam.run.outputs import RunFiles
+from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
-from slam.run.replay import RecordedFrame, Recording, replay
+from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of

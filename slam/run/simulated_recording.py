@@ -11,7 +11,7 @@ from slam.data import IdArray, Observations
 from slam.mapping.config import MapConfig
 from slam.mapping.selection import new_landmarks
 from slam.models import EstimatorModels, models_for
-from slam.run.replay import RecordedFrame, RecordedRows, Recording
+from slam.run.recorded import RecordedFrame, RecordedRows, Recording
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import CommonError, Estimate, FrameResult
+from slam.data import Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
 from slam.foreign import named_failures
 from slam.geometry.se3 import Array
@@ -15,7 +15,8 @@ from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.landmarks import LandmarkRows
 from slam.objects.metrics import ObjectScore
-from slam.run.replay import Recording
+from slam.rig_error import CommonError
+from slam.run.recorded import Recording
 from slam.run.schema import STAGES
 from slam.runtime.compile_clock import compile_clock, working_time
 from slam.sequences import Sequence

@@ -14,7 +14,8 @@ import backends
 from slam.config import SystemConfig
 from slam.errors import PartError, SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.replay import record, replay
+from slam.run.recorded import record
+from slam.run.replay import replay
 from slam.run.runner import RunOptions, run
 from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject, require_line

@@ -10,6 +10,7 @@ import pytest
 from backends.ekf import EkfBackend
 from frontends.surf import SurfFrontend
 from slam.commands.cli import main
+from slam.data import StereoFrame
 from slam.errors import ConfigurationError, PartError
 from slam.foreign import named_failures
 from slam.models import EstimatorModels
@@ -75,7 +76,7 @@ def test_a_program_that_ends_itself_while_a_part_works_ends():
 
 def test_a_front_end_that_stops_does_not_end_the_frames():
     system = StereoSlam(RIG, Blind(RIG), "ekf")
-    frames = [system._frame(LEFT, RIGHT, 0.0)]
+    frames = [StereoFrame(0, 0.0, LEFT, RIGHT)]
     for overlap in (True, False):
         with pytest.raises(PartError, match=r"^frame 0: Blind.extract failed: StopIteration"):
             list(system.run(frames, overlap))

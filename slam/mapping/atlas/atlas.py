@@ -12,12 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam.data import CommonError, Estimate
+from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, adjoints, shared_out
 from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
 from slam.mapping.atlas.places import PlaceIndex
+from slam.rig_error import CommonError
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Anchor:
     Attributes:
         covariance: of its pose, perturbing on the right, and of the common errors (6 + n, 6 + n).
         common: the common errors (n,), where their variance was one.
-        rig: what they stand for, see `slam.data.CommonError`.
+        rig: what they stand for, see `slam.rig_error.CommonError`.
     """
 
     covariance: Array

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import Correction, IdArray, StereoFeatures
+from slam.data import IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.mapping.atlas.config import AtlasConfig
+from slam.rig_error import Correction
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Keyframe:
         covariance: its covariance (6, 6) then, by noise alone.
         step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
             right.
-        shares: derivative (6, m) of the pose by the errors that all poses share, see `slam.data.CommonError`.
+        shares: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
         travelled: length of the path up to here [m].
         depth: median depth of the features [m].
         points: features in coordinates of the rectified left camera (F, 3) [m].

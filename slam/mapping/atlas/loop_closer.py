@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray, CommonError, Correction, IdArray, StereoFeatures
+from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
@@ -29,6 +29,7 @@ from slam.mapping.atlas.verification import Verified, alike, verify
 from slam.mapping.mapper import KnownPlace, Returned
 from slam.mapping.step import Step
 from slam.models import EstimatorModels
+from slam.rig_error import CommonError, Correction
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import LandmarkMatches, Localizer

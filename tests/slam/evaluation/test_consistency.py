@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.data import CommonError
 from slam.evaluation.consistency import consistency_figures, stretch_nees, verdict
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.rig_error import CommonError
 
 STEP = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 1.0])  # a turn of 0.02 rad and 1 m forward
 SIGMA = np.array([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.02])

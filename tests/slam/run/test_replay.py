@@ -11,8 +11,9 @@ from slam.data import FrameStatus, Observations
 from slam.errors import MeasurementError, SequenceError
 from slam.geometry.trajectory import Trajectory
 from slam.models import models_for
+from slam.run.recorded import RecordedRows, Recording, record
 from slam.run.recording import load_recording, save_recording
-from slam.run.replay import RecordedRows, Recording, record, replay
+from slam.run.replay import replay
 from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.system import StereoSlam
 from tests.backends.fixed_map import FixedMapBackend

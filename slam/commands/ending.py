@@ -1,0 +1,46 @@
+"""How the command ends where something fails: one line on standard error, and an exit status."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from slam.commands.signals import Stopped
+from slam.errors import PartError, SlamError, one_line
+from slam.files import reason
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Bad input ends the process with one line and exit status 2; a signal's status is 128 + its number.
+
+    With the environment variable SLAM_DEBUG, errors show their traceback instead.
+    """
+    try:
+        yield
+    except SlamError as error:
+        if os.environ.get("SLAM_DEBUG"):
+            raise
+        foreign = isinstance(error, PartError)
+        _end(f"slam: {error}{'; with SLAM_DEBUG=1 there is a traceback' if foreign else ''}", 2)
+    except BrokenPipeError:  # whoever read the output has gone
+        _end("", 1)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _end(f"slam: {one_line(f'{place}{reason(error)}')}", 2)
+    except MemoryError:
+        _end("slam: there is not enough memory for this", 2)
+    except Stopped as stopped:
+        _end(f"slam: stopped by {stopped}; {stopped.leaves}", 128 + stopped.number)
+
+
+def _end(line: str, status: int) -> None:
+    """Say why, where there is still a terminal to say it on, and end."""
+    with suppress(OSError):
+        if line:
+            print(line, file=sys.stderr, flush=True)
+        else:
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 Python flushes it at the end
+    sys.exit(status)

@@ -1,0 +1,75 @@
+"""The front end at work in a system: from what it is given as images to features, timed, and with its warnings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.data import StereoFeatures, StereoFrame
+from slam.errors import ConfigurationError, MeasurementError
+from slam.foreign import named_failures
+from slam.geometry.rig import StereoRig
+from slam.interfaces import Frontend
+from slam.models import EstimatorModels
+from slam.runtime.blas import one_blas_thread
+from slam.runtime.one_thread import OneThread
+from slam.runtime.stages import Stages
+from slam.tracking.input_warnings import InputWarnings
+
+#: How far from its row a front end looks for a feature's partner, where it does not say [px].
+_ROWS = 1.5
+
+
+def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: float | None, index: int) -> StereoFrame:
+    """A frame, or two images (H, W) or (H, W, 3|4) with their time [s], as a frame of this index.
+
+    Raises:
+        MeasurementError: images without a stamp, or a frame with one.
+    """
+    if isinstance(left, StereoFrame):
+        if right is not None or stamp is not None:
+            raise MeasurementError("process: a frame has its right image and its stamp already")
+        return left
+    if stamp is None:
+        raise MeasurementError("process: two images need their time [s]: process(left, right, stamp)")
+    return StereoFrame(index, stamp, left, right)
+
+
+class Extractor:
+    """Features of frames, in one thread at a time, which may be another one than the system's.
+
+    Args:
+        frontend: that is used; its settings say how far features may be from their row.
+        rig: the cameras.
+        models: noise of the features.
+    """
+
+    def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
+        rows = getattr(getattr(frontend, "config", None), "epipolar", _ROWS)
+        self._warnings = InputWarnings(rig, models, rows)
+        self._extracting = OneThread("this system's front end")
+
+    @property
+    def warnings(self) -> list[str]:
+        """What looks wrong with the images so far, a line each (see `slam.tracking.input_warnings`)."""
+        return list(self._warnings.lines)
+
+    @one_blas_thread
+    def extract(
+        self, frontend: Frontend | None, frame: StereoFrame
+    ) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
+        """A frame, its features, and how long these took [ms].
+
+        Raises:
+            ConfigurationError: there is no front end.
+            MeasurementError: this is no frame.
+            SlamError: another thread is here; or the front end failed (`PartError`).
+        """
+        if frontend is None:
+            raise ConfigurationError("this system has no front end: use process_features")
+        if not hasattr(frame, "index"):
+            raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
+        stages = Stages()
+        with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
+            features = frontend.extract(frame)
+        self._warnings.look(frame, features)
+        return frame, features, stages.milliseconds
