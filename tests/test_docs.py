@@ -24,6 +24,7 @@ from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
 from slam.interfaces import Backend
 from slam.testing import check_backend, findings
+from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -37,11 +38,7 @@ SECTIONS = ("The bookshelf aisle", "Do the back ends know", "Moving box")
 
 
 def pose_fit():
-    path = DOCS / "examples" / "pose_fit.py"
-    spec = importlib.util.spec_from_file_location("pose_fit", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.PoseFit
+    return load_script("docs/examples/pose_fit.py").PoseFit
 
 
 @pytest.mark.slow
@@ -84,9 +81,7 @@ def test_the_back_end_in_50_lines_keeps_the_map():
 
 @pytest.mark.slow
 def test_two_streams_of_arrays_are_followed(capsys):
-    spec = importlib.util.spec_from_file_location("two_streams", DOCS / "examples" / "two_streams.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_script("docs/examples/two_streams.py")
     sequence = slam.open_sequence("synthetic:desk?frames=4&width=160&height=120")
     lefts, rights, stamps = zip(*((frame.left, frame.right, frame.stamp) for frame in sequence))
     path = module.follow(lefts, rights, stamps, sequence.rig.left.K, sequence.rig.baseline)

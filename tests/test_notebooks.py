@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import pytest
+
+from tests.scripts import load_script
 
 nbformat = pytest.importorskip("nbformat")
 pytest.importorskip("nbclient")
 
 DOCS = Path(__file__).parent.parent / "docs"
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
-
-
-def make_notebooks():
-    spec = importlib.util.spec_from_file_location("make_notebooks", DOCS / "make_notebooks.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def texts(notebook):
@@ -38,7 +32,7 @@ def test_notebooks_run_and_show_what_is_saved(path, monkeypatch):
     root = str(DOCS.parent)
     monkeypatch.setenv("PYTHONPATH", root)
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
-    saved, shown = texts(nbformat.read(path, as_version=4)), texts(make_notebooks().run(path))
+    saved, shown = texts(nbformat.read(path, as_version=4)), texts(load_script("docs/make_notebooks.py").run(path))
     assert len(shown) == len(saved) > 3
     assert shown[0] == saved[0]  # the sequence, the same everywhere
     assert sum("Figure" in text for text in shown) >= 2

@@ -1,21 +1,17 @@
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import pytest
+
+from tests.scripts import load_script
 
 ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module")
 def results():
-    spec = importlib.util.spec_from_file_location("results_page", ROOT / "experiments" / "results.py")
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(__import__("sys").modules, "results_page", module)  # dataclasses look their module up
-        spec.loader.exec_module(module)
-    return module
+    return load_script("experiments/results.py")
 
 
 @pytest.fixture

@@ -131,17 +131,11 @@ class RigModel:
         out *= self.focal
         return out
 
-    def residual_field(self, points: Array) -> Array:
-        """As `field`, by the residual fields (N, 3, m): of x and y of the left camera, then of the right one."""
-        x, y, d = points.T / self.focal
-        n = len(RESIDUAL)
-        out = np.zeros((len(points), 3, 4 * n))
-        out[:, 0, :n] = out[:, 1, n : 2 * n] = out[:, 2, :n] = self.focal * self._polynomials(x, y)
-        out[:, 2, 2 * n : 3 * n] = -self.focal * self._polynomials(x - d, y)
-        return out
-
     def residual_products(self, factors: Array, points: Array) -> Array:
-        """Sum over points (N, 3) of factors (N, 3, n) times `residual_field`: (n, m)."""
+        """Sum over points (N, 3) of factors (N, 3, n) times the residual fields (N, 3, m) there: (n, m).
+
+        The fields are those of x and y of the left camera, then of the right one.
+        """
         x, y, d = points.T / self.focal
         n = len(RESIDUAL)
         out = np.zeros((factors.shape[2], 4 * n))

@@ -19,6 +19,16 @@ def residual_fields(rng):
     return np.sqrt(residual_variance()) * rng.standard_normal(4 * len(RESIDUAL))
 
 
+def residual_field(model, points):
+    """The fields (N, 3, m) of x and y of the left camera, then of the right one, at points (N, 3)."""
+    x, y, d = points.T / model.focal
+    n = len(RESIDUAL)
+    out = np.zeros((len(points), 3, 4 * n))
+    out[:, 0, :n] = out[:, 1, n : 2 * n] = out[:, 2, :n] = model.focal * model._polynomials(x, y)
+    out[:, 2, 2 * n : 3 * n] = -model.focal * model._polynomials(x - d, y)
+    return out
+
+
 class Street:
     """Points beside the road with unit descriptors."""
 
@@ -46,7 +56,7 @@ class Street:
         points = model.points(z)
         vertical = -model.vertical(points) @ theta
         if residual is not None:
-            z = model.rows(points - model.residual_field(points) @ residual)
+            z = model.rows(points - residual_field(model, points) @ residual)
             vertical -= model.residual_vertical(points) @ residual
         left, right = z[:, :2], np.column_stack([z[:, 2], z[:, 1] + vertical])
         left = left + noise * rng.standard_normal((n, 2))
