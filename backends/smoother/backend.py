@@ -17,7 +17,8 @@ from backends.smoother.factor_graph import FactorGraph
 from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.objects import ObjectSmoother
-from backends.smoother.prediction import PredictedPoints, PredictedPose, normalised_innovation, residual_noise
+from backends.smoother.pose_set import PredictedPose
+from backends.smoother.prediction import PredictedPoints, normalised_innovation, residual_noise
 from backends.smoother.recovery import Agreement, agreement, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo

@@ -11,16 +11,17 @@ import numpy as np
 
 from backends.smoother import recovery, uncertainty
 from backends.smoother.factor_graph import FactorGraph
+from backends.smoother.pose_set import PoseSet
 from backends.smoother.prediction import (
     PredictedPoints,
     PredictedPose,
-    carried_covariance,
     first_pose,
     predict_points,
     predict_pose,
+    propagated_covariance,
 )
 from backends.smoother.solver import SolverError
-from backends.smoother.uncertainty import PoseSet, WindowJacobians
+from backends.smoother.uncertainty import WindowJacobians
 from backends.smoother.variables import pose_key
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
@@ -82,14 +83,14 @@ class Belief:
             return window
 
     def _joint_covariance(self, frames: IndexArray) -> Array:
-        """Joint covariance of poses; where the solver cannot give it, the last one carried on by the motion model."""
+        """Joint covariance of poses; where the solver cannot give it, the last one propagated by the motion model."""
         with suppress(SolverError):
             return self._graph.joint_covariance(_keys(frames))
         self._graph.recover()
         with suppress(SolverError):
             return self._graph.joint_covariance(_keys(frames))
         last = self._window if self._window is not None and len(self._window) else None
-        return carried_covariance(self._models, self._log.path, last, frames)
+        return propagated_covariance(self._models, self._log.path, last, frames)
 
     def last_measured(self) -> int:
         """Place in the window of the newest pose that measured landmarks; of the last one where none did."""
@@ -150,7 +151,7 @@ class Belief:
         window, marks, place = self.window(), self._log.landmarks, self.last_measured()
         slots = marks.used()
         J = self.landmarks_by_window(slots).copy()
-        J[:, :, 6 * place : 6 * place + 6] -= uncertainty.carried(window.poses[place], marks.position[slots])
+        J[:, :, 6 * place : 6 * place + 6] -= uncertainty.moved_with_pose(window.poses[place], marks.position[slots])
         return uncertainty.quadratic(J, window.covariance) + marks.covariance[slots]
 
     def points(self, predicted: PredictedPose, slots: IndexArray) -> PredictedPoints:

@@ -11,9 +11,10 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.factors import FactorMaker, to_pose3
+from backends.smoother.held import Held
 from backends.smoother.lag import held_pose, overdue, without_old
 from backends.smoother.landmarks import Known
-from backends.smoother.marginal import Held, reference_prior
+from backends.smoother.marginal import reference_prior
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.positions import linearise, place
 from backends.smoother.rebuild import optimise, pose_factor, stepped, whole_problem

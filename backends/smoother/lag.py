@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import gtsam
 
+from backends.smoother.held import Held
 from backends.smoother.landmarks import Track
-from backends.smoother.marginal import Held, MarginalPrior, marginal_prior
+from backends.smoother.marginal import MarginalPrior, marginal_prior
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of

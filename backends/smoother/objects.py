@@ -22,8 +22,8 @@ from backends.smoother.objects_window import (
     without_points,
 )
 from backends.smoother.path import Path
+from backends.smoother.pose_set import PoseSet
 from backends.smoother.stereo import RectifiedStereo
-from backends.smoother.uncertainty import PoseSet
 from slam.data import BoolArray, IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, adjoint, inverse, transform

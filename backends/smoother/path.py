@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from backends.smoother.pose_set import PredictedPose
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
-
-if TYPE_CHECKING:
-    from backends.smoother.prediction import PredictedPose
 
 
 def grown(array: np.ndarray, rows: int) -> np.ndarray:

@@ -8,45 +8,13 @@ import numpy as np
 
 from backends.smoother import motion
 from backends.smoother.path import Path
+from backends.smoother.pose_set import PoseSet, PredictedPose
 from backends.smoother.stereo import RectifiedStereo, by_pose
-from backends.smoother.uncertainty import PoseSet, quadratic
+from backends.smoother.uncertainty import quadratic
 from slam.data import BoolArray, IndexArray
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.se3 import Array, points_by_pose
 from slam.models import EstimatorModels
 from slam.tracking.gating import whiteners
-
-
-@dataclass(frozen=True)
-class PredictedPose:
-    """The newest pose before its measurements.
-
-    Attributes:
-        stamp: time [s].
-        T: predicted pose (4, 4).
-        by_window: its Jacobian (6, 6 W) by the poses of the window.
-        noise: covariance (6, 6) of what the motion adds.
-        window: the poses that it is predicted from.
-    """
-
-    stamp: float
-    T: Array
-    by_window: Array
-    noise: Array
-    window: PoseSet
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (6, 6)."""
-        P = self.by_window @ self.window.covariance @ self.by_window.T + self.noise
-        return np.asarray(0.5 * (P + P.T))
-
-    def covariance_to(self, place: int) -> Array:
-        """Covariance (6, 6) where one pose of the window is known: what all have in common moves the landmarks too."""
-        if not len(self.window):
-            return self.noise
-        J = self.by_window.copy()
-        J[:, 6 * place : 6 * place + 6] -= adjoint(inverse(self.T) @ self.window.poses[place])
-        return J @ self.window.covariance @ J.T + self.noise
 
 
 def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: float) -> PredictedPose:
@@ -70,8 +38,8 @@ def first_pose(models: EstimatorModels, stamp: float) -> PredictedPose:
     return PredictedPose(stamp, models.initial_pose, np.zeros((6, 0)), np.diag(sigmas**2), none)
 
 
-def carried_covariance(models: EstimatorModels, path: Path, known: PoseSet | None, frames: IndexArray) -> Array:
-    """Joint covariance of successive poses up to the newest, carried on from an earlier set by the motion alone.
+def propagated_covariance(models: EstimatorModels, path: Path, known: PoseSet | None, frames: IndexArray) -> Array:
+    """Joint covariance of successive poses up to the newest, propagated from an earlier set by the motion alone.
 
     Args:
         models: priors and motion.

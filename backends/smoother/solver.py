@@ -7,18 +7,16 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from backends.smoother.held import Held
 from backends.smoother.variables import ballast_key, size_of
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
-
-if TYPE_CHECKING:
-    from backends.smoother.marginal import Held
 
 _T = TypeVar("_T")
 

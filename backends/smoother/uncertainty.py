@@ -10,12 +10,11 @@ covariance of the poses that gives every covariance asked for, with the correlat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from backends.smoother.landmarks import Landmarks
 from backends.smoother.measurement_log import Measurements
+from backends.smoother.pose_set import PoseSet
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
@@ -111,24 +110,6 @@ def _form(A: Array, x: Array) -> Array:
     return np.einsum("mi,mij,mj->m", x, A, x)
 
 
-@dataclass(frozen=True)
-class PoseSet:
-    """Poses with their joint covariance.
-
-    Attributes:
-        frames: their frames (W,), ascending.
-        poses: (W, 4, 4).
-        covariance: (6 W, 6 W).
-    """
-
-    frames: IndexArray
-    poses: Array
-    covariance: Array
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-
 def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, slots: IndexArray) -> Array:
     """Jacobians (M, 3, 6 W) of landmark positions by poses of the set.
 
@@ -145,8 +126,8 @@ def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, s
     information = (share @ landmarks.information[slots].reshape(*rows.shape, 9)).reshape(count, width, 3, 3)
     oldest = np.where(rows >= 0, place, width - 1).min(axis=1)
     information[np.arange(count), oldest] += landmarks.older[slots]
-    carried = landmarks.covariance[slots][:, None] @ information @ _carry(known.poses, landmarks.position[slots])
-    return np.swapaxes(carried, 1, 2).reshape(count, 3, 6 * width)
+    by_pose = landmarks.covariance[slots][:, None] @ information @ _moved_with(known.poses, landmarks.position[slots])
+    return np.swapaxes(by_pose, 1, 2).reshape(count, 3, 6 * width)
 
 
 class WindowJacobians:
@@ -171,7 +152,7 @@ class WindowJacobians:
         return self._jacobians[slots]
 
 
-def _carry(poses: Array, points: Array) -> Array:
+def _moved_with(poses: Array, points: Array) -> Array:
     """G (M, W, 3, 6): how points (M, 3) move that are fixed to poses (W, 4, 4), by the poses' perturbation."""
     R = poses[None, :, :3, :3]
     x, y, z = np.moveaxis(points[:, None] - poses[None, :, :3, 3], 2, 0)
@@ -180,9 +161,9 @@ def _carry(poses: Array, points: Array) -> Array:
     return np.concatenate([turn @ R, np.broadcast_to(R, turn.shape)], axis=3)
 
 
-def carried(T: Array, points: Array) -> Array:
+def moved_with_pose(T: Array, points: Array) -> Array:
     """How points (M, 3) move that are fixed to a pose (4, 4), by its perturbation (M, 3, 6)."""
-    return _carry(T[None], points)[:, 0]
+    return _moved_with(T[None], points)[:, 0]
 
 
 def quadratic(A: Array, P: Array) -> Array:
