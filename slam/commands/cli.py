@@ -374,7 +374,7 @@ def list_command() -> None:
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.commands.warm_up import warm_up
+    from slam.run.warm_up import warm_up
 
     seconds = warm_up()
     if not quiet:
