@@ -221,11 +221,14 @@ def plot_command(
         str,
         typer.Option(metavar="NAME", help="summary, path, map, errors or time.", autocompletion=completion.figures),
     ] = "summary",
+    width: Annotated[
+        float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
+    ] = None,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.commands.plot import plot_runs
 
-    for file in plot_runs(folders, out, figure):
+    for file in plot_runs(folders, out, figure, width):
         print(file)
 
 
