@@ -113,7 +113,7 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
     if _is_column(width):
         heights = [*[0.9 * width] * parts, _errors_height(width), _time_height(runs)]
         figure = _figure(width, sum(heights))
-        *parts_above, left, right = figure.subfigures(len(heights), 1, height_ratios=heights)
+        *parts_above, left, right = np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights))
         first, *others = (part.subplots() for part in parts_above)
     else:
         width = width or 5.0 * parts
