@@ -1,4 +1,4 @@
-"""A run of twenty thousand frames: what must not decay or grow.
+"""A run of thousands of frames: what must not decay or grow.
 
     python experiments/long_run.py [--quick] [--backend ekf smoother] [--world loop corridor] [--frames 20000]
                                    [--set lag=200] [--out DIR]
@@ -286,19 +286,20 @@ def draw(path: Path, runs: dict[str, list[Checkpoint]]) -> None:
 
     panels = (
         ("milliseconds", "CPU time of a frame [ms]", "linear"),
-        ("beyond", "memory beyond start and trajectory [MB]", "linear"),
+        ("beyond", "memory beyond start and path [MB]", "linear"),
         ("least", "least eigenvalue (correlations)", "log"),
-        ("nees", "NEES of the pose (6 expected)", "log"),
+        ("nees", "NEES of the pose (6 expected)", "linear"),
     )
-    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.2))
-    for panel, (what, label, scale) in zip(axes, panels):
+    figure, axes = plt.subplots(2, 2, figsize=(8, 6), sharex=True, layout="constrained")
+    for panel, (what, label, scale) in zip(axes.flat, panels):
         for name, done in runs.items():
             panel.plot([c.frame for c in done], [getattr(c, what) for c in done], ".-", label=name)
-        panel.set(xlabel="frame", ylabel=label, yscale=scale)
+        panel.set(ylabel=label, yscale=scale)
         if scale == "linear":
             panel.set_ylim(bottom=0)
-    axes[0].legend()
-    figure.tight_layout()
+    for panel in axes[1]:
+        panel.set_xlabel("frame")
+    axes[0, 0].legend(fontsize=8)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 

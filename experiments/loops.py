@@ -208,19 +208,20 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
 
     rows = len({backend for _, backend in runs})  # the runs are in order of their paths
     shape = (rows, len(runs) // rows)
-    figure, axes = plt.subplots(*shape, figsize=(4 * shape[1], 4 * shape[0]), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(*shape, figsize=(2.6 * shape[1], 2.9 * shape[0]), squeeze=False, layout="constrained")
     for axis, ((name, backend), run) in zip(axes.T.flat, runs.items()):
         for poses, style, label in (
             (run.truth, "k--", "true"), (run.odometry, "C1-", "without loops"), (run.final.poses, "C0-", "with loops"),
         ):  # fmt: skip
             axis.plot(*poses[:, [0, 2], 3].T, style, lw=1.2, label=label)
         at = [run.atlas.keyframes[loop.second].frame for loop in run.atlas.loops]
-        axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=5, label="loops closed")
+        axis.plot(*run.final.positions[at][:, [0, 2]].T, "o", mfc="none", mec="C2", ms=4, label="loops closed")
         axis.set(
             title=f"{name}, {backend}", aspect="equal", adjustable="datalim", xlabel="right [m]", ylabel="forward [m]"
         )
+        axis.locator_params(nbins=4)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
-    figure.savefig(out / "loops.png", dpi=110)
+    figure.savefig(out / "loops.png", dpi=120)
 
 
 def main() -> None:

@@ -84,7 +84,7 @@ def scored_run(
         results.append(result)
     summary = score.summary()
     figures = {
-        "world": name,
+        "world": name.rstrip("?"),
         "back end": backend,
         **camera_figures(sequence, results),
         **summary["features"],

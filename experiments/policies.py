@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -168,9 +169,9 @@ def draw(found: dict[tuple[str, str], list[dict[str, float]]], path: Path) -> No
         points = axis.plot(np.concatenate(values), np.repeat(places, [len(v) for v in values]), ".", alpha=0.45)
         colour = points[0].get_color()
         axis.plot([np.median(v) for v in values], places, "|", ms=13, mew=2, color=colour, label=f"{backend}, median")
-    axis.set_yticks(range(len(POLICIES)), [policy.name for policy in POLICIES])
+    axis.set_yticks(range(len(POLICIES)), [textwrap.fill(policy.name, 30) for policy in POLICIES])
     axis.invert_yaxis()
-    axis.set_xscale("log")
+    axis.set_xlim(left=0)
     axis.set_xlabel("mean position error of a seed [cm]")
     axis.legend(frameon=False, fontsize=8, ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0))
     figure.savefig(path, dpi=110, metadata={"Software": None})

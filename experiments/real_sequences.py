@@ -9,6 +9,7 @@ median time of a frame. Draws the paths from above with the true one.
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
+from slam.run.figures import widths
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
@@ -65,11 +67,15 @@ def draw(names: dict[str, Path], out: Path) -> None:
     """Paths from above, online, and the true one laid upon the first of them."""
     from matplotlib.figure import Figure
 
-    figure = Figure((4.6 * len(names), 4), layout="constrained")
-    for axis, (name, folder) in zip(figure.subplots(1, len(names), squeeze=False)[0], names.items()):
+    rows = math.ceil(len(names) / 2)
+    figure = Figure((9, 4 * rows), layout="constrained")
+    axes = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axis in axes[len(names) :]:
+        axis.set_axis_off()
+    for axis, (name, folder) in zip(axes, names.items()):
         paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in BACKENDS]
-        for backend, path in zip(BACKENDS, paths):
-            axis.plot(*path.positions[:, [0, 2]].T, lw=1.5, label=backend)
+        for backend, path, width in zip(BACKENDS, paths, widths(len(BACKENDS), 1.5)):
+            axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
         truth = true_path(folder, paths[0])
         if truth is not None:
             axis.plot(*truth[:, [0, 2]].T, "k--", lw=1, label="truth")

@@ -29,6 +29,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments import loops
+from experiments.explanations import caption, explained
 from slam.compare.revision import made_with
 from slam.run.repeat import versions
 
@@ -164,7 +165,9 @@ def copied_pictures(experiment: Experiment, out: Path, page: Path) -> list[str]:
         target = page.parent / "images" / "results" / f"{experiment.name}_{picture.name}"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(picture, target)
-        shown.append(f"![{experiment.title}: {picture.stem}](images/results/{target.name})")
+        said = caption(experiment.name, picture.stem)
+        image = f"![{said or f'{experiment.title}: {picture.stem}'}](images/results/{target.name})"
+        shown.append(f"{image}\n\n*{said}*" if said else image)
     return shown
 
 
@@ -175,7 +178,7 @@ def section(experiment: Experiment, printed: str, failure: str, pictures: Sequen
         lines += [f"**The paper:** {experiment.paper}", ""]
     if failure:
         lines += [f"**Failed:** {failure}", ""]
-    lines += [demoted(printed), ""]
+    lines += [explained(experiment.name, printed), "", demoted(printed), ""]
     for picture in pictures:
         lines += [picture, ""]
     lines += [f"`python {' '.join(experiment.command(quick))}`", ""]
@@ -224,8 +227,10 @@ def head(quick: bool) -> str:
     used = ", ".join(f"{name} {version}" for name, version in versions().items())
     short = " in its short form, which shows that everything runs, and no more" if quick else ""
     return (
-        "# Results\n\nBoth papers' experiments and our own. This page is written by `python experiments/results.py`"
-        f"{short}; nothing in it is typed in. Papers A and B: see [the papers](papers.md). With {used}.\n"
+        "# Results\n\nBoth papers' experiments and our own. Papers A and B: see [the papers](papers.md); errors, "
+        "covariances and NEES: see [concepts](concepts.md). A click on *What the columns say* explains the tables of a "
+        "section, and its last line is the command that makes it.\n\nThis page is written by "
+        f"`python experiments/results.py`{short}; nothing in it is typed in. With {used}.\n"
     )
 
 

@@ -158,7 +158,7 @@ def draw(data: Data, found: list[Part], path: Path) -> None:
     for axis, steps in zip(others, spans):
         for part in (p for p in found if p.span == steps):
             axis.semilogy(range(part.start, part.stop), part.errors, lw=1, label=part.backend)
-        axis.set_ylabel("error [m]")
+        axis.set_ylabel(f"from step {steps.partition('–')[0]}\nerror [m]")
     others[0].legend(frameon=False, fontsize=8)
     others[-1].set_xlabel("step")
     figure.savefig(path, dpi=110, metadata={"Software": None})

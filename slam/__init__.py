@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from slam.mapping.map_io import SavedMap as SavedMap
     from slam.mapping.map_io import load_map as load_map
     from slam.mapping.map_io import save_map as save_map
+    from slam.run.warm_up import warm_up as warm_up
     from slam.sequences import open_sequence as open_sequence
     from slam.sequences.live import LiveFrames as LiveFrames
     from slam.sequences.rigs import load_rig as load_rig
@@ -47,6 +48,7 @@ _PUBLIC = {
     "open_sequence": "slam.sequences",
     "save_calibration": "slam.calibration.kept",
     "save_map": "slam.mapping.map_io",
+    "warm_up": "slam.run.warm_up",
 }
 
 __all__ = sorted(_PUBLIC)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
+import runpy
 import shlex
 import sys
 from dataclasses import fields
@@ -87,6 +88,18 @@ def test_two_streams_of_arrays_are_followed(capsys):
     path = module.follow(lefts, rights, stamps, sequence.rig.left.K, sequence.rig.baseline)
     assert absolute_errors(path, sequence.ground_truth).translation_statistics.rmse < 0.01
     assert capsys.readouterr().out.count("tracked") == 3
+
+
+def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["write_bag.py", "synthetic:desk?frames=3", str(tmp_path / "walk")])
+    runpy.run_path(str(DOCS / "examples" / "write_bag.py"))
+    written, read = slam.open_sequence("synthetic:desk?frames=3"), slam.open_sequence(tmp_path / "walk")
+    assert read.rig.baseline == pytest.approx(written.rig.baseline)
+    np.testing.assert_allclose(read.rig.left.K, written.rig.left.K)
+    for one, other in zip(written, read, strict=True):
+        assert one.stamp == pytest.approx(other.stamp, abs=1e-6)
+        np.testing.assert_array_equal(one.left, other.left)
+        np.testing.assert_array_equal(one.right, other.right)
 
 
 @pytest.mark.slow
@@ -354,6 +367,7 @@ def test_pages_show_the_examples_as_they_are_tested(file):
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.
 FOR_THE_READER = {
     "README.md": {"path/to/kitti_or_euroc_folder": "synthetic:desk?frames=3"},
+    "docs/sequences.md": {"sys.argv[1]": "'synthetic:desk?frames=3'", "sys.argv[2]": "'walk'"},
     "docs/worlds.md": {"box=1": "box=1&width=160&height=120"},
 }
 #: Run by a test of its own.

@@ -101,3 +101,28 @@ def test_the_gallery_in_the_documentation_is_as_the_script_writes_it(results):
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     assert page.startswith(head)
     assert page.endswith(demo + tail)
+
+
+def test_columns_are_explained_in_their_order_and_others_are_not(results):
+    table = "text\n\n| back end | doubled | tracked |\n| --- | ---: | ---: |\n| ekf | 1 | 2 |\n"
+    said = results.explained("aisle", table)
+    assert said.index("**doubled**: pairs") < said.index("**tracked**: frames")
+    assert "back end" not in said
+    assert results.explained("frame_rate", table).count("- **") == 1
+    assert results.explained("aisle", "no table") == ""
+
+
+def test_what_is_explained_is_there(results):
+    """Each column and picture that has an explanation is on the page, where its experiment is."""
+    from experiments.explanations import OF_ONE, PICTURES
+
+    names = {e.name: e for e in results.EXPERIMENTS}
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    sections = {part.split("\n")[0]: part for part in page.split("\n## ")[1:]}
+    assert {*OF_ONE, *PICTURES} <= set(names)
+    for name, experiment in names.items():
+        section = sections.get(experiment.title)
+        for column in OF_ONE.get(name, {}) if section else ():
+            assert f"| {column} |" in section, f"{name}: {column}"
+        for picture in PICTURES.get(name, {}) if section else ():
+            assert f"results/{name}_{picture}.png" in section, f"{name}: {picture}"

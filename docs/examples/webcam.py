@@ -4,6 +4,7 @@ import sys
 
 import slam
 
+slam.warm_up("ekf")  # the first frames do not wait for kernels then
 camera = slam.open_sequence(sys.argv[1])
 live = slam.LiveFrames(camera)  # the newest frame; older ones are dropped
 system = slam.StereoSlam(camera.rig, backend="ekf", kind=camera.kind)

@@ -192,11 +192,14 @@ def plot_command(
         str,
         typer.Option(metavar="NAME", help="summary, path, map, errors or time.", autocompletion=completion.figures),
     ] = "summary",
+    width: Annotated[
+        float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
+    ] = None,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.commands.plot import plot_runs
 
-    for file in plot_runs(folders, out, figure):
+    for file in plot_runs(folders, out, figure, width):
         print(file)
 
 
@@ -345,7 +348,7 @@ def list_command() -> None:
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.commands.warm_up import warm_up
+    from slam.run.warm_up import warm_up
 
     seconds = warm_up()
     if not quiet:

@@ -10,13 +10,14 @@ from slam.errors import ConfigurationError, SlamError
 from slam.run.plots import PICTURE, plot, read_runs
 
 
-def plot_runs(folders: Sequence[Path], out: Path | None, kind: str) -> list[Path]:
+def plot_runs(folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None) -> list[Path]:
     """Draw runs, those of one sequence in one picture; returns the files.
 
     Args:
         folders: of finished runs.
         out: PNG, PDF or SVG; None for a PNG in the first folder of each sequence.
         kind: name of the figure, see `slam.run.plots.KINDS`.
+        width: of the pictures [mm]; None for what suits a screen.
 
     Raises:
         SlamError: a folder is none of a finished run, or a file cannot be written.
@@ -28,7 +29,7 @@ def plot_runs(folders: Sequence[Path], out: Path | None, kind: str) -> list[Path
     files = []
     for runs in groups:
         file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
-        plot(runs, file, kind)
+        plot(runs, file, kind, width)
         files.append(file)
     return files
 

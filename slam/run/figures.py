@@ -36,6 +36,7 @@ class RunData:
         covariances: (N, 3, 3) [m²].
         seen_last: which landmarks were measured in the last frame (N,).
         deviations: of the online position in world axes (F, 3) [m], a row for each pose of `online`.
+        measured: whether each pose of `online` was measured (F,), or is the motion model's alone.
         status: of each frame.
         milliseconds: by stage, of each frame [ms].
         truth: true path, in its own world; None where it is not known.
@@ -54,6 +55,7 @@ class RunData:
     covariances: Array
     seen_last: np.ndarray
     deviations: Array
+    measured: np.ndarray
     status: list[str]
     milliseconds: dict[str, Array]
     truth: Trajectory | None = None
@@ -87,6 +89,7 @@ class RunData:
         upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
         last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
         truth, final = folder / "truth.txt", Trajectory.read_tum(folder / "trajectory_final.txt")
+        located = [row for row in frames if row["sd_x"]]
         config = read_object(folder / "config.json")
         return cls(
             name,
@@ -95,7 +98,8 @@ class RunData:
             _numbers(landmarks, ("x", "y", "z")),
             upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
             last_seen == int(frames[-1]["frame"]),
-            _numbers([row for row in frames if row["sd_x"]], ("sd_x", "sd_y", "sd_z")),  # empty: no pose
+            _numbers(located, ("sd_x", "sd_y", "sd_z")),
+            np.array([row["status"] in ("started", "tracked") for row in located], bool),
             [row["status"] for row in frames],
             {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
             Trajectory.read_tum(truth) if truth.exists() else None,
@@ -176,11 +180,19 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
         )  # fmt: skip
         axis.add_collection(ellipses)
         axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
-    axis.plot(*run.online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6, label="path")
+    draw_path(axis, run, run.online, "path", color=_COLOURS[0], lw=3, alpha=0.6)
     draw_loops(axis, run)
     _draw_truth(axis, run.online, truth, (0, 2))
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
     _limit_to_most(axis, run)
+
+
+def draw_path(axis: Axes, run: RunData, path: Trajectory, label: str, **style: Any) -> None:
+    """A run's path from above in any world; dotted where the camera was not tracked."""
+    points = path.positions[:, [0, 2]]
+    axis.plot(*np.where(run.measured[:, None], points, np.nan).T, label=label, **style)
+    if not run.measured.all():
+        axis.plot(*points.T, label=f"{label}, not tracked", **{**style, "lw": 1, "ls": ":"})
 
 
 def draw_loops(axis: Axes, run: RunData) -> None:
@@ -236,7 +248,7 @@ def position_errors(run: RunData, truth: Trajectory) -> tuple[Array, Array, Arra
     R = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
     expected = (true.positions - true.positions[0]) @ R.T + own.positions[0]
     rows = np.searchsorted(run.online.stamps, own.stamps)
-    return own.stamps - own.stamps[0], own.positions - expected, run.deviations[rows]
+    return own.stamps - run.online.stamps[0], own.positions - expected, run.deviations[rows]
 
 
 def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:
@@ -275,9 +287,12 @@ def well_known(run: RunData) -> np.ndarray:
 
 
 def _limit_to_most(axis: Axes, run: RunData) -> None:
-    """Axis limits that hold the path and the well-known landmarks."""
-    points = np.concatenate([run.online.positions, run.positions[well_known(run)]])[:, [0, 2]]
-    low, high = points.min(axis=0), points.max(axis=0)
+    """Axis limits that hold the path and the well-known landmarks with their ellipses."""
+    known = well_known(run)
+    points = np.concatenate([run.online.positions, run.positions[known]])[:, [0, 2]]
+    reach = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])  # of the ellipses
+    reach = np.concatenate([np.zeros((len(run.online), 2)), reach])
+    low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
     margin = 0.05 * float((high - low).max()) + 0.1
     axis.set_xlim(low[0] - margin, high[0] + margin)
     axis.set_ylim(low[1] - margin, high[1] + margin)

@@ -14,6 +14,12 @@ from slam.tracking.state import ENOUGH_FEATURES
 
 _TRACKED = "tracked"
 
+#: What may be the cause where each step gave enough.
+_ANY = (
+    "features are found in both images, but not again in the next frame: a vehicle's camera without --kind "
+    "driving, frames too far apart, images that are not in order of time, or the calibration of another camera"
+)
+
 
 def outcome(
     record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_map: bool = False, dropped: int = 0
@@ -23,7 +29,7 @@ def outcome(
     Args:
         record: of the run. Its first frame is not counted: there is no map yet.
         rig: the cameras.
-        warnings: what looked wrong with the images and their times; the first is taken for the cause.
+        warnings: what looked wrong with the images and their times; the first is taken for a cause.
         in_map: the run began in the map of an earlier one.
         dropped: frames of a live run that came too late.
     """
@@ -31,7 +37,15 @@ def outcome(
     if frames < 1 or 2 * tracked >= frames:
         return ""
     how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
-    return f"{how} tracked; likely cause: {warnings[0] if warnings else _cause(record, rig, in_map, dropped)}"
+    causes = [warnings[0] if warnings else _cause(record, rig, in_map)]
+    if dropped:
+        few = "a frame was" if dropped == 1 else f"{dropped} frames were"
+        causes.append(
+            f"{few} dropped, so that others are far apart: make a frame cheaper (smaller images, --set "
+            "objects.mode=off), or move more slowly"
+        )
+    known = [cause for cause in causes if cause] or [_ANY]
+    return f"{how} tracked; likely cause: {'; and '.join(known)}"
 
 
 def nothing_tracked(summary: dict[str, Any]) -> bool:
@@ -39,8 +53,8 @@ def nothing_tracked(summary: dict[str, Any]) -> bool:
     return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
 
 
-def _cause(record: RunRecord, rig: StereoRig, in_map: bool, dropped: int) -> str:
-    """The first step that gave too little, and what to look at."""
+def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
+    """The first step that gave too little, and what to look at; empty where none did."""
     features, stereo = np.median(record.features, axis=0)
     if features < ENOUGH_FEATURES:
         return f"the images show hardly anything to follow ({features:.0f} features in the median frame)"
@@ -51,12 +65,4 @@ def _cause(record: RunRecord, rig: StereoRig, in_map: bool, dropped: int) -> str
             f"in the median frame {stereo:.0f} of {features:.0f} features are found in the right image: check that the "
             "images are of two cameras, the left one first, and the calibration"
         )
-    if dropped > len(record.statuses):
-        return (
-            f"{dropped} frames were dropped, so the others are far apart: make a frame cheaper (smaller images, --set "
-            "objects.mode=off), or move more slowly"
-        )
-    return baseline_doubt(rig) or (
-        "features are found in both images, but not again in the next frame: a vehicle's camera without --kind "
-        "driving, frames too far apart, images that are not in order of time, or the calibration of another camera"
-    )
+    return baseline_doubt(rig)

@@ -5,10 +5,11 @@ Drawn without pyplot: there is no state to share, and it is loaded faster.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
-from slam.run.figures import RunData, draw_map, position_errors, well_known, widths
+from slam.run.figures import RunData, draw_map, draw_path, position_errors, well_known, widths
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,11 +32,20 @@ _STAGE_COLOURS = {
     "update": "#c62828", "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32",
 }  # fmt: skip
 _BANDS = ("-", "--", ":", "-.")  # lines around bands: of equal ones both are seen
+_LETTER = 0.55  # mean width of a letter in sizes of the font
 _TRUTH = "0.25"
 _AXES = ("right", "down", "forward")
 _MOST_MAPS = 3  # side by side in the summary
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
-_STYLE: dict[str, Any] = {"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "slam", "pdf.fonttype": 42}
+_COLUMN = 5.0  # [in] below which panels do not stand side by side
+_STYLE: dict[str, Any] = {
+    "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
+    "pdf.fonttype": 42,
+}  # fmt: skip
+_COLUMN_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
+
+#: Widths that a picture may be given [mm].
+NARROWEST, WIDEST = 50.0, 1000.0
 
 #: What a file of a format says of itself: nothing that changes from run to run.
 _METADATA: dict[str, dict[str, Any]] = {
@@ -63,79 +73,107 @@ def read_runs(folders: Sequence[Path]) -> list[list[RunData]]:
     return list(found.values())
 
 
-def plot(runs: Sequence[RunData], path: Path, kind: str = "summary") -> None:
+def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> None:
     """Draw runs of one sequence into a file.
 
     Args:
         runs: of the same sequence.
         path: PNG, PDF or SVG by its suffix; another picture there is overwritten.
         kind: one of `KINDS`.
+        width: of the picture [mm], such as 88 for a column of many journals; None for one that suits a screen.
 
     Raises:
-        SlamError: the format or the kind is not known, or the file cannot be written.
+        SlamError: the format or the kind is not known, the width is out of range, or the file cannot be written.
     """
     if path.suffix.lower() not in _METADATA:
         raise SlamError(f"{path}: a picture is a file .png, .pdf or .svg")
     if kind not in KINDS:
         raise SlamError(unknown("figure", kind, KINDS))
+    if width is not None and not NARROWEST <= width <= WIDEST:
+        raise SlamError(f"the width of a picture is {NARROWEST:g} to {WIDEST:g} mm, got {width:g}")
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    with rc_context(_STYLE):
-        figure = KINDS[kind](runs)
+    inches = None if width is None else width / 25.4
+    with rc_context(_STYLE | (_COLUMN_STYLE if _is_column(inches) else {})):
+        figure = KINDS[kind](runs, inches)
         FigureCanvasAgg(figure)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=110, metadata={"Title": _title(runs), **_METADATA[path.suffix.lower()]})
+            metadata = {"Title": _title(runs), **_METADATA[path.suffix.lower()]}
+            figure.savefig(path, dpi=110 if width is None else 300, metadata=metadata)
         except OSError as error:
             raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
 
 
-def _summary(runs: Sequence[RunData]) -> Figure:
-    """All at a glance: path and maps above, errors and times below."""
+def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
+    """All at a glance: path and maps above, errors and times below; in a column one below the other."""
     maps = runs[:_MOST_MAPS]
-    figure = _figure(5.0 * (1 + len(maps)), 8.2)
-    above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 3.6)))
-    first, *others = above.subplots(1, 1 + len(maps))
+    parts = 1 + len(maps)
+    if _is_column(width):
+        heights = [*[0.9 * width] * parts, _errors_height(width), _time_height(runs)]
+        figure = _figure(width, sum(heights))
+        *parts_above, left, right = np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights))
+        first, *others = (part.subplots() for part in parts_above)
+    else:
+        width = width or 5.0 * parts
+        figure = _figure(width, 8.2 * (width / (5.0 * parts)))
+        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 3.6)))
+        first, *others = above.subplots(1, parts)
+        left, right = np.asarray(below.subfigures(1, 2))
     _path_panel(first, runs)
     for axis, run in zip(others, maps):
         _map_panel(axis, run)
-    left, right = np.asarray(below.subfigures(1, 2))
     _error_panels(left.subplots(3, 1, sharex=True), runs)
     _time_panel(right.subplots(), runs)
-    figure.suptitle(_title(runs))
+    figure.suptitle(_wrapped(_title(runs), figure.get_figwidth()))
     return figure
 
 
-def _path(runs: Sequence[RunData]) -> Figure:
-    figure = _figure(5.0, 4.6)
+def _path(runs: Sequence[RunData], width: float | None) -> Figure:
+    figure = _figure(width or 5.0, 0.92 * (width or 5.0))
     _path_panel(figure.subplots(), runs)
     return figure
 
 
-def _map(runs: Sequence[RunData]) -> Figure:
-    figure = _figure(5.0 * len(runs), 4.8)
-    for axis, run in zip(figure.subplots(1, len(runs), squeeze=False)[0], runs):
+def _map(runs: Sequence[RunData], width: float | None) -> Figure:
+    rows, columns = (len(runs), 1) if _is_column(width) else (1, len(runs))
+    width = width or 5.0 * columns
+    figure = _figure(width, 0.96 * width / columns * rows)
+    for axis, run in zip(figure.subplots(rows, columns, squeeze=False).ravel(), runs):
         _map_panel(axis, run)
     return figure
 
 
-def _errors(runs: Sequence[RunData]) -> Figure:
-    figure = _figure(6.0, 4.8)
+def _errors(runs: Sequence[RunData], width: float | None) -> Figure:
+    figure = _figure(width or 6.0, _errors_height(width) if width else 4.8)
     _error_panels(figure.subplots(3, 1, sharex=True), runs)
     return figure
 
 
-def _time(runs: Sequence[RunData]) -> Figure:
-    figure = _figure(6.0, 1.9 + 0.4 * len(runs))
+def _time(runs: Sequence[RunData], width: float | None) -> Figure:
+    figure = _figure(width or 6.0, _time_height(runs))
     _time_panel(figure.subplots(), runs)
     return figure
 
 
 #: Figures by name.
-KINDS: dict[str, Callable[[Sequence[RunData]], Figure]] = {
+KINDS: dict[str, Callable[[Sequence[RunData], float | None], Figure]] = {
     "summary": _summary, "path": _path, "map": _map, "errors": _errors, "time": _time,
 }  # fmt: skip
+
+
+def _is_column(width: float | None) -> TypeGuard[float]:
+    """Whether a width [in] is that of a column, in which panels stand one below the other."""
+    return width is not None and width < _COLUMN
+
+
+def _errors_height(width: float) -> float:
+    return max(0.8 * width, 3.8)  # below which the labels of the three axes overlap
+
+
+def _time_height(runs: Sequence[RunData]) -> float:
+    return 1.9 + 0.4 * len(runs)
 
 
 def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
@@ -144,12 +182,13 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
     for colour, width, run, path in zip(_repeated(_COLOURS, len(runs)), widths(len(runs), 2.0), runs, paths):
-        axis.plot(*path.positions[:, [0, 2]].T, color=colour, lw=width, alpha=0.75, label=run.name)
+        draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
-    axis.set(title="Path, online, from above (dot: start)", xlabel="right [m]", ylabel="forward [m]")
+    _set_title(axis, "Path, online, from above (dot: start)")
+    axis.set(xlabel="right [m]", ylabel="forward [m]")
     if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in paths])):
         axis.set_aspect("equal", adjustable="datalim")
-    axis.legend(fontsize=8, frameon=False)
+    axis.legend(frameon=False)
     axis.grid(color="0.9", lw=0.5)
 
 
@@ -174,8 +213,8 @@ def _map_panel(axis: Axes, run: RunData) -> None:
     _widen(axis)
     known, every = len(well_known(run)), len(run.positions)
     of = "" if known == every else f" of {known}"
-    axis.set_title(f"Map of {run.name}: {every} landmarks, 2σ ellipses{of}")
-    axis.legend(fontsize=7, frameon=True, framealpha=0.8, edgecolor="none")
+    _set_title(axis, f"Map of {run.name}: {every} landmarks, 2σ ellipses{of}")
+    axis.legend(fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
 
 
 def _widen(axis: Axes, ratio: float = 1.15) -> None:
@@ -187,30 +226,33 @@ def _widen(axis: Axes, ratio: float = 1.15) -> None:
 
 
 def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
-    """Errors of the position with the claimed ±3σ; where no truth is known the band alone."""
+    """Errors of the position with the claimed ±3σ; where no truth is known the claimed σ alone."""
     known = any(run.truth is not None for run in runs)
     series = [_errors_of(run) for run in runs]
     shown = [error if known else sigma for _, error, sigma in series]
     factor, unit = _unit(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
     styles = zip(_repeated(_COLOURS, len(runs)), _repeated(_BANDS, len(runs)), widths(len(runs), 1.1))
     for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
-        for axis, e, s in zip(axes, factor * error.T, 3 * factor * sigma.T):
-            axis.fill_between(time, -s, s, color=colour, alpha=0.12, lw=0)
-            label = None if known else run.name
-            axis.plot(time, s, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes, label=label)
-            axis.plot(time, -s, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes)
-            if run.truth is not None:
-                axis.plot(time, e, color=colour, lw=width, label=run.name)
+        untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
+        for axis, e, s in zip(axes, factor * error.T, factor * sigma.T):
+            if known:
+                axis.fill_between(time, -3 * s, 3 * s, color=colour, alpha=0.12, lw=0)
+                for side in (-3, 3):
+                    axis.plot(time, side * s, color=colour, alpha=0.6, lw=0.6 * width, ls=dashes)
+            if run.truth is not None or not known:
+                axis.plot(time, e if known else s, color=colour, lw=width, label=run.name)
+            if len(untracked):
+                label = f"{run.name}, not tracked"
+                axis.plot(untracked, np.zeros(len(untracked)), "x", ms=4, color=colour, label=label)
     for axis, name in zip(axes, _AXES):
         axis.set_ylabel(f"{name} [{unit}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
-    title = "Error of the online position" if known else "Online position, no truth is known"
     turned = ", truth turned to fit" if any(run.truth is not None and not run.truth_is_exact for run in runs) else ""
-    axes[0].set_title(f"{title}{turned}; band: ±3σ as claimed")
+    errors = f"Error of the online position{turned}; band: ±3σ as claimed"
+    _set_title(axes[0], errors if known else "No true path is known, so no errors: claimed σ of the online position")
     axes[-1].set_xlabel("time [s]")
-    if known or len(runs) > 1:
-        axes[0].legend(fontsize=8, framealpha=0.8, edgecolor="none", ncols=4)
+    axes[0].legend(framealpha=0.8, edgecolor="none", ncols=4)
 
 
 def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
@@ -223,12 +265,13 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
         axis.barh(rows, width, left=left, height=0.6, color=_STAGE_COLOURS.get(stage, "0.5"), label=stage)
         left += width
     for row, total in zip(rows, left):
-        axis.text(total, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize=8)
+        axis.text(total, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
     axis.set_yticks(rows, [run.name for run in runs])
     axis.set(xlim=(0, 1.25 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
-    axis.set(ylim=(-margin, len(runs) - 1 + margin), title="Median time of each stage")
-    axis.figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    axis.set(ylim=(-margin, len(runs) - 1 + margin))
+    _set_title(axis, "Median time of each stage")
+    axis.figure.legend(loc="outside lower center", ncols=int(min(5, _width(axis) / 1.1)), frameon=False)
 
 
 def _errors_of(run: RunData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -267,6 +310,24 @@ def _title(runs: Sequence[RunData]) -> str:
     frames = ", ".join(dict.fromkeys(f"{len(run.status)} frames" for run in runs))
     frames += "".join(f"; {name}: {count} not tracked" for name, count in lost.items() if count)
     return f"{runs[0].sequence}: {frames}"
+
+
+def _set_title(axis: Axes, text: str) -> None:
+    """A title in as many lines as it takes."""
+    axis.set_title(_wrapped(text, _width(axis)))
+
+
+def _width(axis: Axes) -> float:
+    """Width of a panel with what stands beside it [in]."""
+    figure, grid = axis.figure, axis.get_gridspec()
+    return float(figure.bbox.width / figure.dpi) / (1 if grid is None else grid.ncols)
+
+
+def _wrapped(text: str, width: float) -> str:
+    """A text in lines of titles so wide [in]."""
+    from matplotlib import rcParams
+
+    return textwrap.fill(text, int(72 * width / (_LETTER * rcParams["axes.titlesize"])))
 
 
 def _repeated(styles: Sequence[str], count: int) -> list[str]:

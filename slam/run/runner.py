@@ -30,6 +30,7 @@ from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
+from slam.run.warm_up import BACKENDS, warm_up
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
@@ -126,6 +127,8 @@ def run(
         prior_map=known,
         rig_prior=rig_prior,
     )
+    if live is not None:  # its clock starts with its first frame, which does not wait for kernels then
+        warm_up(options.backend if options.backend in BACKENDS else BACKENDS[0], until=until)
     record = RunRecord()
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
     return _drive(sequence, options, system, results, record, on_frame, live)

@@ -27,6 +27,7 @@ WAIT = 10.0
 
 _AGAIN = 0.25  # [s] between two attempts to open a camera again
 _LONGEST_WAIT = 86400.0
+_OLD = 1.0  # [s] after which a camera that nobody read is opened again: its images have waited in a queue
 _WIDEST = 100_000
 
 Pair = tuple[float, np.ndarray, np.ndarray]
@@ -100,7 +101,7 @@ class CameraSequence:
         return self._frames(start, stop)
 
     def _frames(self, start: int, stop: int | None) -> Iterator[StereoFrame]:
-        cameras, self._cameras = self._cameras or self._open(), None
+        cameras = self._fresh()
         index, last = 0, -math.inf
         with ExitStack() as stack, FaultLog(self.warnings) as faults:
             stack.callback(lambda: cameras.release())  # whichever they are in the end
@@ -117,6 +118,14 @@ class CameraSequence:
                     if index >= start:
                         yield StereoFrame(index, *pair)
                     index += 1
+
+    def _fresh(self) -> _Cameras:
+        """The open cameras, whose next images are of now."""
+        cameras, self._cameras = self._cameras, None
+        if cameras is not None and time.monotonic() - cameras.last_read > _OLD:
+            cameras.release()
+            cameras = None
+        return cameras or self._open()
 
     def _require_size(self, image: np.ndarray) -> None:
         """Raise where a camera has changed the size of its images, as one may that was opened again."""
@@ -195,6 +204,7 @@ class _Cameras:
             "camera:" + ",".join(map(devices.without_password, addresses)),
         )
         self.have_an_end = any(devices.plays_a_file(a) for a in addresses)
+        self.last_read = time.monotonic()
         self._devices: list[devices.Device] = []
         try:
             for address in addresses:
@@ -213,7 +223,8 @@ class _Cameras:
         """
         if not all([device.grab() for device in self._devices]):
             return None
-        stamp = self._origin + time.monotonic()
+        self.last_read = time.monotonic()
+        stamp = self._origin + self.last_read
         images = [image for device in self._devices if (image := devices.read_image(device)) is not None]
         if len(images) < len(self._devices):
             return None

@@ -79,11 +79,11 @@ class InputWarnings:
         if not SHORTEST <= interval <= LONGEST:
             guess = next((unit for unit, size in _UNITS if interval * size <= LONGEST), _UNITS[-1][0])
             what = f" (are they in {guess}?)" if interval > LONGEST else ""
-            self._warn(f"frames are {interval:.3g} s apart by their stamps{what}: give stamps in seconds")
+            self._warn(f"stamps are {interval:.3g} s apart{what}: give them in seconds")
         elif interval > self._farthest:
             self._warn(
-                f"frames are {interval:.3g} s apart: a camera can turn out of view from one to the next; "
-                f"take more frames per second, at least {1 / self._farthest:.2g}"
+                f"frames are {interval:.3g} s apart: in that time a camera can turn so far that it sees nothing of "
+                f"the frame before; use {1 / self._farthest:.2g} frames per second or more"
             )
 
     def _check_texture(self, features: int) -> None:

@@ -13,7 +13,7 @@ from slam.commands.plot import leave_picture, plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import RunData, position_errors, well_known
+from slam.run.figures import RunData, draw_map, position_errors, well_known
 from slam.run.plots import KINDS, _in_one_world, _stretch, read_runs
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -44,6 +44,13 @@ def test_figures_of_two_runs(runs, tmp_path, kind):
     picture = read_picture(file)
     assert min(picture.shape[:2]) > 200
     assert np.ptp(picture, axis=2).max() > 60  # there is colour in it
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("width", [88, 180])
+def test_a_figure_is_as_wide_as_asked(runs, tmp_path, kind, width):
+    (file,) = plot_runs([runs / "a", runs / "b"], tmp_path / "a.png", kind, width)
+    assert abs(read_picture(file).shape[1] - width / 25.4 * 300) <= 1
 
 
 @pytest.mark.parametrize(("suffix", "start"), [("pdf", b"%PDF"), ("svg", b"<?xml"), ("png", b"\x89PNG")])
@@ -94,6 +101,37 @@ def test_a_run_without_truth_or_objects_is_drawn(runs, tmp_path, kind):
     (tmp_path / "a" / "truth.txt").unlink()
     plot_runs([tmp_path / "a"], tmp_path / "a.png", kind)
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_frames_that_were_not_tracked_are_told_from_others(runs, tmp_path):
+    from matplotlib.figure import Figure
+
+    shutil.copytree(runs / "a", tmp_path / "a")
+    frames = tmp_path / "a" / "frames.csv"
+    head, first, *others = frames.read_text().splitlines()
+    lost = [line.replace("tracked", "predicted") if k < 3 else line for k, line in enumerate(others)]
+    frames.write_text("\n".join([head, first, *lost]) + "\n")
+    data = RunData.read(tmp_path / "a", "a")
+    assert data.measured.tolist() == [True, False, False, False, True, True, True, True]
+    axis = Figure().subplots()
+    draw_map(axis, data, None)
+    solid, dotted = (line.get_xdata() for line in axis.lines if str(line.get_label()).startswith("path"))
+    assert np.isnan(solid).tolist() == (~data.measured).tolist()
+    np.testing.assert_array_equal(dotted, data.online.positions[:, 0])
+    plot_runs([tmp_path / "a", runs / "b"], tmp_path / "a.png", "summary")
+
+
+def test_ellipses_are_inside_of_the_map(runs):
+    from matplotlib.figure import Figure
+
+    data = RunData.read(runs / "a", "a")
+    known = well_known(data)
+    right = known[np.argmax(data.positions[known, 0])]
+    data.covariances[right] = np.diag([0.19**2, 1e-6, 1e-6])
+    assert right in well_known(data)
+    axis = Figure().subplots()
+    draw_map(axis, data, None)
+    assert axis.get_xlim()[1] > data.positions[right, 0] + 2 * np.sqrt(data.covariances[right, 0, 0])
 
 
 def test_a_pdf_is_named_after_its_sequence(runs, tmp_path):
@@ -147,6 +185,8 @@ def test_bad_input_is_one_line(runs, tmp_path):
         plot_runs([tmp_path], None, "summary")
     with pytest.raises(SlamError, match=r"a picture is a file \.png, \.pdf or \.svg"):
         plot_runs([runs / "a"], tmp_path / "a.jpg", "summary")
+    with pytest.raises(SlamError, match=r"is 50 to 1000 mm, got 8\.8"):
+        plot_runs([runs / "a"], tmp_path / "a.png", "path", 8.8)
     with pytest.raises(SlamError, match=r"unknown figure 'eror'.*did you mean 'errors'"):
         plot_runs([runs / "a"], tmp_path / "a.png", "eror")
     (tmp_path / "file").write_text("")

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,6 +26,7 @@ from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recorded import RecordedFrame
 from slam.run.recording import load_recording
 from slam.run.runner import RunOptions, parse_frames, run
+from slam.run.warm_up import warm_up
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
@@ -93,6 +95,30 @@ def test_the_same_run_twice_gives_the_same_bytes(tmp_path, backend):
         run(open_sequence(WORLD), options(tmp_path / name, backend))
     for file in ("trajectory.txt", "trajectory_final.txt", "landmarks.csv"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_kernels_are_loaded_before_a_live_run_takes_its_first_frame(tmp_path, monkeypatch):
+    happened = []
+
+    class Recorded(Broken):
+        def frames(self, start=0, stop=None):
+            for frame in open_sequence(WORLD).frames(0, 3):
+                happened.append(frame.index)
+                yield frame
+
+    monkeypatch.setattr("slam.run.runner.warm_up", lambda backend, until: happened.append(backend))
+    run(Recorded(3), options(tmp_path / "recorded"))
+    assert happened == [0, 1, 2]
+    run(Recorded(3), options(tmp_path / "live", live=True))
+    assert happened[3:] == ["ekf", 0, 1, 2]
+
+
+def test_loading_kernels_ends_when_it_is_told_to(monkeypatch):
+    until, done = threading.Event(), []
+    until.set()
+    monkeypatch.setattr("slam.run.warm_up._frames", lambda backend: (done.append(backend) for _ in range(5)))
+    assert warm_up("ekf", "smoother", until=until) == 0.0
+    assert done == ["ekf", "smoother"]
 
 
 def test_frames_are_chosen(tmp_path):

@@ -54,7 +54,7 @@ def test_a_kernel_that_is_compiled_is_noticed_once(caplog, monkeypatch):
 
 @pytest.mark.slow
 def test_after_warming_up_nothing_is_left_to_compile():
-    from slam.commands.warm_up import warm_up
+    from slam.run.warm_up import warm_up
 
     warm_up()
     assert warm_up() == 0.0

@@ -121,6 +121,15 @@ def test_swapped_halves_and_a_part_of_the_frames(rig_here, played):
     assert [(f.index, int(f.left[0, 0]), int(f.right[0, 0])) for f in frames] == [(2, 35, 30), (3, 45, 40), (4, 55, 50)]
 
 
+def test_a_camera_that_nobody_read_for_a_while_is_opened_again(rig_here, played, monkeypatch):
+    for old, opened in ((60.0, 1), (-1.0, 2)):
+        monkeypatch.setattr(camera, "_OLD", old)
+        played({"0": [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(9)]})
+        Played.opened = 0
+        assert len(list(slam.open_sequence("camera:0").frames(0, 3))) == 3
+        assert Played.opened == opened
+
+
 def test_a_video_file_plays_a_device_at_its_own_rate(rig_here, scene, tmp_path):
     write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 20.0)
     sequence = slam.open_sequence("camera:both.avi")

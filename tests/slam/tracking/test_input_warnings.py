@@ -139,11 +139,11 @@ def test_colour_and_sixteen_bits():
 @pytest.mark.parametrize(
     ("interval", "words"),
     [
-        (50.0, "50 s apart by their stamps (are they in milliseconds?): give stamps in seconds"),
+        (50.0, "stamps are 50 s apart (are they in milliseconds?): give them in seconds"),
         (33_333.0, "are they in microseconds?"),
         (5e7, "are they in nanoseconds?"),
-        (5e-11, "5e-11 s apart by their stamps: give stamps in seconds"),
-        (2.0, "frames are 2 s apart: a camera can turn out of view"),
+        (5e-11, "stamps are 5e-11 s apart: give them in seconds"),
+        (2.0, "frames are 2 s apart: in that time a camera can turn so far"),
     ],
 )
 def test_stamps_in_another_unit_and_frames_far_apart(interval, words):
