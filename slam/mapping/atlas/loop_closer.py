@@ -339,13 +339,13 @@ class LoopCloser:
 
 
 def says_more(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
-    """Whether a loop tells more of where the camera is than the path since the last one does.
+    """Whether a loop tells more of where the camera is, in any direction, than the path since the last one does.
 
     The path's common errors are as uncertain as the loops so far have left them: in a place that is seen again and
     again they are soon known, and most loops tell nothing new.
     """
     _, P = graph.relative_pose(last.second, loop.second)
-    return bool(np.trace(P[3:, 3:]) > np.trace(loop.covariance[3:, 3:]))
+    return bool(np.linalg.eigvals(np.linalg.solve(loop.covariance, P)).real.max() > 1.0)
 
 
 def _inliers(one: tuple[Loop, Verified]) -> int:
