@@ -1,6 +1,6 @@
 """The whole system for hours: memory, open files and time, and a camera that stops giving frames and comes back.
 
-    python experiments/endurance.py [--quick] [--backend ekf smoother] [--frames 20000] [--images 3000] [--out DIR]
+    python experiments/endurance.py [--quick] [--backend ekf smoother] [--frames 20000] [--images 20000] [--out DIR]
                                     [--page docs/robustness.md]
 
 Two runs of each back end:
@@ -9,13 +9,14 @@ Two runs of each back end:
 - ``images``: rendered images of a desk, forwards and backwards again and again, through SURF.
 
 After a quarter of the frames the camera gives none for an hour, and after half of them nothing is to be seen in fifty.
-A row for every twentieth part: CPU time of a frame, memory of the process and its open files, landmarks, and frames
-that were not tracked. ``--page`` puts the table of all runs in DIR, also earlier ones, on a page.
+A row for every twentieth part: CPU time of a frame, memory of the process and its open files, landmarks, keyframes and
+loops, and frames that were not tracked. ``--page`` puts the table of all runs in DIR, also earlier ones, on a page.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 import sys
 import time
 from collections.abc import Iterator
@@ -39,9 +40,8 @@ _HOUR = 3600.0
 _DARK = 50  # frames in which nothing is to be seen
 _RENDERED = 90  # images of the desk, forwards and backwards
 _PARTS = 20
-_KINDS = {"frame": int, "milliseconds": float, "memory": float, "files": int, "landmarks": int, "untracked": int}
 BEGIN, END = "<!-- endurance: written by experiments/endurance.py --page -->", "<!-- end of endurance -->"
-_WORLD = f"synthetic:desk?frames={_RENDERED}&width=240&height=180"
+_WORLD = f"synthetic:desk?frames={_RENDERED}&width=320&height=240"
 
 
 @dataclass(frozen=True)
@@ -50,18 +50,23 @@ class Part:
 
     Attributes:
         frame: number of frames so far.
-        milliseconds: mean CPU time of a step, extraction included [ms].
+        median, mean: CPU time of a step, extraction included [ms].
         memory: of the process [MB].
         files: that are open.
         landmarks: in the map.
+        keyframes: in the atlas.
+        loops: closed so far.
         untracked: frames in this part that were not tracked, but for those in which nothing was to be seen.
     """
 
     frame: int
-    milliseconds: float
+    median: float
+    mean: float
     memory: float
     files: int
     landmarks: int
+    keyframes: int
+    loops: int
     untracked: int
 
 
@@ -97,19 +102,23 @@ def run(backend: str, kind: str, frames: int) -> Iterator[Part]:
     rig = RIG if kind == "observations" else slam.open_sequence(_WORLD).rig
     config = SystemConfig(models=MODELS) if kind == "observations" else None
     system = StereoSlam(rig, None if kind == "observations" else "surf", backend, config=config)
-    every, untracked, spent = max(frames // _PARTS, 1), 0, 0.0
+    every, untracked, spent = max(frames // _PARTS, 1), 0, []
     source: Iterator[Any] = features() if kind == "observations" else images()
     for k, given in zip(range(frames), source):
         dark = frames // 2 <= k < frames // 2 + min(_DARK, frames // 10)
         item = replace(given, stamp=given.stamp + (_HOUR if k >= frames // 4 else 0.0))
         start = time.process_time()
         result = _step(system, _darkened(item) if dark else item)
-        spent += time.process_time() - start
+        spent.append(1e3 * (time.process_time() - start))
         untracked += not dark and result.status is not FrameStatus.TRACKED
         if (k + 1) % every == 0:
             files = len(list(Path("/proc/self/fd").iterdir()))
-            yield Part(k + 1, 1e3 * spent / every, memory(), files, result.map_size, untracked)
-            untracked, spent = 0, 0.0
+            median, mean = float(np.median(spent)), float(np.mean(spent))
+            atlas, size = system.atlas.summary(), result.map_size
+            yield Part(
+                k + 1, median, mean, memory(), files, size, atlas["keyframes"], atlas["closed"], untracked
+            )  # fmt: skip
+            untracked, spent = 0, []
 
 
 def _step(system: StereoSlam, item: StereoFrame | StereoFeatures) -> FrameResult:
@@ -125,12 +134,18 @@ def _darkened(item: StereoFrame | StereoFeatures) -> StereoFrame | StereoFeature
 
 def table(runs: dict[str, list[Part]]) -> str:
     """Some parts of every run."""
-    header = ("run", "frames", "ms a frame", "memory [MB]", "open files", "landmarks", "not tracked, so far")
+    header = (
+        "run", "frames", "median [CPU ms]", "mean [CPU ms]", "memory [MB]", "open files", "landmarks", "keyframes",
+        "loops", "not tracked, so far",
+    )  # fmt: skip
     rows = []
     for name, parts in runs.items():
         for i in sorted({0, 1, len(parts) // 2, len(parts) - 1}):
             p, lost = parts[i], sum(q.untracked for q in parts[: i + 1])
-            rows.append((name, p.frame, f"{p.milliseconds:.1f}", f"{p.memory:.0f}", p.files, p.landmarks, lost))
+            rows.append((
+                name, p.frame, f"{p.median:.1f}", f"{p.mean:.1f}", f"{p.memory:.0f}", p.files, p.landmarks, p.keyframes,
+                p.loops, lost,
+            ))  # fmt: skip
     return markdown(header, rows)
 
 
@@ -143,7 +158,7 @@ def write_page(page: Path, text: str) -> None:
 def read_csv(path: Path) -> list[Part]:
     """What `write_csv` wrote."""
     with path.open(newline="") as file:
-        return [Part(*(kind(row[name]) for name, kind in _KINDS.items())) for row in csv.DictReader(file)]
+        return [Part(**{name: json.loads(value) for name, value in row.items()}) for row in csv.DictReader(file)]
 
 
 def write_csv(path: Path, parts: list[Part]) -> None:
@@ -158,7 +173,7 @@ def main() -> int:
     parser = script_options(__file__, __doc__, "two hundred frames of each")
     parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"])
     parser.add_argument("--frames", type=int, default=20_000, help="of observations; 0 for none")
-    parser.add_argument("--images", type=int, default=3_000, help="frames of images; 0 for none")
+    parser.add_argument("--images", type=int, default=20_000, help="frames of images; 0 for none")
     parser.add_argument("--page", type=Path, help="a page for the table")
     arguments = parser.parse_args()
     counts = {"observations": arguments.frames, "images": arguments.images}

@@ -17,7 +17,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from slam.errors import ConfigurationError, SlamError, UnknownNameError, cause
+from slam.errors import ConfigurationError, SlamError, UnknownNameError, cause, text_of
 from slam.naming import unknown
 
 #: What this distribution brings, so that a plain checkout works without being installed.
@@ -65,7 +65,7 @@ def resolve(role: str, name: str) -> Any:
     try:
         return getattr(import_module(module), attribute)
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
-        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {error}") from error
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {cause(error)}") from error
 

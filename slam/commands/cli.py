@@ -60,6 +60,7 @@ def main() -> None:
     """Entry point; errors end as `slam.commands.ending` says."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
+    os.environ["MPLBACKEND"] = "agg"  # pictures are files here, whatever windows are to be drawn with elsewhere
     catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from slam.errors import SlamError, one_line
+from slam.errors import SlamError, one_line, text_of
 
 logger = logging.getLogger("slam.run")
 
@@ -28,7 +28,7 @@ class LastFiles:
     @property
     def lines(self) -> list[str]:
         """What failed, a line each."""
-        return [one_line(f"{error}") or type(error).__name__ for error in self.failures]
+        return [one_line(text_of(error)) or type(error).__name__ for error in self.failures]
 
     def report(self, stopped_by: BaseException | None) -> None:
         """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.

@@ -13,7 +13,7 @@ from slam import registry
 from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFrame
-from slam.errors import SlamError, one_line
+from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.summary import true_path
 from slam.files import require_target
 from slam.geometry.trajectory import Trajectory
@@ -187,7 +187,7 @@ def _drive(
                 if on_frame is not None:
                     on_frame(result)
         except BaseException as error:
-            ended, stopped_by = f"stopped: {one_line(str(error)) or type(error).__name__}", error
+            ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
             raise
         finally:
             if live is not None and live.ended_early and stopped_by is None:

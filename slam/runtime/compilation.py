@@ -14,10 +14,14 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit
-from numba.core import event
-
+from slam.errors import ConfigurationError
 from slam.runtime.compile_clock import compile_clock
+
+try:
+    from numba import njit
+    from numba.core import event
+except ValueError as error:  # it reads its environment variables
+    raise ConfigurationError(f"numba cannot be loaded; one of its variables NUMBA_… is wrong: {error}") from error
 
 _LOG = logging.getLogger(__name__)
 _ROOMS = ("slam.", "frontends.", "backends.")

@@ -93,9 +93,19 @@ class LiveFrames:
             return frame
 
     def _read(self) -> None:
-        """Put every frame where it is taken from when it is due; in a thread of its own."""
+        """Put every frame where it is taken from; in a thread of its own."""
+        try:
+            self._give(iter(self._frames))
+        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
+            self._error = error
+        finally:
+            with self._changed:
+                self._over = True
+                self._changed.notify_all()
+
+    def _give(self, frames: Iterator[StereoFrame]) -> None:
+        """Put every frame where it is taken from when it is due, until the last one or the end."""
         origin = None
-        frames = iter(self._frames)
         try:
             for frame in frames:
                 if self._paced:
@@ -107,15 +117,10 @@ class LiveFrames:
                 if self._closed or self._until.is_set():
                     break
                 self._put(frame)
-        except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
-            self._error = error
         finally:
             close = getattr(frames, "close", None)
             if close is not None:
                 close()  # a camera is released in the thread that reads it
-            with self._changed:
-                self._over = True
-                self._changed.notify_all()
 
     def _wait_until(self, due: float) -> None:
         """Wait for a time of the clock, or for the end."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import SequenceError, SlamError, one_line
+from slam.errors import SequenceError, SlamError, one_line, text_of
 from slam.sequences.images import MOST_PIXELS, Size, decode_image, size_text
 
 #: Types of messages that hold an image.
@@ -49,7 +49,7 @@ def naming_recording(path: Path) -> Iterator[None]:
     except SlamError:
         raise
     except Exception as error:  # of rosbags, of the decoders that it uses, or of messages that are not what they say
-        text = one_line(str(error), 200) or type(error).__name__
+        text = one_line(text_of(error), 200) or type(error).__name__
         raise SequenceError(f"{path}: cannot be read as a ROS recording: {text}") from error
 
 

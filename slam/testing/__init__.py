@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, text_of
 from slam.naming import unknown
 from slam.testing import estimation, protocol, running
 from slam.testing.scene import GENERAL_RIG, MODELS, RIG, SIGMA, Factory
@@ -152,8 +152,9 @@ def _failure(check: Check, factory: Factory) -> str:
     """How a check fails, in a sentence; empty where it passes."""
     try:
         check(factory)
-    except AssertionError as error:
-        return str(error)
-    except Exception as error:  # noqa: BLE001 - the back end is somebody else's: whatever it raises is a finding
-        return f"raised {type(error).__name__}: {' '.join(str(error).split()) or 'without a message'}"
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - somebody else's: what it raises is a finding
+        said = " ".join(text_of(error).split())
+        if said and isinstance(error, AssertionError):
+            return said
+        return f"raised {type(error).__name__}: {said or 'without a message'}"
     return ""

@@ -113,6 +113,19 @@ def test_a_missing_method_and_a_defect_are_named():
     assert said[0] == "raised AttributeError: 'Buggy' object has no attribute 'nothing_of_this_name'"
 
 
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("nothing to say")
+
+
+@pytest.mark.parametrize("error", [AssertionError(), AssertionError("\n"), SystemExit(), MuteError()])
+def test_an_exception_that_says_nothing_fails_a_check(error):
+    def failing(*args, **options):
+        raise error
+
+    assert next(findings(failing)).failure == f"raised {type(error).__name__}: without a message"
+
+
 def test_a_status_that_is_a_word_is_told_from_the_right_one():
     class Wordy(FixedMapBackend):
         def update(self, observations, guess=None):

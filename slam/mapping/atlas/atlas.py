@@ -64,6 +64,7 @@ class Atlas:
         keyframes: in order of time.
         index: which of them look alike.
         loops: those that the pose graph holds.
+        dropped: number of loops of this run that it holds no more.
         refused: loops that contradict the path, as the numbers of both keyframes.
         corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
         anchor: how well the last of these is known; None without a loop.
@@ -77,6 +78,7 @@ class Atlas:
     keyframes: tuple[Keyframe, ...] = ()
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
+    dropped: int = 0
     refused: tuple[tuple[int, int], ...] = ()
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     anchor: Anchor | None = None
@@ -116,7 +118,17 @@ class Atlas:
         """
         closed = sum(loop.second >= self.known for loop in self.loops)
         known = {"known": self.known} if self.known else {}
-        return {"keyframes": len(self), **known, "closed": closed, "refused": len(self.refused)}
+        return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
+
+    def with_loop(self, loop: Loop, most: int) -> Atlas:
+        """With one loop more; of more than `most`, the one is dropped whose neighbours on the path are nearest."""
+        loops = (*self.loops, loop)
+        if len(loops) <= most:
+            return replace(self, loops=loops)
+        at = np.array([self.keyframes[k.second].travelled for k in loops])
+        least = 1 + int(np.argmin(at[2:] - at[:-2]))
+        dropped = self.dropped + (loops[least].second >= self.known)
+        return replace(self, loops=loops[:least] + loops[least + 1 :], dropped=dropped)
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
 
-_RANGES = {"features": (1, 100_000), "candidates": (0, 10_000), "inliers": (3, 100_000), "agreeing": (1, 2)}
+_RANGES = {
+    "features": (1, 100_000),
+    "candidates": (0, 10_000),
+    "inliers": (3, 100_000),
+    "agreeing": (1, 2),
+    "most_loops": (2, 100_000),
+}
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,8 @@ class AtlasConfig:
             the image's width.
         agreeing: keyframes that must see the same return, at once or within three, before it is believed: 1 or 2.
         gate_sigmas: a return is refused where it contradicts the path by more than this many standard deviations.
+        most_loops: loops that the pose graph holds at most, as each makes the next one dearer; of more, those stay that
+            are spread evenly along the path.
         give_back: landmarks of a place seen again return to the back end, where it can place landmarks.
         on_disk: features of keyframes are kept in a temporary file; some 6 kB of a keyframe stay in memory.
     """
@@ -45,6 +53,7 @@ class AtlasConfig:
     spread: float = 0.1
     agreeing: int = 2
     gate_sigmas: float = 5.0
+    most_loops: int = 200
     give_back: bool = True
     on_disk: bool = False
 

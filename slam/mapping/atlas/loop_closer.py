@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,9 @@ from slam.rig_error import CommonError, Correction
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import LandmarkMatches, Localizer
+
+if TYPE_CHECKING:
+    from slam.mapping.atlas.pose_graph import PoseGraph
 
 _NEARBY = 4  # keyframes that are compared as the path is near them, besides those that look alike
 _CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
@@ -293,15 +297,14 @@ class LoopCloser:
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas, None
         atlas = replace(atlas, confirmed=True)
-        if atlas.loops and not self._says_more(chain, atlas.loops[-1], loop):
+        if atlas.loops and not says_more(graph, atlas.loops[-1], loop):
             return atlas, None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
             return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second)), pending=None), None
         solution = graph.solution()
         atlas = replace(
-            atlas,
-            loops=(*atlas.loops, loop),
+            atlas.with_loop(loop, self._config.most_loops),
             corrected=solution.poses,
             anchor=Anchor(solution.covariance, solution.common, rig),
             T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
@@ -319,11 +322,6 @@ class LoopCloser:
         P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
         return _distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
 
-    def _says_more(self, chain: Chain, last: Loop, loop: Loop) -> bool:
-        """Whether a loop tells more of where the camera is than the path since the last one does."""
-        _, P = chain.motion(last.second, loop.second)
-        return bool(np.trace(P[3:, 3:]) > np.trace(loop.covariance[3:, 3:]))
-
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's features that agree, in the coordinates of the present left camera."""
         keyframe, m, X, back = (
@@ -339,6 +337,16 @@ class LoopCloser:
         P = X[:3, :3] @ (P + J @ seen.covariance @ np.swapaxes(J, 1, 2)) @ X[:3, :3].T
         symmetric = 0.5 * (P + np.swapaxes(P, 1, 2))
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
+
+
+def says_more(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
+    """Whether a loop tells more of where the camera is, in any direction, than the path since the last one does.
+
+    The path's common errors are as uncertain as the loops so far have left them: in a place that is seen again and
+    again they are soon known, and most loops tell nothing new.
+    """
+    _, P = graph.relative_pose(last.second, loop.second)
+    return bool(np.linalg.eigvals(np.linalg.solve(loop.covariance, P)).real.max() > 1.0)
 
 
 def _inliers(one: tuple[Loop, Verified]) -> int:

@@ -207,14 +207,15 @@ class _Problem:
     def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
         """Poses (M, 4, 4) and common errors (m,) of least χ², and normal equations near there.
 
-        Steps use the normal equations of earlier ones while they converge fast: the gradient alone is made anew.
+        Steps use the normal equations of earlier ones while they converge fast: the gradient alone is made anew. They
+        are made anew, too, where such a step gains nothing.
         """
         cost, gain = self.cost(poses, common), np.inf
         normal, fresh = self.normal(poses, common), True
         for _ in range(_ROUNDS):
             step, change = normal.step(*self.gradient(poses, common))
             before, less = gain, np.inf
-            for half in 0.5 ** np.arange(_HALVINGS):
+            for half in 0.5 ** np.arange(_HALVINGS if fresh else 1):
                 moved = np.concatenate([poses[:1], poses[1:] @ exp(half * step)])
                 less = self.cost(moved, common + half * change)
                 if less <= cost:

@@ -79,7 +79,10 @@ def verify(
     if np.sqrt(across) < config.spread * rig.width:
         return None
     measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
-    T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
+    try:
+        T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
+    except np.linalg.LinAlgError:  # points that no pose depends on, such as those of a map that lies
+        return None
     slide = _SLIDE / rig.left.fu
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
     return Verified(keyframe, T, covariance, noise, Matches(ids.astype(np.intp), seen))
@@ -98,6 +101,9 @@ def refined_pose(
         measured: (uL, vL, uR) (M, 3) [px] in the present frame; uR NaN where there is no right pixel.
         T_world_left: first guess of the present camera in the earlier one's coordinates (4, 4).
         pixel_sigma: noise of uL, vL, uR [px].
+
+    Raises:
+        LinAlgError: the pose cannot be told from these points.
     """
     P = rig.triangulation_covariance(points, pixel_sigma)
     T, normal = T_world_left, np.eye(6)

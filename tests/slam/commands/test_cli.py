@@ -161,3 +161,12 @@ def test_list_names_everything():
     assert done.returncode == 0, done.stderr
     for word in ("ekf", "smoother", "surf", "synthetic:aisle", "euroc", "kitti"):
         assert word in done.stdout
+
+
+@pytest.mark.slow
+def test_wrong_variables_of_libraries_end_in_one_line_or_do_no_harm(tmp_path):
+    run = ["run", "synthetic:desk?frames=3&width=160&height=120", "--out", tmp_path / "out", "--quiet"]
+    fails_with_one_line(in_a_new_process(*run, env={**os.environ, "NUMBA_NUM_THREADS": "0"}), "NUMBA_")
+    done = in_a_new_process(*run, env={**os.environ, "MPLBACKEND": "nonsense"})
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "out").glob("*.png"))

@@ -15,6 +15,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import adjoint, exp, inverse, transform
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import landmarks_by_pose
+from slam.mapping.atlas.keyframes import Loop
 
 LAP = 100  # frames
 BIAS, SIGMAS = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 5e-3]), np.array([1e-3, 2e-3, 1e-3, 5e-3, 5e-3, 1e-2])
@@ -256,3 +257,22 @@ def test_a_run_in_a_saved_map_keeps_its_keyframes_and_loops(closed, sequence, tm
     assert kept[: len(pairs)] == pairs
     assert second.atlas.summary()["known"] == len(before)
     assert after.holds == f"{len(after)} landmarks, {len(after.keyframes)} keyframes, {len(after.loops)} loops"
+
+
+def test_loops_stay_bounded_and_spread_along_the_path(closed):
+    atlas = replace(closed[0].atlas, loops=(), dropped=0)
+    seconds = range(10, len(atlas))
+    for second in seconds:
+        atlas = atlas.with_loop(Loop(second - 10, second, np.eye(4), np.eye(6), 20), 6)
+    kept = [loop.second for loop in atlas.loops]
+    assert (len(kept), kept[0], kept[-1]) == (6, seconds[0], seconds[-1])
+    assert atlas.summary()["closed"] == len(seconds) > 2 * len(kept)
+    gaps = np.diff([atlas.keyframes[second].travelled for second in kept])
+    assert gaps.max() < 0.5 * gaps.sum()
+
+
+def test_a_bounded_number_of_loops_still_corrects_the_path(closed, sequence):
+    few, _ = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.most_loops=2")
+    assert few.atlas.summary()["closed"] == closed[0].atlas.summary()["closed"] > 2
+    assert len(few.atlas.loops) == 2
+    assert errors(few.trajectory().poses, sequence.ground_truth)[-1] < 0.2

@@ -11,6 +11,7 @@ import pytest
 from slam.geometry.se3 import adjoint, exp, inverse, log
 from slam.mapping.atlas.chain import Chain, shared_out
 from slam.mapping.atlas.keyframes import Loop
+from slam.mapping.atlas.loop_closer import says_more
 from slam.mapping.atlas.pose_graph import PoseGraph, solve
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
@@ -230,3 +231,13 @@ def test_one_loop_more_is_the_same_as_all_at_once():
     one, all_at_once = graph.solution(), solve(chain, loops, chain.poses)
     np.testing.assert_allclose(one.poses, all_at_once.poses, atol=1e-4)
     np.testing.assert_allclose(one.covariance, all_at_once.covariance, atol=1e-3 * np.abs(one.covariance).max())
+
+
+def test_a_loop_says_little_where_earlier_ones_have_told_the_common_errors():
+    true, chain, loops, _ = problem_with_common_errors(4)
+    chain = Chain(true, 0.01 * chain.steps, chain.common[:, :, :1])
+    before, loop = loops[:2]
+    ends = before.second, loop.first, loop.second
+    untold, told = (PoseGraph.solved(chain, some, true, ends) for some in ((), (before,)))
+    assert says_more(untold, before, loop)
+    assert not says_more(told, before, loop)
