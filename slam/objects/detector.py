@@ -45,7 +45,7 @@ from slam.objects.twists import fit_twist
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_SETTLED = 12  # frames from which a body is remembered in any case
+_SETTLED = 0.4  # [s] for which a body was measured, from which it is remembered in any case
 
 
 class MovingObjectDetector:
@@ -137,7 +137,7 @@ class MovingObjectDetector:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = self._stamps[self.slot], self._dt(times)
         for body in list(self.bodies.values()):
-            fresh = body.seen < _SETTLED
+            fresh = (body.seen + 0.5) * dt < _SETTLED  # to the nearest frame
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
