@@ -6,6 +6,7 @@ becomes a landmark; `update` gives the bodies' observations to the back end and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +45,7 @@ from slam.objects.twists import fit_twist
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_SETTLED = 12  # frames from which a body is remembered in any case
+_SETTLED = 0.4  # [s] for which a body was measured, from which it is remembered in any case
 
 
 class MovingObjectDetector:
@@ -136,7 +137,7 @@ class MovingObjectDetector:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = self._stamps[self.slot], self._dt(times)
         for body in list(self.bodies.values()):
-            fresh = body.seen < _SETTLED
+            fresh = (body.seen + 0.5) * dt < _SETTLED  # to the nearest frame
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
@@ -301,12 +302,18 @@ class MovingObjectDetector:
         for known in self.bodies.values():
             mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
             if known.measured and len(mine) < len(members) and membership.part_of(body, tracks, mine):
-                tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
-                self._forgotten.append(known.id)
-                grown = continued(body, known)
-                membership.enter(grown, tracks, mine, sure=True)
-                return grown
+                return self._in_place_of(known, body, mine)
         return body
+
+    def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
+        """A body under the id of a known one, of which it shows more, and whose seen members `mine` go over to it."""
+        tracks = self.tracks
+        assert tracks is not None
+        tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
+        self._forgotten.append(known.id)
+        grown = continued(body, known)
+        membership.enter(grown, tracks, mine, sure=True)
+        return grown
 
     def _follow_candidates(self, times: Array, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
@@ -363,7 +370,8 @@ class MovingObjectDetector:
     def _merge(self) -> None:
         """A body whose members go with an older one is a part of that: at once while young, later only after a while.
 
-        The parts of an articulated one go together now and then.
+        The parts of an articulated one go together now and then. An older body of which fewer members are seen may be
+        the part as well.
         """
         tracks = self.tracks
         assert tracks is not None
@@ -380,6 +388,22 @@ class MovingObjectDetector:
                     whole = self.bodies[whole.id] = membership.reaching(whole, tracks, mine)
                     membership.enter(whole, tracks, mine, sure=True)
                     self._forget(body.id)
+                elif whole is None and body.seen < _MERGES:
+                    self._outgrow(body, len(mine), older)
+
+    def _outgrow(self, body: Body, count: int, older: Mapping[int, Body]) -> None:
+        """Let a young body, of which `count` members are seen, take the place of an older one that goes with it."""
+        tracks = self.tracks
+        assert tracks is not None
+        for known in older.values():
+            theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
+            fewer = known.measured and len(theirs) < count and known.id != body.apart_from
+            if fewer and membership.overlapped({body.id: body}, tracks, theirs, known) is not None:
+                self.bodies[known.id] = self._in_place_of(known, body, theirs)
+                tracks.body[tracks.body == body.id] = known.id
+                del self.bodies[body.id]
+                self._forgotten.append(body.id)
+                return
 
     def _begin_tracks(self, features: StereoFeatures, local: Array, T_world_left: Array, landmark: IdArray) -> None:
         """New tracks at stereo features that continue none; give up tracks not seen for long."""

@@ -43,20 +43,24 @@ def follow(
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
     is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes
     it on which it lies, and then as far as `max_speed` allows.
+    Members of a body that was not measured in the last frame have no claim: a free track may follow their feature, too,
+    until the body is located. Else a body that has turned out of sight hides from the detector what is seen of it anew.
     `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     tracks.row[:] = -1
     alive = np.flatnonzero(tracks.ids >= 0)
     _advance(tracks, bodies, alive, dt)
     if len(alive) and len(features):
-        local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-        z, J = rig.project_stereo(local)
-        spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
         among = ByLine.of(features)
-        _near(tracks, alive, among, z, spread, config)
-        _check_right(tracks, alive, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+        lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
+        _expected(tracks, alive[~lost], T_world_left, among, dt, config, rig, sigma)
+        held = tracks.row[tracks.seen & (tracks.body >= 0)]
         _carried_along(tracks, bodies, candidates, T_world_left, among, dt, config, rig, sigma)
         _far(tracks, T_world_left, features, measured, dt, config, rig, sigma)
+        if lost.any():
+            unclaimed = alive[lost]
+            _expected(tracks, unclaimed, T_world_left, among, dt, config, rig, sigma)
+            tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
     seen = tracks.seen
     tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
     tracks.missed[:] = np.where(seen, 0, tracks.missed + 1)
@@ -74,9 +78,14 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
         )
 
 
-def _near(
-    tracks: Tracks, alive: NDArray[np.intp], among: ByLine, z: Array, spread: Array, config: ObjectsConfig
-) -> None:
+def _expected(
+    tracks: Tracks, alive: NDArray[np.intp], T_world_left: Array, among: ByLine, dt: float, config: ObjectsConfig,
+    rig: StereoRig, sigma: float,
+) -> None:  # fmt: skip
+    """Look for tracks where their fit or their body's motion says."""
+    local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
+    z, J = rig.project_stereo(local)
+    spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
     size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
     radius = np.fmin(np.fmax(size, least), config.search_limit)  # the least where the size is NaN
@@ -84,6 +93,7 @@ def _near(
         z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], among, config.d_match, config.ratio
     )
     tracks.row[alive[rows]] = columns
+    _check_right(tracks, alive, among.features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
 
 
 def _check_right(

@@ -55,7 +55,7 @@ def locate(
     depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
     if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
         return None
-    tracks.row[members] = followed
+    tracks.row[members] = np.where(np.isin(followed, tracks.row[tracks.seen]), -1, followed)
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, looks = mine[agrees], rows[agrees]
     tracks.row[members[np.isin(followed, looks)]] = -1
