@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from slam.data import StereoFeatures
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
+from slam.models import EstimatorModels
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.detector import MovingObjectDetector
 from slam.objects.tracks import Tracks, fit_positions, record
 
 WINDOW = 12
 SLOT = WINDOW - 1
 SIGMA = 0.002  # [m]
+RIG = StereoRig.rectified_pair(260.0, 160, 120, 0.12, 320, 240)
 TIMES = (np.arange(WINDOW) - SLOT) / 30.0
 
 
@@ -114,6 +118,20 @@ def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own(
     for sigma, same in ((1e-4, False), (0.01, True)):
         known = replace(whole, covariance=sigma**2 * np.eye(6))
         assert (membership.overlapped({1: known}, tracks, group, own) is known) == same
+
+
+def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() -> None:
+    local, off = corners(12, 12), MOVING + np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tracks = table(seen_from(path(MOVING), local, 13))
+    few = body_along(path(off), np.arange(3), tracks, id=1)
+    more = replace(body_along(path(MOVING), np.arange(3, 12), tracks, id=2), seen=5)
+    detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
+    detector.tracks, detector.bodies = tracks, {1: few, 2: more}
+    detector._merge()
+    assert list(detector.bodies) == [1]
+    assert (tracks.body == np.where(tracks.ids >= 0, 1, -1)).all()
+    np.testing.assert_allclose(detector.bodies[1].T, more.T)
+    np.testing.assert_allclose(transform(more.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
 def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
