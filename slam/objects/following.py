@@ -38,7 +38,8 @@ def follow(
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
     Members of bodies take over the descriptor of their feature also where `slam.objects.recovery.locate` does not
-    confirm it afterwards: it is the body's pose that is wrong more often than the match.
+    confirm it afterwards: it is the body's pose that is wrong more often than the match. Those of a body that was not
+    measured in the last frame do not: out of sight, they would come to look like what hides it.
 
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
     is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes
@@ -50,9 +51,9 @@ def follow(
     tracks.row[:] = -1
     alive = np.flatnonzero(tracks.ids >= 0)
     _advance(tracks, bodies, alive, dt)
+    lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
     if len(alive) and len(features):
         among = ByLine.of(features)
-        lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
         _expected(tracks, alive[~lost], T_world_left, among, dt, config, rig, sigma)
         held = tracks.row[tracks.seen & (tracks.body >= 0)]
         _carried_along(tracks, bodies, candidates, T_world_left, among, dt, config, rig, sigma)
@@ -62,8 +63,9 @@ def follow(
             _expected(tracks, unclaimed, T_world_left, among, dt, config, rig, sigma)
             tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
     seen = tracks.seen
-    tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
     tracks.missed[:] = np.where(seen, 0, tracks.missed + 1)
+    seen[alive[lost]] = False
+    tracks.descriptors[seen] = features.descriptors[tracks.row[seen]]
 
 
 def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp], dt: float) -> None:

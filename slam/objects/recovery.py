@@ -44,7 +44,11 @@ def locate(
     if found is None or 2 * found[1].sum() < len(mine):
         wide, wide_rows = _by_looks(body, tracks, members, features, measured, T_world_left, config)
         again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
-        if again is not None and (found is None or again[1].sum() > found[1].sum()):
+        if (
+            again is not None
+            and (found is None or again[1].sum() > found[1].sum())
+            and _is_within_reach(body, T_world_left @ inverse(again[0]), T_world_left, rig, sigma)
+        ):
             found, mine, rows = again, wide, wide_rows
     followed = tracks.row[members]
     tracks.row[members] = -1
@@ -63,6 +67,18 @@ def locate(
     tracks.row[good], tracks.missed[good] = looks, 0
     tracks.descriptors[good] = features.descriptors[looks]
     return T
+
+
+def _is_within_reach(body: Body, T: Array, T_world_left: Array, rig: StereoRig, sigma: float) -> bool:
+    """Whether a body that is found again at a pose (4, 4) can have gone there from where it was seen.
+
+    Its predicted place has a covariance, and so has the place of a point that stereo measures there.
+    """
+    R, view = body.T[:3, :3], T_world_left[:3, :3]
+    local = transform(inverse(T_world_left), T[None, :3, 3])
+    spread = R @ body.covariance[3:, 3:] @ R.T + view @ rig.triangulation_covariance(local, sigma)[0] @ view.T
+    gap = T[:3, 3] - body.T[:3, 3]
+    return bool(gap @ np.linalg.solve(spread, gap) < _FITS)
 
 
 def _is_expected(body: Body) -> bool:
