@@ -19,7 +19,7 @@ from slam.tracking.association import AssociationConfig
 MAPS = {
     "handheld": MapConfig(),
     "driving": MapConfig(
-        target_in_view=150, max_landmarks=300, descriptor_update=1.0, confirmed=1, restart_after=5, spacing=0.0
+        target_in_view=150, max_landmarks=200, descriptor_update=1.0, confirmed=1, restart_after=5, spacing=0.0
     ),
 }
 
