@@ -401,15 +401,15 @@ class FactorGraph:
         change, places = whole_problem(self._make, self.log)
         self._factor_builder.eliminate_late(change)
         start = time.process_time()
+        prior = self.log.history.prior
+        held = None if prior is None else held_pose(self.log, prior, change.values)
+        if held is not None:  # before all is solved: poses that have left would not follow if it moved
+            change.factors.add(held.factor())
         try:
             if solved:
                 change.values = stepped(change) if near else optimise(change)
-            prior = self.log.history.prior
-            held = None if prior is None else held_pose(self.log, prior, change.values)
         finally:
             self._seconds += time.process_time() - start
-        if held is not None:
-            change.factors.add(held.factor())
         solver = self._new_solver()
         new = solver.update(change)
         with suppress(SolverError):

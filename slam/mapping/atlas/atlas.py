@@ -17,7 +17,8 @@ from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, tran
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.chain import Chain, adjoints, shared_out
 from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
-from slam.mapping.atlas.places import PlaceIndex
+from slam.mapping.atlas.places import PlaceIndex, Vectors
+from slam.mapping.atlas.rows import KeyframeRows
 from slam.rig_error import CommonError
 
 
@@ -62,6 +63,7 @@ class Atlas:
 
     Attributes:
         keyframes: in order of time.
+        rows: their poses and what else the pose graph needs of them.
         index: which of them look alike.
         loops: those that the pose graph holds.
         dropped: number of loops of this run that it holds no more.
@@ -76,6 +78,7 @@ class Atlas:
     """
 
     keyframes: tuple[Keyframe, ...] = ()
+    rows: KeyframeRows = field(default_factory=KeyframeRows)
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
     dropped: int = 0
@@ -100,16 +103,19 @@ class Atlas:
             poses: theirs in the map (K, 4, 4).
             loops: that led to these.
         """
-        index = PlaceIndex()
+        atlas = cls()
         for keyframe in keyframes:
-            index = index.with_new(keyframe.descriptors.astype(np.float32))
-        known = tuple(replace(k, frame=-1) for k in keyframes)
-        return cls(known, index, loops=tuple(loops), corrected=poses, known=len(known))
+            atlas = atlas.with_new(replace(keyframe, frame=-1), keyframe.descriptors.astype(np.float32))
+        return replace(atlas, loops=tuple(loops), corrected=poses, known=len(atlas))
+
+    def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
+        """With one more keyframe, of descriptors (F, D)."""
+        rows, index = self.rows.with_new(keyframe), self.index.with_new(descriptors)
+        return replace(self, keyframes=(*self.keyframes, keyframe), rows=rows, index=index)
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        since = np.array([k.T_odom_left for k in self.keyframes[len(self.corrected) :]]).reshape(-1, 4, 4)
-        return np.concatenate([self.corrected, self.T_map_odom @ since])
+        return self._in_map(self.rows.poses)
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused as they contradict the path.
@@ -149,21 +155,23 @@ class Atlas:
             rig: what common errors stand for now.
             path: the path so far.
         """
-        poses = np.array([k.T_odom_left for k in self.keyframes]).reshape(-1, 4, 4)
+        poses, count, m = self.rows.poses.copy(), len(self), len(rig.known)
         if path is not None:
-            rows = np.searchsorted(path.stamps, [k.stamp for k in self.keyframes[self.known :]])
-            poses[self.known :] = path.poses[rows]
-        count, m = len(self), len(rig.known)
-        none = np.zeros((6, m))  # where a prior map was made without them
-        shares = np.array([k.shares if k.shares.shape[1] == m else none for k in self.keyframes]).reshape(6 * count, m)
-        common = (shares @ rig.root).reshape(count, 6, rig.scale.shape[1] + 1)
+            poses[self.known :] = path.poses[np.searchsorted(path.stamps, self.rows.stamps[self.known :])]
+        shares = self.rows.shares
+        if shares.shape[2] != m:  # all are of a prior map that was made without them
+            shares = np.zeros((count, 6, m))
+        common = (shares.reshape(6 * count, m) @ rig.root).reshape(count, 6, rig.scale.shape[1] + 1)
         common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
-        steps = np.array([k.step_covariance for k in self.keyframes]).reshape(-1, 6, 6)
-        return Chain(poses, steps, common[:, :, :-1], common[:, :, -1])
+        return Chain(poses, self.rows.steps, common[:, :, :-1], common[:, :, -1])
 
     def in_map(self, chain: Chain) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
-        return np.concatenate([self.corrected, self.T_map_odom @ chain.poses[len(self.corrected) :]])
+        return self._in_map(chain.poses)
+
+    def _in_map(self, poses: Array) -> Array:
+        """Poses (K, 4, 4) of all keyframes in odom, taken to the map."""
+        return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
         """Pose T_map_left (4, 4) of a keyframe."""
@@ -201,7 +209,7 @@ class Atlas:
 
         chain = self.chain(self.anchor.rig, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
-        stamps = np.array([k.stamp for k in self.keyframes[self.known :]])
+        stamps = self.rows.stamps[self.known :]
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :]))
 
 

@@ -115,9 +115,8 @@ class LoopCloser:
             return atlas, None
         candidates = self._candidates(atlas, new, step, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
-        index = atlas.index.with_new(descriptors)
         kept = new if self._file is None else self._file.put(new)
-        atlas = replace(atlas, keyframes=(*atlas.keyframes, kept), index=index, restarts=restarts)
+        atlas = replace(atlas.with_new(kept, descriptors), restarts=restarts)
         found = self._verified(atlas, candidates, step.features, step.correction, step.index)
         best = max(found, key=_inliers, default=None)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
@@ -246,7 +245,7 @@ class LoopCloser:
 
     def _within_reach(self, atlas: Atlas, new: Keyframe, poses: Array, here: Array, covariance: Array) -> BoolArray:
         """Which keyframes (K,), at poses (K, 4, 4), the camera has left, but may be back at by what its path says."""
-        c, length = self._config, np.array([new.travelled - k.travelled for k in atlas.keyframes])
+        c, length = self._config, new.travelled - atlas.rows.travelled
         far = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length

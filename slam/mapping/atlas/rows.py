@@ -1,0 +1,82 @@
+"""What the path and the pose graph need of every keyframe, a row each, in arrays that grow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam.geometry.se3 import Array
+from slam.mapping.atlas.keyframes import Keyframe
+
+_LEAST = 64  # rows that there is room for at first
+
+
+@dataclass(frozen=True)
+class KeyframeRows:
+    """Numbers of keyframes; see `slam.mapping.atlas.keyframes.Keyframe`. Rows beyond `count` are nobody's.
+
+    Attributes:
+        count: number of keyframes.
+        room: stamps (N,), poses (N, 4, 4), step covariances (N, 6, 6), shares (N, 6, m) and ways travelled (N,).
+    """
+
+    count: int = 0
+    room: tuple[Array, Array, Array, Array, Array] = field(
+        default_factory=lambda: (
+            np.zeros(0),
+            np.zeros((0, 4, 4)),
+            np.zeros((0, 6, 6)),
+            np.zeros((0, 6, 0)),
+            np.zeros(0),
+        )
+    )
+
+    @property
+    def stamps(self) -> Array:
+        """(K,) [s]."""
+        return self.room[0][: self.count]
+
+    @property
+    def poses(self) -> Array:
+        """T_odom_left (K, 4, 4)."""
+        return self.room[1][: self.count]
+
+    @property
+    def steps(self) -> Array:
+        """Covariances (K, 6, 6) of the motions since the keyframe before."""
+        return self.room[2][: self.count]
+
+    @property
+    def shares(self) -> Array:
+        """Derivatives (K, 6, m) of the poses by common errors; zero in those of a run with other ones."""
+        return self.room[3][: self.count]
+
+    @property
+    def travelled(self) -> Array:
+        """(K,) [m]."""
+        return self.room[4][: self.count]
+
+    def with_new(self, keyframe: Keyframe) -> KeyframeRows:
+        """With one more keyframe. Earlier rows are shared with `self`, which stays as it is."""
+        k, room = self.count, self.room
+        new = (
+            keyframe.stamp,
+            keyframe.T_odom_left,
+            keyframe.step_covariance,
+            keyframe.shares,
+            keyframe.travelled,
+        )
+        if k >= len(room[0]) or room[3].shape[1:] != keyframe.shares.shape:
+            room = tuple(_with_room(rows, k, np.shape(value)) for rows, value in zip(room, new))  # type: ignore[assignment]
+        for rows, value in zip(room, new):
+            rows[k] = value
+        return KeyframeRows(k + 1, room)
+
+
+def _with_room(rows: Array, count: int, shape: tuple[int, ...]) -> Array:
+    """The first `count` rows with room for as many again; zero where they had another shape."""
+    out = np.zeros((max(_LEAST, 2 * count), *shape))
+    if rows.shape[1:] == shape:
+        out[:count] = rows[:count]
+    return out
