@@ -60,15 +60,14 @@ class KeyframeRows:
     def with_new(self, keyframe: Keyframe) -> KeyframeRows:
         """With one more keyframe. Earlier rows are shared with `self`, which stays as it is."""
         k, room = self.count, self.room
-        new = (
-            keyframe.stamp,
-            keyframe.T_odom_left,
-            keyframe.step_covariance,
-            keyframe.shares,
-            keyframe.travelled,
-        )
+        new = tuple(
+            np.asarray(value, np.float64)
+            for value in (
+                keyframe.stamp, keyframe.T_odom_left, keyframe.step_covariance, keyframe.shares, keyframe.travelled,
+            )
+        )  # fmt: skip
         if k >= len(room[0]) or room[3].shape[1:] != keyframe.shares.shape:
-            room = tuple(_with_room(rows, k, np.shape(value)) for rows, value in zip(room, new))  # type: ignore[assignment]
+            room = tuple(_with_room(rows, k, value.shape) for rows, value in zip(room, new))  # type: ignore[assignment]
         for rows, value in zip(room, new):
             rows[k] = value
         return KeyframeRows(k + 1, room)
