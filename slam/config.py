@@ -23,10 +23,11 @@ MAPS = {
     ),
 }
 
-#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter.
+#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter;
+#: that features would slide over surfaces then is what their alignment is for.
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
-    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),
+    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),
 }
 
 #: Moving objects by kind of motion: what moves on a street is faster than what a hand or a robot moves.

@@ -2,7 +2,7 @@
 
 A detector finds a feature at another place of the surface as the view changes. The place is therefore corrected: what
 was seen there first, warped as a small surface that faces the camera would be, is aligned to what is seen now. It is
-taken anew where the view has changed by much, or where it fits no more.
+taken anew, at the place to which it was aligned, where it is seen much larger or smaller; and where it fits no more.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from slam.landmarks import LandmarkRows
 from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches
 
-_LARGEST = 1.5  # factor by which a patch may have grown or shrunk before it is taken anew: `Patches` hold no more
+_LARGEST = 1.5  # factor by which a patch may have grown or shrunk at most: `Patches` hold no more
+_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew where it is found: one such change more fits
 _FORGOTTEN = 10  # frames without a measurement after which a patch is given up
 
 
@@ -125,6 +126,7 @@ class Aligner:
         warps = warps_of(rectified, matched.poses, matches.T_world_left, positions(matched.ids))
         growth = np.sqrt(np.abs(np.linalg.det(warps)))
         similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
+        outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
         left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
         answer = frontend.align(features.images, matched.patches, warps, left, right)
         left, right = require_aligned(answer, len(rows), frontend)
@@ -136,7 +138,7 @@ class Aligner:
         uv_right[rows[found]] = rectified.unrectify_right(right[found])
         return Aligned(
             replace(features, uv_left=uv_left, uv_right=uv_right),
-            anchors.select(~np.isin(anchors.ids, matched.ids[~found])),
+            anchors.select(~np.isin(anchors.ids, matched.ids[~found | outgrown])),
         )
 
     def anchored(

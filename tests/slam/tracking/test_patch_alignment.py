@@ -134,6 +134,14 @@ def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, siz
     np.testing.assert_array_equal(new.poses, np.tile(np.eye(4), (4, 1, 1)))
 
 
+def test_a_patch_that_is_seen_larger_is_taken_anew_where_it_is_found_before_it_is_too_large():
+    then, features = np.eye(4), frame()
+    then[2, 3] = -1.6  # all are seen 1.23 to 1.4 times as large
+    aligned = align(features, anchors_at(then))
+    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
+    assert not len(aligned.anchors)
+
+
 def test_without_a_pose_or_images_nothing_moves_and_switched_off_nothing_is_kept():
     features, anchors = frame(), anchors_at(np.eye(4))
     for aligned in (
