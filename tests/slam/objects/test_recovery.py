@@ -71,9 +71,12 @@ def test_a_point_that_disagrees_is_followed_on_and_counted():
     assert tracks.misfit[:4].tolist() == [0, 0, 0, 1]
 
 
+FAR = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])
+
+
 def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
-    off = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0])  # farther than its prediction may be off
-    body, tracks, features, truth = scene(4, off, np.random.default_rng(6))
+    body, tracks, features, truth = scene(4, FAR, np.random.default_rng(6))
+    body = replace(body, covariance=np.diag([0.05**2] * 3 + [2.0**2] * 3))
     tracks.row[:4] = -1
     followers = tracks.begin(np.arange(10, 14), features, np.arange(4), transform(truth, POINTS))
     local = RIG.triangulate(features.uv_left, features.uv_right)
@@ -81,6 +84,13 @@ def test_a_body_seen_again_takes_its_points_from_the_tracks_that_follow_them():
     assert T is not None and np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.5
     assert tracks.row[:4].tolist() == [0, 1, 2, 3]
     assert (tracks.ids[followers] == -1).all()
+
+
+def test_what_looks_like_a_body_where_that_cannot_have_gone_is_not_it():
+    body, tracks, features, _ = scene(4, FAR, np.random.default_rng(6))  # off by eight of its standard deviations
+    tracks.row[:4] = -1
+    local = RIG.triangulate(features.uv_left, features.uv_right)
+    assert locate(body, tracks, features, local, np.eye(4), RIG, SIGMA, ObjectsConfig(max_speed=40.0), 0) is None
 
 
 def test_two_points_do_not_place_a_body_that_may_be_anywhere():
