@@ -112,6 +112,22 @@ def test_whether_the_whole_path_follows_is_told_with_the_present_frame():
     assert answers[0] and not answers[-1]
 
 
+def test_mended_measurements_do_not_part_the_path_from_poses_that_have_left():
+    """What is left of the problem may stand anywhere in the world; poses that have left do not follow it there."""
+    models = replace(MODELS, initial_position_sigma=10.0, initial_rotation_sigma=0.1)
+    backend, known = SmootherBackend(RIG, models, lag=12, window=8), set()
+    for stamp, _, seen in drive(40, points=400):
+        step(backend, stamp, seen, known)
+        gone = sorted(known - set(seen.ids.tolist()))
+        backend.remove(gone)
+        known.difference_update(gone)
+    before, first = backend.trajectory().poses, backend.measurement_log.history.first
+    backend.revise(lambda z: z + np.array([0.0, 0.0, 2.0]))
+    moved = np.linalg.norm(backend.trajectory().poses[:, :3, 3] - before[:, :3, 3], axis=1)
+    assert not moved[:first].any()
+    assert moved[first] < 0.01 * moved[-1], moved[first:]
+
+
 def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
     """All that is measured is relative; the smoother must not wander about within what it does not know."""
     models = replace(MODELS, initial_position_sigma=10.0, initial_rotation_sigma=0.1)
