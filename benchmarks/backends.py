@@ -1,13 +1,12 @@
 """What the EKF's predict and update cost over the bare ``dsyrk``.
 
-    python benchmarks/backends.py [--quick]
+    python benchmarks/backends.py [--quick] [--out DIR]
 
 Times are CPU times, medians of one run; compare ratios, not milliseconds. How cost grows: `benchmarks/growth.py`.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,10 +20,15 @@ from threadpoolctl import threadpool_limits
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import backends
+from experiments.common import script_options
 from experiments.long_run import DT, MODELS, RIG, measured
+from experiments.tables import markdown, write_json
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
+
+HEADER = ("landmarks' coordinates", "landmarks", "measured", "dsyrk [ms]", "predict [ms]", "update [ms]", "ratio",
+          "turning, ratio")  # fmt: skip
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -100,44 +104,41 @@ def bare_dsyrk(landmarks: int, count: int) -> Callable[[], object]:
     return lambda: dsyrk(-1.0, W, beta=1.0, c=P, lower=1, overwrite_c=1)
 
 
-def ratios(sizes: Sequence[tuple[int, int]], frames: int) -> None:
-    """Prints the EKF's time over that of the bare ``dsyrk``.
+def ratios(sizes: Sequence[tuple[int, int]], frames: int) -> Iterator[list[object]]:
+    """The EKF's time over that of the bare ``dsyrk``, as `HEADER`.
 
     By medians for a camera that stands still; by means for one that turns around, so that the frames count in which the
     filter stores its whole covariance.
     """
-    print("| landmarks | measured | landmarks' coordinates | dsyrk [ms] | predict | update | ratio | turning, ratio |")
-    print("| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: |")
+    for landmarks, count in sizes:
+        for coordinates in ("inverse_depth", "euclidean"):
+            bare = bare_dsyrk(landmarks, count)
+            still, moving = (
+                1e3
+                * np.array(
+                    [
+                        (seconds(bare), *times[:2])
+                        for times in drive("ekf", landmarks, count, frames, landmarks=coordinates)
+                    ]
+                )
+                for drive in (standing, turning)
+            )
+            floor, predict, update = map(float, np.median(still, axis=0))
+            mean = moving.mean(axis=0)
+            ratio = float(mean[1] + mean[2]) / float(mean[0])
+            yield [coordinates, landmarks, count, floor, predict, update, (predict + update) / floor, ratio]
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "two sizes and few frames")
+    arguments = parser.parse_args()
+    sizes = [(60, 20), (318, 30)] if arguments.quick else [(50, 30), (150, 30), (318, 30), (318, 60), (1000, 30)]
     with threadpool_limits(1, user_api="blas"):
-        for landmarks, count in sizes:
-            for coordinates in ("inverse_depth", "euclidean"):
-                bare = bare_dsyrk(landmarks, count)
-                still, moving = (
-                    1e3
-                    * np.array(
-                        [
-                            (seconds(bare), *times[:2])
-                            for times in drive("ekf", landmarks, count, frames, landmarks=coordinates)
-                        ]
-                    )
-                    for drive in (standing, turning)
-                )
-                floor, predict, update = np.median(still, axis=0)
-                mean = moving.mean(axis=0)
-                print(
-                    f"| {landmarks} | {count} | {coordinates} | {floor:.2f} | {predict:.2f} | {update:.2f} "
-                    f"| {(predict + update) / floor:.2f} | {(mean[1] + mean[2]) / mean[0]:.2f} |",
-                    flush=True,
-                )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two sizes and few frames")
-    quick = parser.parse_args().quick
-    sizes = [(60, 20), (318, 30)] if quick else [(50, 30), (150, 30), (318, 30), (318, 60), (1000, 30)]
-    ratios(sizes, 20 if quick else 100)
+        table = list(ratios(sizes, 20 if arguments.quick else 100))
+    print(markdown(HEADER, table))
+    write_json(arguments.out / "table.json", HEADER, table)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

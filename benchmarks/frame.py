@@ -180,7 +180,6 @@ def main() -> int:
     for size in sizes(arguments.quick):
         table += rows(size, measure(size, arguments.orbslam3))
     print(markdown(HEADER, table, 2))
-    print(f"\nLoad of the machine, average of the last minute: {os.getloadavg()[0]:.1f}, of {os.cpu_count()} cores.")
     write_json(arguments.out / "table.json", HEADER, table)
     return 0
 

@@ -89,6 +89,7 @@ EXPERIMENTS = (
     ),
     Experiment("consistency", "Do the back ends know how sure they are?", arguments=("--seeds", "30")),
     Experiment("long_run", "Cost growth: time and memory along a walk", arguments=("--frames", "4000")),
+    Experiment("cost", "What a frame costs, next to others", "", ("growth.png",)),
     Experiment(
         "policies", "Policies of map management", arguments=("--frames", "930:1050", "--seeds", "6", "--processes", "1")
     ),

@@ -1,0 +1,111 @@
+"""What ``slam run`` costs as a whole: the first run on a machine, the second one, and the memory of a long one.
+
+    python benchmarks/command.py [--quick] [--backend NAME ...] [--only first memory] [--out DIR]
+
+The first run has an empty folder for compiled kernels, the second one what the first has left there; between them,
+``cv2.SIFT`` with 800 features on an image of the same size says how fast the machine is at that time. Memory is the
+peak of the process after 100 and after 1000 frames of KITTI odometry 06 where SLAM_DATA has it, else of a rendered
+street. Prints Markdown tables.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.frame import BACKENDS, KITTI
+from experiments.common import script_options
+from experiments.tables import markdown, write_json
+from slam.errors import SlamError
+from slam.sequences import open_sequence
+
+ROOT = Path(__file__).resolve().parents[1]
+DESK = "synthetic:desk?width=752&height=480&frames=20"
+FIRST = (
+    "back end", "first, wall [s]", "first, CPU [s]", "second, wall [s]", "second, CPU [s]", "more, wall [s]",
+    "more, CPU [s]", "cv2.SIFT at 752x480, wall / CPU [ms]",
+)  # fmt: skip
+MEMORY = ("back end", "sequence", "frames", "peak memory [MB]", "CPU [s] of the run")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of a process and those that it has started: wall and CPU time [s], peak memory [MB]."""
+
+    wall: float
+    cpu: float
+    peak: float
+
+
+def cost(arguments: list[str], **environment: str) -> Cost:
+    """What ``slam`` with these arguments costs."""
+    began, out = time.perf_counter(), subprocess.DEVNULL
+    settings = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    process = subprocess.Popen([sys.executable, "-m", "slam", *arguments], stdout=out, stderr=out, env=settings)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SlamError(f"slam {' '.join(arguments)}: exit status {process.returncode}")
+    return Cost(time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+
+
+def sift(repeats: int) -> np.ndarray:
+    """Wall and CPU time of ``cv2.SIFT`` on an image of 752x480, medians (2,) [ms]."""
+    image, detector, times = next(iter(open_sequence(DESK))).left, cv2.SIFT_create(800), []
+    for _ in range(repeats):
+        start = np.array([time.perf_counter(), time.process_time()])
+        detector.detectAndCompute(image, None)
+        times.append(1e3 * (np.array([time.perf_counter(), time.process_time()]) - start))
+    return np.asarray(np.median(times, axis=0))
+
+
+def first_run(name: str) -> list[object]:
+    """First and second run of a short sequence with one back end, as `FIRST`."""
+    with TemporaryDirectory() as folder:
+        run = ["run", DESK, "--backend", name, "--quiet", "--out", f"{folder}/run", "--overwrite"]
+        first = cost(run, NUMBA_CACHE_DIR=f"{folder}/kernels")
+        speed = sift(20)
+        second = cost(run, NUMBA_CACHE_DIR=f"{folder}/kernels")
+    more = (first.wall - second.wall, first.cpu - second.cpu)
+    return [name, first.wall, first.cpu, second.wall, second.cpu, *more, f"{speed[0]:.0f} / {speed[1]:.0f}"]
+
+
+def memory(name: str, frames: int) -> list[object]:
+    """Peak memory of a run, as `MEMORY`."""
+    data = Path(os.environ.get("SLAM_DATA", ""), KITTI)
+    street = "synthetic:street?width=1226&height=370&frames=1000"
+    sequence, said = (str(data), "KITTI 06") if data.is_dir() else (street, "street, 1226x370")
+    with TemporaryDirectory() as folder:
+        run = ["run", sequence, "--backend", name, "--frames", f"0:{frames}", "--quiet", "--out", f"{folder}/run"]
+        used = cost(run)
+    return [name, said, frames, round(used.peak), used.cpu]
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "10 and 20 frames for the memory")
+    parser.add_argument("--backend", nargs="+", choices=BACKENDS, default=BACKENDS, help="these alone")
+    parser.add_argument("--only", nargs="+", choices=("first", "memory"), default=("first", "memory"))
+    given = parser.parse_args()
+    if "first" in given.only:
+        table = [first_run(name) for name in given.backend]
+        print(markdown(FIRST, table) + "\n", flush=True)
+        write_json(given.out / "first.json", FIRST, table)
+    if "memory" in given.only:
+        table = [memory(name, n) for name in given.backend for n in ((10, 20) if given.quick else (100, 1000))]
+        print(markdown(MEMORY, table, 2), flush=True)
+        write_json(given.out / "memory.json", MEMORY, table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
