@@ -200,7 +200,8 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
 def continued(body: Body, known: Body) -> Body:
     """A body found anew where it was known already in part: with its id and what has been learnt of its existence.
 
-    The back end's frame for it goes on as predicted, but for a shift from what was seen of it to what is now.
+    The back end estimates it anew; its frame for it goes on as predicted, but for a shift from what was seen of it to
+    what is now.
     """
     shift = np.eye(4)
     shift[:3, 3] = body.middle - known.middle
@@ -208,7 +209,7 @@ def continued(body: Body, known: Body) -> Body:
     return replace(
         body, id=known.id, T_body_estimate=T_body_estimate, proved=known.proved, existence=known.existence,
         age=known.age, reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at,
+        measured_at=known.measured_at, estimate=None, refused=0,
     )  # fmt: skip
 
 

@@ -375,8 +375,9 @@ class MovingObjectDetector:
         """
         tracks = self.tracks
         assert tracks is not None
-        for body in sorted(self.bodies.values(), key=lambda body: -body.id):
-            if body.measured:
+        for id in sorted(self.bodies, reverse=True):
+            body = self.bodies.get(id)  # it may have taken another's place
+            if body is not None and body.measured:
                 mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
                 older = {id: other for id, other in self.bodies.items() if id < body.id}
                 whole = membership.overlapped(older, tracks, mine, body)

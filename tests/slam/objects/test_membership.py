@@ -11,6 +11,7 @@ from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
 from slam.models import EstimatorModels
+from slam.object_data import ObjectEstimate
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
@@ -123,14 +124,23 @@ def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own(
 def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() -> None:
     local, off = corners(12, 12), MOVING + np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     tracks = table(seen_from(path(MOVING), local, 13))
-    few = body_along(path(off), np.arange(3), tracks, id=1)
-    more = replace(body_along(path(MOVING), np.arange(3, 12), tracks, id=2), seen=5)
+    few, more = (
+        body_along(path(off), np.arange(3), tracks, id=1),
+        body_along(path(MOVING), np.arange(3, 12), tracks, id=2),
+    )
+    few = replace(few, alike=1, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0])))
+    none = np.zeros(0, np.int64)
+    believed = ObjectEstimate(2, 0.0, more.T, np.eye(6), MOVING, np.eye(6), True, none, none)
+    more = replace(more, seen=5, estimate=believed, refused=1)
     detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
     detector.tracks, detector.bodies = tracks, {1: few, 2: more}
     detector._merge()
     assert list(detector.bodies) == [1]
     assert (tracks.body == np.where(tracks.ids >= 0, 1, -1)).all()
-    np.testing.assert_allclose(detector.bodies[1].T, more.T)
+    grown = detector.bodies[1]
+    np.testing.assert_allclose(grown.T, more.T)
+    np.testing.assert_allclose(grown.history, more.history)
+    assert grown.estimate is None and grown.refused == 0  # the back end begins anew with it
     np.testing.assert_allclose(transform(more.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
