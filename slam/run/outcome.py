@@ -37,15 +37,17 @@ def outcome(
     if frames < 1 or 2 * tracked >= frames:
         return ""
     how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
-    causes = [warnings[0] if warnings else _cause(record, rig, in_map)]
+    first = warnings[0] if warnings else _cause(record, rig, in_map)
+    if not first and dropped < frames:  # where most came, the gaps are hardly all of it
+        first = _ANY
+    causes = [first] if first else []
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
         causes.append(
             f"{few} dropped, so that others are far apart: make a frame cheaper (smaller images, --set "
             "objects.mode=off), or move more slowly"
         )
-    known = [cause for cause in causes if cause] or [_ANY]
-    return f"{how} tracked; likely cause: {'; and '.join(known)}"
+    return f"{how} tracked; likely cause: {'; and '.join(causes)}"
 
 
 def nothing_tracked(summary: dict[str, Any]) -> bool:

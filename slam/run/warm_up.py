@@ -41,10 +41,10 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
         >>> seconds = slam.warm_up("ekf")
     """
     before = compile_clock.seconds()
-    for backend in backends or BACKENDS:
-        for _ in _frames(backend):
-            if until is not None and until.is_set():
-                break
+    for frame in (frame for backend in backends or BACKENDS for frame in _frames(backend)):
+        del frame
+        if until is not None and until.is_set():
+            break
     return compile_clock.seconds() - before
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,9 @@ from slam.runtime.compile_clock import compile_clock
 try:
     from numba import njit
     from numba.core import event
-except ValueError as error:  # it reads its environment variables
+except ValueError as error:
+    if not any(name.startswith("NUMBA_") for name in os.environ):
+        raise
     raise ConfigurationError(f"numba cannot be loaded; one of its variables NUMBA_… is wrong: {error}") from error
 
 _LOG = logging.getLogger(__name__)

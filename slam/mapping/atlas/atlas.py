@@ -127,14 +127,17 @@ class Atlas:
         return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
 
     def with_loop(self, loop: Loop, most: int) -> Atlas:
-        """With one loop more; of more than `most`, the one is dropped whose neighbours on the path are nearest."""
-        loops = (*self.loops, loop)
-        if len(loops) <= most:
-            return replace(self, loops=loops)
-        at = np.array([self.keyframes[k.second].travelled for k in loops])
-        least = 1 + int(np.argmin(at[2:] - at[:-2]))
-        dropped = self.dropped + (loops[least].second >= self.known)
-        return replace(self, loops=loops[:least] + loops[least + 1 :], dropped=dropped)
+        """With one loop more; of more than `most`, those are dropped whose neighbours on the path are nearest.
+
+        They stay in the poses that have been solved with them.
+        """
+        loops, dropped = (*self.loops, loop), self.dropped
+        while len(loops) > most:
+            at = np.array([self.keyframes[k.second].travelled for k in loops])
+            least = 1 + int(np.argmin(at[2:] - at[:-2]))
+            dropped += loops[least].second >= self.known
+            loops = loops[:least] + loops[least + 1 :]
+        return replace(self, loops=loops, dropped=dropped)
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""

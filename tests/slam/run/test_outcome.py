@@ -37,7 +37,7 @@ def test_fewer_than_half_are_told(tracked, words):
             {"dropped": 40},
             "40 frames were dropped, so that others are far apart: make a frame cheaper",
         ),
-        ((200, 150), 0.12, {"dropped": 1}, "a frame was dropped, so that others are far apart"),
+        ((200, 150), 0.12, {"dropped": 1}, "features are found in both images, but not again in the next frame"),
         ((200, 150), 0.12, {"dropped": 2, "warnings": ["A"]}, "A; and 2 frames were dropped, so that others are far"),
         ((200, 150), 0.12, {}, "features are found in both images, but not again in the next frame"),
         ((200, 0), 0.12, {"in_map": True}, "the camera is not where the map was made"),
