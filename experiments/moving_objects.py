@@ -1,6 +1,7 @@
 """Moving objects: found without being told, and by the papers' Procedure 1, against known truth.
 
-    [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--only PART,…] [--out DIR]
+    [SLAM_DATA=/path/to/data] python experiments/moving_objects.py [--quick] [--resume] [--only PART,…]
+        [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
 paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
@@ -361,6 +362,7 @@ def main() -> int:
     parser = script_options(__file__, __doc__, "a few frames of each part")
     parser.add_argument("--observations", action="store_true", help="worlds as observations, not rendered")
     parser.add_argument("--only", default=",".join(PARTS), help="parts, joined by commas")
+    parser.add_argument("--resume", action="store_true", help="parts that are in the folder already are not run again")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     parts = {
@@ -375,10 +377,14 @@ def main() -> int:
         "kitti": kitti,
     }
     for name in arguments.only.split(","):
-        rows = parts[name](not arguments.observations, arguments.quick, arguments.out)
+        kept = arguments.out / f"{name}.json"
+        if arguments.resume and kept.exists():
+            rows = json.loads(kept.read_text())
+        else:
+            rows = rounded(parts[name](not arguments.observations, arguments.quick, arguments.out))
         shown = worlds_together(rows) if name == "still" else rows
         print(f"\n# {TITLES[name]}\n\n{parts[name].__doc__}\n\n{table(shown)}", flush=True)
-        (arguments.out / f"{name}.json").write_text(json.dumps(rounded(rows), indent=2, default=str) + "\n")
+        kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0
 
 
