@@ -359,6 +359,7 @@ def test_a_body_changes_neither_camera_nor_map(body):
     np.testing.assert_array_equal(found.covariances, expected.covariances)
 
 
+@pytest.mark.slow
 def test_the_camera_is_consistent_with_bodies_and_after_them():
     """NEES over eight walks, mean of three frames with the body and of three after it."""
     found = np.mean([drive_with_body(seed, "right")[0] for seed in range(8)], axis=0)
