@@ -19,17 +19,17 @@ from slam.system import StereoSlam
 
 #: World, and about twice the online ATE [m] measured with either back end.
 OBSERVED = {
-    "aisle?frames=40&sigma=0.7": 0.007,
-    "aisle?frames=30&sigma=0.7&rig=toedin": 0.008,
-    "desk?frames=40&sigma=0.7": 0.006,
-    "field?frames=30&sigma=0.7": 0.008,
-    "startup?frames=40&sigma=0.7": 0.010,
-    "box?frames=40&sigma=0.7": 0.010,
-    "boxes?frames=40&sigma=0.7": 0.020,
-    "street?frames=20&sigma=0.7": 0.025,
-    "town?frames=20&sigma=0.7": 0.040,
+    "aisle?frames=25&sigma=0.7": 0.007,
+    "aisle?frames=25&sigma=0.7&rig=toedin": 0.008,
+    "desk?frames=25&sigma=0.7": 0.006,
+    "field?frames=25&sigma=0.7": 0.008,
+    "startup?frames=25&sigma=0.7": 0.010,
+    "box?frames=25&sigma=0.7": 0.010,
+    "boxes?frames=25&sigma=0.7": 0.020,
+    "street?frames=15&sigma=0.7": 0.025,
+    "town?frames=15&sigma=0.7": 0.040,
 }
-RENDERED = {"aisle?frames=20": 0.005, "desk?frames=20": 0.005, "box?frames=20": 0.015, "street?frames=8": 0.06}
+RENDERED = {"aisle?frames=12": 0.005, "desk?frames=12": 0.005, "box?frames=12": 0.015, "street?frames=5": 0.06}
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])

@@ -261,7 +261,7 @@ def corrected(body: Body, camera: CameraBelief, covariances: Gathered, s: Array,
     # The filter's state has the covariance `crossᵀ of_body + camera.crossᵀ of_camera` with B.
     gain = W @ np.concatenate([of_body, of_camera]).T
     after = _learnt(body, change, W, gain, np.concatenate([body.cross[covariances.rows], camera.cross]))
-    return referred(after, body.points, camera)
+    return transported(after, body.points, camera)
 
 
 def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, W: Array, camera: CameraBelief) -> Body:
@@ -271,7 +271,7 @@ def corrected_by_map(body: Body, columns: NDArray[np.intp], s: Array, B: Array, 
     mine = body.cross[:, columns]
     V = mine @ B
     after = _learnt(body, mine @ s, V, V, W[: body.cross.shape[1]].T)
-    return referred(after, body.points, camera)
+    return transported(after, body.points, camera)
 
 
 def _learnt(body: Body, change: Array, W: Array, gain: Array, rows: Array) -> Body:
@@ -289,13 +289,13 @@ def _learnt(body: Body, change: Array, W: Array, gain: Array, rows: Array) -> Bo
     )
 
 
-def referred(body: Body, before: BodyPoints, camera: CameraBelief) -> Body:
-    """Refer the covariance to the points as they are now; `before` (p) are those that it still refers to.
+def transported(body: Body, before: BodyPoints, camera: CameraBelief) -> Body:
+    """Transport the covariance to the points as they are now, from those before, `before` (p), for which it holds.
 
     No measurement says where in the body its frame lies, nor where in the world camera and body are together. If the
     pose is off by ``[θ, τ]`` and the camera by c, such a displacement changes the points by ``N η``, where ``η =
     [θ, τ] − Ad c`` (see `gathered`), and no prediction. N depends on the points; were the covariance kept in the
-    coordinates of their old places, each update would seem to say something of η. So it is carried over to the new N.
+    coordinates of their old places, each update would seem to say something of η. So it is transported to the new N.
     """
     if not len(before):
         return body

@@ -106,7 +106,7 @@ class Solution:
         H: the Jacobian of the last linearisation.
         inverse: ``L⁻¹`` (3M, 3M), lower triangular.
         measured: which rows (3M,) are measured.
-        nis: ``νᵀ S⁻¹ ν`` with the innovation referred to the prior through the last linearisation.
+        nis: ``νᵀ S⁻¹ ν`` with the innovation taken back to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
     """
 
@@ -149,7 +149,7 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _System:
-    """The linear update at an iterate: Jacobian H, innovation ν referred to the prior, its covariance S."""
+    """The linear update at an iterate: Jacobian H, innovation ν taken back to the prior, its covariance S."""
 
     rows: BoolArray
     H: Jacobian

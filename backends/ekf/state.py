@@ -44,7 +44,7 @@ class FilterState:
         landmarks: their coordinates and names.
         covariance: of everything.
         objects: the bodies, with their covariances with everything.
-        consistent: whether the covariance is referred to the corrected state.
+        consistent: whether the covariance is transported to the corrected state.
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels, config: EkfConfig) -> None:
@@ -180,7 +180,7 @@ class FilterState:
         """Prepare an update by some landmarks: see `Covariance.make_local`."""
         joined = self.covariance.make_local(slots)
         if self.consistent:
-            self._refer_landmarks(joined)
+            self._transport_landmarks(joined)
 
     def correct(self, slots: IndexArray, found: Agreement) -> None:
         """Change the whole state and covariance by an update with landmarks `slots`, or nothing.
@@ -231,7 +231,7 @@ class FilterState:
         return self.R_world_angles @ rotation(camera[3:6]) @ body_rate_matrix(camera[3:6])
 
     def _transport(self, before: Array) -> None:
-        """Refer the covariance to the corrected state; `before` is the camera's (12,) that it still refers to.
+        """Transport the covariance to the corrected state; `before` is the camera's (12,) for which it holds.
 
         A displacement of camera and landmarks together is unobservable. What it changes in each coordinate depends on
         the state, though (how far the world's origin is, which way is depth), and an update moves the state. A filter
@@ -245,7 +245,7 @@ class FilterState:
         J[3:6, 3:6] = np.linalg.solve(A, A_before)
         J[6:9, 3:6] = -se3.hat(change[6:9]) @ A_before
         self._transform_camera(J)
-        self._refer_landmarks(self.covariance.local)
+        self._transport_landmarks(self.covariance.local)
 
     def _turn_with(self, before: Array) -> None:
         """Carry the attitude's error through a step as a turn about the world's axes, not as one of the angles φ.
@@ -257,7 +257,7 @@ class FilterState:
         J[3:6, 3:6] = np.linalg.solve(self.turning(self.camera), self.turning(before))
         self._transform_camera(J)
 
-    def _refer_landmarks(self, slots: IndexArray) -> None:
+    def _transport_landmarks(self, slots: IndexArray) -> None:
         """The same for landmarks, those that became local last, by the displacement that the camera's [r, φ] has."""
         if not len(slots):
             return

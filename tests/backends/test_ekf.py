@@ -138,7 +138,7 @@ def test_augmentation_is_the_derivative_of_triangulation(drive, landmarks):
 
 @pytest.mark.parametrize("sigma", [1e-2, 1e-3])
 def test_without_noise_the_path_is_exact(sigma):
-    data = scene(path(200, 0.1, np.array([0.2, 0.1, 0.5]), np.array([0.3, 0.2, 0.4])), points=600, sigma=0.0)
+    data = scene(path(100, 0.1, np.array([0.2, 0.1, 0.5]), np.array([0.3, 0.2, 0.4])), points=600, sigma=0.0)
     models = EstimatorModels(pixel_sigma=sigma, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7)
     backend = EkfBackend(RIG, models)
     run(backend, data)

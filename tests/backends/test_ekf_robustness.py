@@ -257,7 +257,7 @@ def test_far_points_stay_before_the_camera(landmarks):
     Nor do they hold up the first steps: the inverse depth of some wants to be negative.
     """
     rng = np.random.default_rng(5)
-    poses = path(40, 0.1, np.array([0, 0, 2.0]), 0.02 * YAW)
+    poses = path(25, 0.1, np.array([0, 0, 2.0]), 0.02 * YAW)
     points = np.concatenate([cloud(poses, 60, rng, 4.0, 15.0), cloud(poses, 120, rng, 60.0, 400.0)])
     backend, known = EkfBackend(RIG, replace(MODELS, pixel_sigma=0.7), landmarks=landmarks), set()
     for k, T in enumerate(poses):

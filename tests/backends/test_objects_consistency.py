@@ -9,7 +9,7 @@ import pytest
 
 import backends
 from backends.ekf import EkfBackend
-from backends.ekf.objects_body import RIGID, CameraBelief, _learnt, advanced, found, referred
+from backends.ekf.objects_body import RIGID, CameraBelief, _learnt, advanced, found, transported
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
 from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
@@ -163,7 +163,7 @@ def test_the_filter_never_learns_where_in_a_body_its_frame_lies():
     change = np.concatenate([np.zeros(RIGID), 0.02 * rng.standard_normal(15)])
     nothing = np.zeros((len(change), 1))
     camera = CameraBelief(np.eye(4), np.eye(6), np.zeros((8, 6)))
-    after = referred(_learnt(before, change, nothing, nothing, np.zeros((1, 8))), before.points, camera)
+    after = transported(_learnt(before, change, nothing, nothing, np.zeros((1, 8))), before.points, camera)
     frame = np.concatenate([np.eye(6), np.zeros((6, 6)), after.points.by_frame()])
     np.testing.assert_allclose(after.covariance, 1e-4 * frame @ frame.T, atol=1e-12)
     np.testing.assert_allclose(after.cross, frame @ with_map, atol=1e-9)
@@ -359,6 +359,7 @@ def test_a_body_changes_neither_camera_nor_map(body):
     np.testing.assert_array_equal(found.covariances, expected.covariances)
 
 
+@pytest.mark.slow
 def test_the_camera_is_consistent_with_bodies_and_after_them():
     """NEES over eight walks, mean of three frames with the body and of three after it."""
     found = np.mean([drive_with_body(seed, "right")[0] for seed in range(8)], axis=0)

@@ -154,6 +154,7 @@ def loop(laps: float, frames_a_lap: int):
     return se3.inverse(poses[0]) @ poses, se3.transform(se3.inverse(poses[0]), points)
 
 
+@pytest.mark.slow
 def test_landmarks_seen_again_tie_the_trajectory_together():
     frames = 90
     poses, points = loop(1.15, frames)
@@ -173,6 +174,7 @@ def test_landmarks_seen_again_tie_the_trajectory_together():
     assert deviations[1] < 0.5 * deviations[0], "the smoother knows that it knows better"
 
 
+@pytest.mark.slow
 def test_a_fixed_lag_keeps_the_path_and_bounds_the_problem():
     data = drive(80, points=400)
     full, lagged = SmootherBackend(RIG, MODELS, lag=None), SmootherBackend(RIG, MODELS, lag=15, window=10, explicit=30)

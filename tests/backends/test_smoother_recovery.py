@@ -55,8 +55,7 @@ def test_what_is_known_of_the_pose_in_the_world_outlasts_the_lag():
     assert np.sqrt(np.diag(backend.estimate(landmarks=False).covariance)).max() < 0.3
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("lag", [None, 50])
+@pytest.mark.parametrize(("lag", "seed"), [(None, 0), (None, 1), (50, 2)])
 def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed):
     """Two landmarks, then six seconds in the dark: no linearisation in the world holds for what is seen then."""
     rng = np.random.default_rng(seed)

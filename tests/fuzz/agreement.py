@@ -219,7 +219,7 @@ def batch(rng: np.random.Generator, folder: Path) -> None:
 _PROMISE = "ids, counts, shapes and stamps exact; pose, landmarks and covariances those of dense least squares"
 
 SUBJECTS = (
-    Subject("answers of ekf", "sequences of calls with good data", _PROMISE, ekf, short=4),
-    Subject("answers of smoother", "the same", _PROMISE, smoother, short=4),
+    Subject("answers of ekf", "sequences of calls with good data", _PROMISE, ekf, short=2),
+    Subject("answers of smoother", "the same", _PROMISE, smoother, short=2),
     Subject("answers of batch", "the same", _PROMISE, batch, short=2),
 )

@@ -266,9 +266,9 @@ def _check(result: slam.FrameResult) -> None:
 
 SUBJECTS = (
     Subject("images of features", "features with images of other sizes and types, three kinds of rig",
-            "a sound result or one line", images_of_features, short=20),
+            "a sound result or one line", images_of_features, short=8),
     Subject("front ends", "front ends whose features, patches and aligned pixels are wrong, or that raise",
-            "a sound result or one line; later frames are taken", front_ends, short=15),
+            "a sound result or one line; later frames are taken", front_ends, short=8),
     Subject("interrupts", "interrupts at any line of a step with images, then copies", "the next frames are tracked",
             interrupts, short=6),
     Subject("same bytes", "images, some dark or without a right one; copies, one thread or two, overlap or none",

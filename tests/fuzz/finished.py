@@ -151,5 +151,5 @@ def _hostile(rng: np.random.Generator, tree: Any) -> Any:
 SUBJECTS = (
     Subject("finished work", "run, plot, view, compare and calibrate on changed files of earlier commands",
             "exit status 0, 1 and a line where no frame was tracked, or 2 and one line", commands,
-            quiet=False, short=15),
+            quiet=False, short=6),
 )  # fmt: skip

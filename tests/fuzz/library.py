@@ -263,7 +263,7 @@ SUBJECTS = (
     Subject("features", "hostile features between good ones, both back ends", "a sound result or one line",
             hostile_features, quiet=False, short=40),
     Subject("images", "hostile images, stamps and indices", "a result or one line", hostile_images, quiet=False,
-            short=15),
+            short=8),
     Subject("calls of ekf", "sequences of calls with hostile stamps, pixels, guesses and covariances", _SOUND,
             ekf_calls, quiet=False, short=30),
     Subject("calls of smoother", "the same", _SOUND, smoother_calls, quiet=False, short=20),

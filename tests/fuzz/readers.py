@@ -288,7 +288,7 @@ def write(files: Files, root: Path) -> None:
 SUBJECTS = (
     Subject(
         "folders", "mutated folders of every format: names, tables, calibrations, images, pipes, devices",
-        "a sequence of sound frames or one line", read_folder, short=120,
+        "a sequence of sound frames or one line", read_folder, short=60,
     ),
     Subject(
         "paths", "hostile paths and options of sequences", "a sequence or one line", read_path, short=60,

@@ -317,7 +317,7 @@ SUBJECTS = (
     Subject("maps", "mutated maps with right checksums, and runs that start in them", "a run or one line", read_map,
             quiet=False),
     Subject("extreme maps", "maps of 10⁵ landmarks, or scaled by 10⁻²⁰ to 10²⁰", "a run or one line", large_map,
-            quiet=False, short=25),
+            quiet=False, short=15),
     Subject("kept calibrations", "mutated files of a rig's errors, and runs that begin with them", "a run or one line",
             kept_calibration, short=40),
     Subject("recordings", "mutated recordings, replayed into both back ends", "a run or one line", read_recording,

@@ -32,8 +32,8 @@ def test_a_copy_of_the_filter_goes_on_to_the_same_bytes(copied, after, setting):
     for k in range(after):
         system.process_features(SEQUENCE.observations(FIRST + k))
     other = copied(system)
-    whole = go_on(system, after, 26)  # the one does not notice the other
-    assert go_on(other, after, 26) == whole
+    whole = go_on(system, after, after + 6)  # the one does not notice the other
+    assert go_on(other, after, after + 6) == whole
 
 
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)

@@ -95,7 +95,7 @@ def interrupt_often(system: StereoSlam, frames: Iterator[Any], points: int) -> N
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_interrupted_at_any_line_the_next_frames_are_tracked(backend):
-    cloud, points = Cloud(150), 24
+    cloud, points = Cloud(150), 12
     system, truth = StereoSlam(RIG, None, backend, config=CONFIG), path(3 * points + 12)
     frames = (cloud.features(T, k / 30, 0.3)[0] for k, T in enumerate(truth))
     for _ in range(8):
@@ -115,7 +115,7 @@ def test_interrupted_where_a_body_moves(backend):
         pass
     assert interrupted(system, next(frames), 100)
     assert system.process_features(next(frames)).objects  # interrupted elsewhere, the detector goes on
-    interrupt_often(system, frames, 10)
+    interrupt_often(system, frames, 5)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -43,8 +43,8 @@ class Chain:
         if self.known is None:
             object.__setattr__(self, "known", np.zeros((len(self.poses), 6)))
 
-    def carried(self, ends: NDArray[np.intp]) -> Carried:
-        """How far each keyframe is off by what its stretch has carried to it, perturbing the pose at which that ends.
+    def propagated(self, ends: NDArray[np.intp]) -> Propagated:
+        """Error that each stretch has propagated to its keyframes, perturbing the pose at which it ends.
 
         Args:
             ends: the keyframes that bound stretches, ascending, the first and the last one among them.
@@ -59,14 +59,14 @@ class Chain:
             total = np.cumsum(step, axis=0)
             total -= total[begin]
             parts.append(total)
-        return Carried(*parts)
+        return Propagated(*parts)
 
     def motion(self, first: int, second: int) -> tuple[Array, Array]:
         """Motion (4, 4) from one keyframe to another, and its covariance (6, 6), perturbing on the right."""
         a, b = sorted((first, second))
         rows = slice(a, b + 1)
         part = Chain(self.poses[rows], self.steps[rows], self.common[rows], self.known[rows])
-        noise, common, known = (each[-1] for each in part.carried(np.unique([0, b - a])))
+        noise, common, known = (each[-1] for each in part.propagated(np.unique([0, b - a])))
         P = noise + common @ common.T
         T = inverse(self.poses[a]) @ self.poses[b] @ exp(known)
         if first > second:
@@ -75,8 +75,8 @@ class Chain:
         return T, P
 
 
-class Carried(NamedTuple):
-    """What each keyframe's stretch has carried to it.
+class Propagated(NamedTuple):
+    """What each keyframe's stretch has propagated to it.
 
     Attributes:
         noise: covariance (K, 6, 6).
@@ -89,7 +89,7 @@ class Carried(NamedTuple):
     known: Array
 
 
-def spread(chain: Chain, ends: NDArray[np.intp], carried: Carried, moved: Array, common: Array) -> Array:
+def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: Array, common: Array) -> Array:
     """Poses (K, 4, 4) of all keyframes, from those of some: each stretch's change is shared out.
 
     What the common errors say of each step goes to that step, the rest in proportion to the noise.
@@ -97,18 +97,18 @@ def spread(chain: Chain, ends: NDArray[np.intp], carried: Carried, moved: Array,
     Args:
         chain: the path.
         ends: the keyframes (M,) that bound stretches.
-        carried: see `Chain.carried`.
+        propagated: see `Chain.propagated`.
         moved: their new poses (M, 4, 4).
         common: the common errors (m,).
     """
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch
     rest = inverse(chain.poses) @ chain.poses[ends[at + 1]]
-    known = carried.common @ common + carried.known
+    known = propagated.common @ common + propagated.known
     change = log(inverse(chain.poses[ends[1:]]) @ chain.poses[ends[:-1]] @ inverse(moved[:-1]) @ moved[1:])
-    whole = carried.noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
+    whole = propagated.noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
     weight = np.linalg.solve(whole, (change - known[ends[1:]])[:, :, None])
-    part = known + (carried.noise @ weight[at])[:, :, 0]
+    part = known + (propagated.noise @ weight[at])[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change
     out = shared_out(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)

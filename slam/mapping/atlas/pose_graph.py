@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
-from slam.mapping.atlas.chain import Carried, Chain, adjoints, spread
+from slam.mapping.atlas.chain import Chain, Propagated, adjoints, spread
 from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class PoseGraph:
     def solution(self) -> Solution:
         """What it says of all keyframes."""
         p, P = self.problem, self.normal.covariance([len(self.poses) - 1])
-        moved = spread(self.chain, p.ends, p.carried, self.poses, self.common)
+        moved = spread(self.chain, p.ends, p.propagated, self.poses, self.common)
         return Solution(moved, P, self.common, self.disagreement())
 
 
@@ -122,7 +122,7 @@ class _Problem:
         roots: of their information (E, 6, 6): a residual r weighs |root r|².
         common: derivative of the motions by the common errors (E, 6, m).
         known: by what they are known to be off (E, 6).
-        carried: of all keyframes, see `slam.mapping.atlas.chain.Chain.carried`.
+        propagated: of all keyframes, see `slam.mapping.atlas.chain.Chain.propagated`.
     """
 
     ends: NDArray[np.intp]
@@ -132,16 +132,16 @@ class _Problem:
     roots: Array
     common: Array
     known: Array
-    carried: Carried
+    propagated: Propagated
 
     @classmethod
     def of(cls, chain: Chain, loops: Sequence[Loop], also: Sequence[int]) -> _Problem:
         last = len(chain.poses) - 1
         ends = np.unique([0, last, *also, *(k for loop in loops for k in (loop.first, loop.second))]).astype(np.intp)
-        carried = chain.carried(ends)
+        propagated = chain.propagated(ends)
         begin, end = ends[:-1], ends[1:]
-        common, known = carried.common[end], carried.known[end]
-        covariances = np.concatenate([carried.noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
+        common, known = propagated.common[end], propagated.known[end]
+        covariances = np.concatenate([propagated.noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
         motions = inverse(chain.poses[begin]) @ chain.poses[end]
         return cls(
             ends,
@@ -151,7 +151,7 @@ class _Problem:
             _root_of_information(covariances),
             np.concatenate([common, np.zeros((len(loops), *common.shape[1:]))]),
             np.concatenate([known, np.zeros((len(loops), 6))]),
-            carried,
+            propagated,
         )
 
     def with_loop(self, loop: Loop) -> _Problem:
@@ -164,7 +164,7 @@ class _Problem:
             np.concatenate([self.roots, _root_of_information(loop.covariance[None])]),
             np.concatenate([self.common, np.zeros((1, *self.common.shape[1:]))]),
             np.concatenate([self.known, np.zeros((1, 6))]),
-            self.carried,
+            self.propagated,
         )
 
     def expected(self, common: Array) -> Array:

@@ -200,6 +200,7 @@ def test_a_run_without_a_map_is_no_error_after_a_run(tmp_path, caplog):
     assert "no picture: " in caplog.text
 
 
+@pytest.mark.slow
 def test_matplotlib_is_loaded_by_pictures_alone(tmp_path):
     words = ["run", "synthetic:desk?frames=2&width=64&height=48", "-q", "--overwrite", "-o", str(tmp_path)]
     code = f"""

@@ -22,6 +22,12 @@ def every():
     return list(settings())
 
 
+@pytest.fixture
+def read(every, monkeypatch):
+    """The settings are read once for all tests of their listing."""
+    monkeypatch.setattr("slam.commands.settings.settings", lambda: every)
+
+
 def test_every_setting_is_there_with_its_defaults(every):
     shown = {s.key: s for s in every if not s.owner}
     for kind in ("handheld", "driving"):
@@ -152,18 +158,18 @@ def test_docstrings_of_bases_count():
 
 
 @pytest.mark.parametrize("width", [80, 100])
-def test_the_listing_fits(width):
+def test_the_listing_fits(read, width):
     assert max(map(len, listing(None, width).splitlines())) <= width
 
 
 @pytest.mark.parametrize("wanted", ["map", "map.grid", "models.motion", "ekf", "backend", "surf"])
-def test_a_part_of_the_listing(wanted):
+def test_a_part_of_the_listing(read, wanted):
     shown = listing(wanted, 80)
     assert ("map.grid" in shown) == wanted.startswith("map")
     assert ("backend.iterations" in shown) == (wanted in ("ekf", "backend"))
 
 
-def test_defaults_are_shown_as_they_are_typed(every):
+def test_defaults_are_shown_as_they_are_typed(read, every):
     lines = listing(None, 100).splitlines()
     for s in every:
         line = next(line for line in lines if line.startswith(f"  {s.key} = "))
@@ -172,7 +178,7 @@ def test_defaults_are_shown_as_they_are_typed(every):
             assert value.startswith(json.dumps(s.defaults["handheld"])), line
 
 
-def test_an_unknown_section():
+def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
         listing("mapp", 80)
     with pytest.raises(SlamError, match=r"there is map\.grid, frontend\.grid"):

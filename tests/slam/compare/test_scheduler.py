@@ -79,6 +79,7 @@ def test_nobody_answers():
         DaskScheduler("tcp://127.0.0.1:1", 0.5).run([job("a", jobs.double, 1)], lambda *_: None)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Dask's own
 def test_a_cluster_of_separate_processes(tmp_path):
     distributed = pytest.importorskip("distributed")

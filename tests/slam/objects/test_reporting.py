@@ -45,6 +45,7 @@ def moving_box():
     return step, backend
 
 
+@pytest.mark.slow
 def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
     step, _ = moving_box
     rows = [thing for k in range(FIRST, GONE) for thing in step(k).objects]

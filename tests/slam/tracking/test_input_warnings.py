@@ -42,7 +42,11 @@ def stamped(stamps):
     return [replace(FRAME, index=k, stamp=stamp) for k, stamp in enumerate(stamps)]
 
 
-@pytest.mark.parametrize("world", [name for name in worlds.names() if name != "drive"])  # which needs a file
+LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("field", "people", "town")]  # seconds to draw
+SMALL = sorted(set(worlds.names()) - {"drive", "field", "people", "town"})  # a drive needs a file
+
+
+@pytest.mark.parametrize("world", [*SMALL, *LARGE])
 def test_worlds_are_right(world):
     sequence = slam.open_sequence(f"synthetic:{world}?frames=2")
     found = pair_geometry(sequence.rig, *images(next(iter(sequence))), 1.5)

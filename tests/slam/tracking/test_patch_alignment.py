@@ -157,7 +157,7 @@ def test_without_a_pose_or_images_nothing_moves_and_switched_off_nothing_is_kept
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_features_slide_less(backend):
     """Reprojection errors of the true path are half as large; all else is the same."""
-    sequence = slam.open_sequence("synthetic:desk?frames=12")
+    sequence = slam.open_sequence("synthetic:desk?frames=8")
     config = SystemConfig.for_kind(sequence.kind, "surf", backend)
     true = sequence.ground_truth.poses
     slid = {}

@@ -176,6 +176,7 @@ def test_a_loop_that_contradicts_the_path_is_refused(sequence):
     assert all(abs(now - then - LAP) <= 8 for now, then in told)
 
 
+@pytest.mark.slow
 def test_one_keyframe_alone_closes_no_loop(sequence):
     _, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=2")
     _, single = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.agreeing=1")
