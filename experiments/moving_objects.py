@@ -327,7 +327,7 @@ def worlds_together(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row for each world: medians over the seeds, and all objects that are none."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        found.setdefault(row["world"].rpartition("seed=")[0].rstrip("?&"), []).append(row)
+        found.setdefault(row["world"].partition("seed=")[0].rstrip("?&"), []).append(row)
     medians = ("ATE [mm]", "camera NEES", "false moving per 1000 still", "counted right", "objects [ms]")
     return [
         {
@@ -350,12 +350,6 @@ def text(value: Any) -> str:
     if isinstance(value, list):
         value = ", ".join(map(str, value)) or None
     return "–" if value is None else str(value)
-
-
-def rounded(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: rounded(value) for key, value in tree.items()}
-    return float(f"{tree:.3g}") if isinstance(tree, float) else tree
 
 
 def main() -> int:
@@ -381,7 +375,7 @@ def main() -> int:
         if arguments.resume and kept.exists():
             rows = json.loads(kept.read_text())
         else:
-            rows = rounded(parts[name](not arguments.observations, arguments.quick, arguments.out))
+            rows = parts[name](not arguments.observations, arguments.quick, arguments.out)
         shown = worlds_together(rows) if name == "still" else rows
         print(f"\n# {TITLES[name]}\n\n{parts[name].__doc__}\n\n{table(shown)}", flush=True)
         kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")

@@ -15,7 +15,8 @@ from slam.settings import apply_settings
 from slam.tracking.association import AssociationConfig
 
 #: Map management by kind of motion: a car does not soon come back to what lies behind it, and comes so much nearer to
-#: what lies ahead that descriptors change.
+#: what lies ahead that descriptors change. With 200 landmarks, errors on three drives and in three seeds of `street`
+#: are those of 300, or smaller.
 MAPS = {
     "handheld": MapConfig(),
     "driving": MapConfig(
@@ -23,8 +24,8 @@ MAPS = {
     ),
 }
 
-#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter;
-#: that features would slide over surfaces then is what their alignment is for.
+#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter.
+#: Alignment keeps these features from sliding over surfaces.
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
     "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),

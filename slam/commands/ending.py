@@ -14,9 +14,10 @@ from slam.files import reason
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Bad input ends the process with one line and exit status 2; a signal's status is 128 + its number.
+    """Errors end the process with one line and an exit status.
 
-    With the environment variable SLAM_DEBUG, errors show their traceback instead.
+    Bad input, files that cannot be read or written, and too little memory: 2. A reader of the output that has gone: 1.
+    A signal: 128 + its number. With the environment variable SLAM_DEBUG, a `SlamError` shows its traceback instead.
     """
     try:
         yield

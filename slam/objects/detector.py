@@ -393,7 +393,7 @@ class MovingObjectDetector:
                     self._outgrow(body, len(mine), older)
 
     def _outgrow(self, body: Body, count: int, older: Mapping[int, Body]) -> None:
-        """Let a young body, of which `count` members are seen, take the place of an older one that goes with it."""
+        """Let a young body, of which `count` members are seen, take the place of an older one that moves alike."""
         tracks = self.tracks
         assert tracks is not None
         for known in older.values():

@@ -44,7 +44,7 @@ def outcome(
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
         causes.append(
-            f"{few} dropped, so that others are far apart: make a frame cheaper (smaller images, --set "
+            f"{few} dropped, and the frames about them are far apart: make a frame cheaper (smaller images, --set "
             "objects.mode=off), or move more slowly"
         )
     return f"{how} tracked; likely cause: {'; and '.join(causes)}"

@@ -127,7 +127,7 @@ def run(
         prior_map=known,
         rig_prior=rig_prior,
     )
-    if live is not None:  # its clock starts with its first frame, which does not wait for kernels then
+    if live is not None:  # before its clock starts, with its first frame
         warm_up(options.backend if options.backend in BACKENDS else BACKENDS[0], until=until)
     record = RunRecord()
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)

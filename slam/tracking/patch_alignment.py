@@ -2,7 +2,8 @@
 
 A detector finds a feature at another place of the surface as the view changes. The place is therefore corrected: what
 was seen there first, warped as a small surface that faces the camera would be, is aligned to what is seen now. It is
-taken anew, at the place to which it was aligned, where it is seen much larger or smaller; and where it fits no more.
+taken anew, at the place to which it was aligned, where it is seen larger or smaller by a fifth; and where it fits no
+more.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches
 
 _LARGEST = 1.5  # factor by which a patch may have grown or shrunk at most: `Patches` hold no more
-_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew where it is found: one such change more fits
+_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew: a second change like it stays below the largest
 _FORGOTTEN = 10  # frames without a measurement after which a patch is given up
 
 

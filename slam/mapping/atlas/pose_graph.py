@@ -221,11 +221,10 @@ class _Problem:
                 if less <= cost:
                     poses, common, gain, cost = moved, common + half * change, cost - less, less
                     break
-            if (gain < _CONVERGED and half == 1) or (
-                less > cost and fresh
-            ):  # a part of a step may gain little anywhere
+            worse, whole = less > cost, half == 1
+            if (gain < _CONVERGED and whole) or (worse and fresh):  # a part of a step may gain little anywhere
                 break
-            fresh = less > cost or half < 1 or gain > _FAST * before
+            fresh = worse or not whole or gain > _FAST * before
             normal = self.normal(poses, common) if fresh else normal
         return poses, common, normal
 
