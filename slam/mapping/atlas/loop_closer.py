@@ -297,7 +297,7 @@ class LoopCloser:
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas, None
         atlas = replace(atlas, confirmed=True)
-        if atlas.loops and not says_more(P, loop):
+        if atlas.loops and not says_more(graph, atlas.loops[-1], loop):
             return atlas, None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
@@ -339,14 +339,14 @@ class LoopCloser:
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
 
 
-def says_more(covariance: Array, loop: Loop) -> bool:
-    """Whether a loop tells something new, given the `covariance` (6, 6) of its pose by the path and the loops so far.
+def says_more(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
+    """Whether a loop tells more of where the camera is, in any direction, than the path since the last one does.
 
-    Right after a loop like it, that is this loop's own covariance and what the path since then has added. It tells
-    something new once the path has added more than that in any direction. The path's common errors count as the loops
-    have left them: in a place that is seen again and again they are soon known.
+    The path's common errors are as uncertain as the loops so far have left them: in a place that is seen again and
+    again they are soon known, and most loops tell nothing new.
     """
-    return bool(eigvalsh(covariance, loop.covariance)[-1] > 2.0)
+    _, P = graph.relative_pose(last.second, loop.second)
+    return bool(eigvalsh(P, loop.covariance)[-1] > 1.0)
 
 
 def _inliers(one: tuple[Loop, Verified]) -> int:
