@@ -399,7 +399,7 @@ class MovingObjectDetector:
         for known in older.values():
             theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
             fewer = known.measured and len(theirs) < count and known.id != body.apart_from
-            if fewer and membership.overlapped({body.id: body}, tracks, theirs, known) is not None:
+            if fewer and membership.part_of(body, tracks, theirs):
                 self.bodies[known.id] = self._in_place_of(known, body, theirs)
                 tracks.body[tracks.body == body.id] = known.id
                 del self.bodies[body.id]
