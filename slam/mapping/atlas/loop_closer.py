@@ -37,7 +37,7 @@ from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import LandmarkMatches, Localizer
 
 if TYPE_CHECKING:
-    pass
+    from slam.mapping.atlas.pose_graph import PoseGraph
 
 _NEARBY = 4  # keyframes that are compared as the path is near them, besides those that look alike
 _CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
