@@ -28,7 +28,7 @@ OF_THE_PACKAGE = {"pip", "pytest", "ruff", "mypy", "mkdocs", "pre-commit", "pyth
 #: They end by a signal only; tests/slam/compare/test_cluster.py starts them.
 SERVERS = {"dask"}
 #: A camera, recordings of ROS, and timings.
-NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/")
+NOT_AT_HAND = re.compile(r"^camera:|\.(bag|mcap|db3)(\?|$)|^walk_folder$|^benchmarks/|^experiments/cost\.py$")
 #: What the page shows, and what is run in its place.
 STAND_INS = {
     "path/to/kitti_or_euroc_folder": "euroc",

@@ -228,9 +228,12 @@ def test_a_closed_terminal_leaves_a_summary(tmp_path, ignored):
     """And where it is to be ignored, as `nohup` has it, the run goes on."""
     frames = 12 if ignored else 2000
     command = [sys.executable, "-m", "slam", "run", f"synthetic:desk?frames={frames}&width=128&height=96"]
-    before = (lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)) if ignored else None
+    handler = signal.SIG_IGN if ignored else signal.SIG_DFL  # whatever the tests themselves were started with
     process = subprocess.Popen(
-        [*command, "--out", str(tmp_path), "--quiet"], stderr=subprocess.PIPE, text=True, preexec_fn=before
+        [*command, "--out", str(tmp_path), "--quiet"],
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, handler),
     )
     path = tmp_path / "trajectory.txt"
     deadline = time.monotonic() + 120
