@@ -45,7 +45,7 @@ from slam.objects.twists import fit_twist
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_SETTLED = 0.4  # [s] for which a body was measured, from which it is remembered in any case
+_SETTLED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
 class MovingObjectDetector:
@@ -306,7 +306,7 @@ class MovingObjectDetector:
         return body
 
     def _in_place_of(self, known: Body, body: Body, mine: NDArray[np.intp]) -> Body:
-        """A body under the id of a known one, of which it shows more, and whose seen members `mine` go over to it."""
+        """A body under the id of a known one that is a part of it; its seen members `mine` go over."""
         tracks = self.tracks
         assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
@@ -376,7 +376,7 @@ class MovingObjectDetector:
         tracks = self.tracks
         assert tracks is not None
         for id in sorted(self.bodies, reverse=True):
-            body = self.bodies.get(id)  # it may have taken another's place
+            body = self.bodies.get(id)  # it may have taken the place of another
             if body is not None and body.measured:
                 mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
                 older = {id: other for id, other in self.bodies.items() if id < body.id}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from itertools import chain
 
 from slam.data import FrameResult
 from slam.runtime.compile_clock import compile_clock
@@ -28,7 +29,7 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
 
     Args:
         backends: names of the back ends that will be used; default: all of this package.
-        until: ends it early when it is set.
+        until: ends it early when it is set, after the frame that it is at.
 
     Returns:
         The wall time in which kernels were compiled [s]; 0 where all were loaded.
@@ -41,8 +42,7 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
         >>> seconds = slam.warm_up("ekf")
     """
     before = compile_clock.seconds()
-    for frame in (frame for backend in backends or BACKENDS for frame in _frames(backend)):
-        del frame
+    for _ in chain.from_iterable(_frames(backend) for backend in backends or BACKENDS):
         if until is not None and until.is_set():
             break
     return compile_clock.seconds() - before

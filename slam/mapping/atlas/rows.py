@@ -58,7 +58,11 @@ class KeyframeRows:
         return self.room[4][: self.count]
 
     def with_new(self, keyframe: Keyframe) -> KeyframeRows:
-        """With one more keyframe. Earlier rows are shared with `self`, which stays as it is."""
+        """With one more keyframe.
+
+        The arrays are shared with `self`, whose own rows stay as they are; of two that continue the same one, only the
+        later holds.
+        """
         k, room = self.count, self.room
         new = tuple(
             np.asarray(value, np.float64)
