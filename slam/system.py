@@ -120,7 +120,7 @@ class StereoSlam:
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
         self.world_frame = FIRST_FRAME if prior_map is None else prior_map.world_frame
-        self._rig_error = RemainingRigError(self.calibration, c.models.pixel_sigma)
+        self._rig_error = RemainingRigError(self.calibration, c.models)
         self._localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
         self._aligner = Aligner(rig, c.association.align)
         self._mapper = Mapper(rig, c.map, self._localizer, self.backend)
@@ -285,7 +285,9 @@ class StereoSlam:
     def _estimate_pose(self, report: UpdateReport) -> Estimate:
         """The camera's pose, after an update; what the rig's error does to it is taken down."""
         estimate = require_estimate(self.backend.estimate(landmarks=False), self.backend)
-        self._rig_error.uncertainty.observe(estimate.T_world_left, report.used, self._positions(report.used))
+        self._rig_error.uncertainty.observe(
+            estimate.T_world_left, estimate.stamp, report.used, self._positions(report.used)
+        )
         return estimate
 
     def _manage(self, seen: Associated, step: Step) -> tuple[MapChange, Anchors]:

@@ -5,56 +5,32 @@ as pixel noise does. With δ the error of the applied correction and ``Σ`` its 
 
     T_true = T exp(J δ),    y_true = y + L δ,
 
-and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. J follows
-in every frame from the landmarks that measured the pose: pixels that an ideal rig would have measured, ``z + F δ``, see
-landmarks that are displaced by L δ,
-
-    H (Rᵀ L + [h]ₓ J_ω − J_ρ) = F,
-
-which is solved for J by weighted least squares. A new landmark has ``L = R (H⁻¹ F − [h]ₓ J_ω + J_ρ)``. Where old
-landmarks are measured again, J goes back to what it was when they were first seen.
+and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. J and L
+follow from what was measured, by a filter of their own (`slam.calibration.sensitivity`). It follows `_FOLLOWED` of the
+landmarks that were measured lately, chosen by chance, which bounds its cost.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from slam.calibration.model import RigModel
+from slam.calibration.sensitivity import Followed, Frozen
 from slam.data import Estimate
 from slam.geometry.arrays import Array, IdArray
-from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
+from slam.models import EstimatorModels
 
 #: Standard deviation of the baseline's length, as a share of it. It scales the whole world, so images never show it:
 #: the squares of a calibration board are known to some tenths of a percent.
 BASELINE = 0.002
 
-
-@dataclass(frozen=True)
-class _Landmarks:
-    """Sensitivities of landmarks, a row each, ids ascending.
-
-    Attributes:
-        ids: (N,).
-        by_rig: ∂y/∂δ (N, 3, m).
-        covariance: of the position by pixel noise at first sight (N, 3, 3) [m²], relative to the camera.
-        seen: number of frames that measured it (N,).
-    """
-
-    ids: IdArray
-    by_rig: Array
-    covariance: Array
-    seen: IdArray
-
-    @classmethod
-    def none(cls, columns: int) -> _Landmarks:
-        return cls(np.zeros(0, np.int64), np.zeros((0, 3, columns)), np.zeros((0, 3, 3)), np.zeros(0, np.int64))
-
-    def select(self, rows: np.ndarray) -> _Landmarks:
-        return _Landmarks(self.ids[rows], self.by_rig[rows], self.covariance[rows], self.seen[rows])
+_FOLLOWED = 60  # landmarks in the filter at most
+_UNSEEN = 3  # frames after which a landmark that is not measured is followed no more
+_LONGEST = 1.0  # time [s] after which nothing is known of a motion
 
 
 class RigUncertainty:
@@ -65,64 +41,72 @@ class RigUncertainty:
 
     Args:
         model: the rig's parameters.
-        pixel_sigma: noise of uL, vL, uR [px].
+        models: noise of the pixels, and of the motion.
         applied: the correction (n,) that the path begins with.
 
     Attributes:
         kept: the correction (n,) that the path was made with, as far as changes of it are in the covariance.
     """
 
-    def __init__(self, model: RigModel, pixel_sigma: float, applied: Array) -> None:
+    def __init__(self, model: RigModel, models: EstimatorModels, applied: Array) -> None:
         self._model = model
+        self._motion = models.motion
         self.kept, self._applied = applied, applied
-        self._noise = pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
+        self._noise = models.pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
-        self._T_world: Array | None = None
-        self._pose: Array = np.zeros((6, self._columns))
-        self._landmarks = _Landmarks.none(self._columns)
+        self._stamp = 0.0
+        self._followed: Followed | None = None
+        self._others = Frozen.none(self._columns)
 
-    def observe(self, T_world_left: Array, ids: IdArray, positions: Array) -> None:
+    def observe(self, T_world_left: Array, stamp: float, ids: IdArray, positions: Array) -> None:
         """Take in a frame.
 
         Args:
             T_world_left: the estimated pose (4, 4).
+            stamp: its time [s].
             ids: landmarks that measured it (M,).
             positions: their estimated positions (M, 3) [m] in world coordinates.
         """
         T = T_world_left @ self._model.rig.rectified.T_left_rectified
-        if self._T_world is not None:
-            self._pose = adjoint(inverse(T) @ self._T_world) @ self._pose
-        self._T_world = T
-        known = self._landmarks
-        rows = np.searchsorted(known.ids, ids).clip(0, max(len(known.ids) - 1, 0))
-        old = known.ids[rows] == ids if len(known.ids) else np.zeros(len(ids), bool)
-        local = transform(inverse(T), positions[old])
-        good = local[:, 2] > 0
-        if good.sum() >= MINIMAL_POINTS:
-            self._solve(T[:3, :3], local[good], known.select(rows[old][good]))
-        seen = known.seen.copy()
-        seen[rows[old]] += 1
-        self._landmarks = replace(known, seen=seen)
+        before, others = self._followed, self._others
+        if before is None:
+            self._followed, self._stamp = Followed.start(T, self._columns), stamp
+            return
+        local = transform(inverse(T), positions)
+        ids, local = ids[local[:, 2] > 0], local[local[:, 2] > 0]
+        lately = before.ids[(before.unseen < _UNSEEN) | _isin(before.ids, ids)]
+        rows = np.flatnonzero(_isin(ids, others.ids))
+        wanted = _chosen(np.concatenate([lately, ids[rows]]))
+        now, others = self._exchanged(before, others, wanted)
+        now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
+        rows = rows[_isin(ids[rows], wanted)]
+        if len(rows):
+            again = np.searchsorted(others.ids, ids[rows])
+            now = now.seen_again(others.select(again), local[rows])
+            others = others.select(np.delete(np.arange(len(others.ids)), again))
+        place = {i: row for row, i in enumerate(now.ids.tolist())}
+        rows = np.array([place.get(i, -1) for i in ids.tolist()], np.intp)
+        if (rows >= 0).any():
+            rows, points = rows[rows >= 0], local[rows >= 0]
+            now = now.measured(rows, points, self._by_point(points), self._field(points), self._noise)
+        # In one statement, so that an interrupt finds all of it done or nothing.
+        self._followed, self._others, self._stamp = now, others, stamp
 
     def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""
-        assert self._T_world is not None
         if not len(ids) and not len(erased):
             return
-        kept = self._landmarks.select(~np.isin(self._landmarks.ids, erased))
-        new = ~np.isin(ids, np.concatenate([kept.ids, erased]))
-        local = transform(inverse(self._T_world), positions[new])
-        R = self._T_world[:3, :3]
-        back = np.linalg.inv(self._by_point(local))
-        by_rig = R @ (back @ self._field(local) - points_by_pose(local) @ self._pose)
-        covariance = R @ back @ self._noise @ np.swapaxes(back, 1, 2) @ R.T
-        both = _Landmarks(
-            np.concatenate([kept.ids, ids[new]]),
-            np.concatenate([kept.by_rig, by_rig]),
-            np.concatenate([kept.covariance, covariance]),
-            np.concatenate([kept.seen, np.ones(int(new.sum()), np.int64)]),
-        )
-        self._landmarks = both.select(np.argsort(both.ids, kind="stable"))
+        now, others = self._without(erased)
+        new = ~_isin(ids, np.concatenate([now.ids, others.ids, erased]))
+        if new.any():
+            ids, local = ids[new], transform(inverse(now.T_world), positions[new])
+            wanted = _chosen(np.concatenate([now.ids, ids]))
+            now, others = self._exchanged(now, others, wanted)
+            H, field, chosen = self._by_point(local), self._field(local), _isin(ids, wanted)
+            rest = now.seen_once(ids[~chosen], local[~chosen], H[~chosen], field[~chosen], self._noise)
+            now = now.first_seen(ids[chosen], local[chosen], H[chosen], field[chosen], self._noise)
+            others = others.joined(rest)
+        self._followed, self._others = now, others
 
     def see_anew(self, ids: IdArray, positions: Array) -> None:
         """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones: what they were before counts no more."""
@@ -131,7 +115,9 @@ class RigUncertainty:
 
     def keep(self, ids: IdArray) -> None:
         """Forget all landmarks but these (M,)."""
-        self._landmarks = self._landmarks.select(np.isin(self._landmarks.ids, ids))
+        if self._followed is not None:
+            known = np.concatenate([self._followed.ids, self._others.ids])
+            self._followed, self._others = self._without(np.setdiff1d(known, ids))
 
     def path_follows(self, applied: Array) -> None:
         """The correction becomes `applied` (n,), and so does that of the path."""
@@ -145,28 +131,32 @@ class RigUncertainty:
             positions: gives the positions (M, 3) [m] of landmarks by their ids (M,).
             landmarks_follow: the landmarks move to where the new correction sees them from the present pose.
         """
-        step, pose, marks = applied - self._applied, self._pose.copy(), self._landmarks
-        if self._T_world is not None and step.any():
-            by_rig = marks.by_rig.copy()
-            pose[:, -1] += pose[:, :-2] @ step
+        step, now, others = applied - self._applied, self._followed, self._others
+        if now is not None and step.any():
+            followed, old = now.by_rig.copy(), others.by_rig.copy()
+            followed[:6, -1] += followed[:6, :-2] @ step
             if not landmarks_follow:
-                by_rig[:, :, -1] += by_rig[:, :, :-2] @ step
-            elif len(marks.ids):
-                local = transform(inverse(self._T_world), positions(marks.ids))
-                by_rig[:, :, -1] = (-self._T_world[:3, :3] @ points_by_pose(local) @ pose[:, -1:])[:, :, 0]
-            marks = replace(marks, by_rig=by_rig)
+                followed[6:, -1] += followed[6:, :-2] @ step
+                old[:, :, -1] += old[:, :, :-2] @ step
+            else:
+                followed[6:, -1] = 0.0
+                if len(others.ids):
+                    local = transform(inverse(now.T_world), positions(others.ids))
+                    old[:, :, -1] = -(points_by_pose(local) @ followed[:6, -1]) @ now.T_world[:3, :3].T
+            now, others = replace(now, by_rig=followed), replace(others, by_rig=old)
         # In one statement, so that an interrupt finds all of it done or nothing.
-        self._pose, self._landmarks, self.kept, self._applied = pose, marks, self.kept + step, applied
+        self._followed, self._others, self.kept, self._applied = now, others, self.kept + step, applied
 
     def added_to(self, estimate: Estimate, covariance: Array) -> Estimate:
         """An estimate with the rig's uncertainty in its covariances; `covariance` (n, n) is that of the parameters."""
         factor = self._factor(covariance)
         J = self._by_left_camera() @ factor
         positions = estimate.covariances
-        if len(estimate.ids) and len(self._landmarks.ids):
-            rows = np.searchsorted(self._landmarks.ids, estimate.ids).clip(0, len(self._landmarks.ids) - 1)
-            known = self._landmarks.ids[rows] == estimate.ids
-            L = self._landmarks.by_rig[rows[known]] @ factor
+        ids, by_rig = self.landmarks()
+        if len(estimate.ids) and len(ids):
+            rows = np.searchsorted(ids, estimate.ids).clip(0, len(ids) - 1)
+            known = ids[rows] == estimate.ids
+            L = by_rig[rows[known]] @ factor
             positions = positions.copy()
             positions[known] += L @ np.swapaxes(L, 1, 2)
         return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
@@ -189,9 +179,23 @@ class RigUncertainty:
         J[:, -1] -= J[:, :-2] @ kept
         return J, self._factor(covariance)[:, :-1], np.concatenate([kept, [0.0, 1.0]])
 
+    @property
+    def pose(self) -> Array:
+        """Derivative of the pose (6, n + 2) in the axes of the rectified left camera."""
+        return np.zeros((6, self._columns)) if self._followed is None else self._followed.by_rig[:6]
+
+    def landmarks(self) -> tuple[IdArray, Array]:
+        """Ids (N,), ascending, and derivatives (N, 3, n + 2) of their positions in world coordinates."""
+        now = self._followed
+        if now is None:
+            return self._others.ids, self._others.by_rig
+        ids = np.concatenate([now.ids, self._others.ids])
+        order = np.argsort(ids, kind="stable")
+        return ids[order], np.concatenate([now.in_world(), self._others.by_rig])[order]
+
     def _by_left_camera(self) -> Array:
         """Derivative of the pose (6, n + 2) in the axes of the left camera."""
-        return adjoint(self._model.rig.rectified.T_left_rectified) @ self._pose
+        return adjoint(self._model.rig.rectified.T_left_rectified) @ self.pose
 
     def _factor(self, covariance: Array) -> Array:
         """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept.
@@ -205,18 +209,26 @@ class RigUncertainty:
         factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
         return factor
 
-    def _solve(self, R: Array, local: Array, landmarks: _Landmarks) -> None:
-        """Sensitivity of the pose from landmarks at `local` (M, 3) [m] in the rectified left camera's coordinates."""
-        H = self._by_point(local)
-        A = H @ points_by_pose(local)
-        b = self._field(local) - H @ (R.T @ landmarks.by_rig)
-        P = R.T @ landmarks.covariance @ R / landmarks.seen[:, None, None]
-        W = np.linalg.inv(self._noise + H @ P @ np.swapaxes(H, 1, 2))
-        WA = W @ A
-        normal = np.tensordot(A, WA, axes=((0, 1), (0, 1)))
-        right = np.tensordot(WA, b, axes=((0, 1), (0, 1)))
-        normal += 1e-9 * np.trace(normal) * np.eye(6)
-        self._pose = np.asarray(np.linalg.solve(normal, right))
+    def _motion_sigmas(self, dt: float) -> tuple[float, float]:
+        """Standard deviations of a motion [rad], [m] before anything is measured: the velocity's change, twice."""
+        v, w = np.sqrt(self._motion.velocity_variance(min(abs(dt), _LONGEST)))
+        return 2 * float(w) * min(abs(dt), _LONGEST), 2 * float(v) * min(abs(dt), _LONGEST)
+
+    def _without(self, erased: IdArray) -> tuple[Followed, Frozen]:
+        """What is followed, and the other landmarks, without some."""
+        assert self._followed is not None
+        now, others = self._followed, self._others
+        if not len(erased):
+            return now, others
+        return now.select(np.flatnonzero(~_isin(now.ids, erased))), others.select(~_isin(others.ids, erased))
+
+    def _exchanged(self, now: Followed, others: Frozen, wanted: IdArray) -> tuple[Followed, Frozen]:
+        """Without those that are not wanted any more, which join the others."""
+        stays = _isin(now.ids, wanted)
+        if stays.all():
+            return now, others
+        leaving = now.select(np.flatnonzero(~stays)).frozen()
+        return now.select(np.flatnonzero(stays)), others.joined(leaving)
 
     def _field(self, local: Array) -> Array:
         """∂(x, y, d)/∂δ (M, 3, m) [px] at points (M, 3) [m]; the corrected pixels are those of an ideal rig."""
@@ -236,3 +248,17 @@ class RigUncertainty:
         f, z, none = self._model.focal, local[:, 2], np.zeros(len(local))
         rows = [[f + none, none, -x], [none, f + none, -y], [none, none, -d]]
         return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) / z[:, None, None])
+
+
+def _chosen(ids: IdArray) -> IdArray:
+    """At most `_FOLLOWED` of some landmarks (N,): by chance, but each time the same ones."""
+    if len(ids) <= _FOLLOWED:
+        return ids
+    drawn = (ids.astype(np.uint64) * np.uint64(2654435761)) % np.uint64(2**32)
+    return ids[np.lexsort((ids, drawn))[:_FOLLOWED]]
+
+
+def _isin(ids: IdArray, others: IdArray) -> np.ndarray:
+    """As ``np.isin``, which takes ten times as long for so few."""
+    known = set(others.tolist())
+    return np.fromiter((i in known for i in ids.tolist()), bool, len(ids))

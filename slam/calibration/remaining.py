@@ -7,6 +7,7 @@ from slam.calibration.correction import Revision
 from slam.calibration.estimator import SelfCalibration
 from slam.data import Estimate
 from slam.interfaces import Backend, RevisingBackend
+from slam.models import EstimatorModels
 from slam.rig_error import CommonError
 
 #: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
@@ -18,17 +19,17 @@ class RemainingRigError:
 
     Args:
         calibration: what is known of the rig.
-        pixel_sigma: noise of uL, vL, uR [px].
+        models: noise of the pixels, and of the motion.
 
     Attributes:
         uncertainty: what the rig's uncertainty adds to the covariances of poses and landmarks.
         given: the correction of all that the back end was given.
     """
 
-    def __init__(self, calibration: SelfCalibration, pixel_sigma: float) -> None:
+    def __init__(self, calibration: SelfCalibration, models: EstimatorModels) -> None:
         self._calibration = calibration
         self.given = calibration.applied
-        self.uncertainty = RigUncertainty(calibration.model, pixel_sigma, self.given.parameters)
+        self.uncertainty = RigUncertainty(calibration.model, models, self.given.parameters)
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by what is known now; returns the change, None where there is none.
