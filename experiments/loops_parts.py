@@ -29,6 +29,7 @@ from slam.geometry.se3 import exp, inverse
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.keyframes import Loop
 from slam.mapping.atlas.pose_graph import PoseGraph, solve
+from slam.runtime.blas import one_blas_thread
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 from slam.worlds.export import write_euroc
@@ -84,6 +85,7 @@ def bounded() -> str:
     return markdown(header, rows, texts=2)
 
 
+@one_blas_thread  # as loops are closed
 def cost(keyframes: int) -> str:
     """CPU time of closing one more loop, at the end of a path of laps with a loop every so often."""
     rng = np.random.default_rng(0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
 from slam.mapping.atlas.places import PlaceIndex, Vectors
 from slam.mapping.atlas.rows import KeyframeRows
 from slam.rig_error import CommonError
+
+if TYPE_CHECKING:
+    from slam.mapping.atlas.pose_graph import Solution
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,8 @@ class Atlas:
         rows: their poses and what else the pose graph needs of them.
         index: which of them look alike.
         loops: those that the pose graph holds.
-        dropped: number of loops of this run that it holds no more.
+        spare: verified loops that it does not hold: refused, unconfirmed, or such that tell nothing new; the last ones.
+        dropped: number of loops of this run that it holds no more, to save time.
         refused: loops that contradict the path, as the numbers of both keyframes.
         corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
         anchor: how well the last of these is known; None without a loop.
@@ -81,6 +86,7 @@ class Atlas:
     rows: KeyframeRows = field(default_factory=KeyframeRows)
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
+    spare: tuple[Loop, ...] = ()
     dropped: int = 0
     refused: tuple[tuple[int, int], ...] = ()
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -127,10 +133,7 @@ class Atlas:
         return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
 
     def with_loop(self, loop: Loop, most: int) -> Atlas:
-        """With one loop more; of more than `most`, those are dropped whose neighbours on the path are nearest.
-
-        They stay in the poses that have been solved with them.
-        """
+        """With one loop more; of more than `most`, those are dropped whose neighbours on the path are nearest."""
         loops, dropped = (*self.loops, loop), self.dropped
         while len(loops) > most:
             at = np.array([self.keyframes[k.second].travelled for k in loops])
@@ -138,6 +141,34 @@ class Atlas:
             dropped += loops[least].second >= self.known
             loops = loops[:least] + loops[least + 1 :]
         return replace(self, loops=loops, dropped=dropped)
+
+    def with_spare(self, loop: Loop, most: int) -> Atlas:
+        """With one loop more that the pose graph does not hold; the last `most` are kept."""
+        return replace(self, spare=(*self.spare, loop)[-most:])
+
+    def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop], most: int) -> Atlas:
+        """With other loops in the pose graph; those that it held, and that are not `believed` any more, are refused.
+
+        The numbers of loops dropped before stay. Both are in order of their second keyframes.
+        """
+        good, kept = {x.pair for x in believed}, {x.pair for x in held}
+        out = [x for x in self.loops if x.pair not in kept]
+        refused = [pair for pair in self.refused if pair not in good]
+        refused += [x.pair for x in out if x.pair not in good]
+        spare = [x for x in (*self.spare, *out) if x.pair not in kept]
+        atlas = replace(self, loops=(), spare=tuple(spare[-most:]), refused=tuple(refused))
+        for loop in held:
+            atlas = atlas.with_loop(loop, most)
+        return replace(atlas, pending=held[-1], confirmed=True)
+
+    def solved_by(self, solution: Solution, rig: CommonError) -> Atlas:
+        """With the keyframes where the pose graph has them; `rig` says what its common errors stand for."""
+        return replace(
+            self,
+            corrected=solution.poses,
+            anchor=Anchor(solution.covariance, solution.common, rig),
+            T_map_odom=solution.poses[-1] @ inverse(self.keyframes[-1].T_odom_left),
+        )
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the frame whose place `frame` showed again, where it closed a loop."""

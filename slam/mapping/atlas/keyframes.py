@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam.data import IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, transform
+from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.rig_error import Correction
 
@@ -79,6 +79,17 @@ class Loop:
     T_first_second: Array
     covariance: Array
     inliers: int
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Numbers of both keyframes."""
+        return self.first, self.second
+
+
+def distance(expected: Array, found: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of two poses (4, 4)."""
+    xi = log(inverse(expected) @ found)
+    return float(xi @ np.linalg.solve(covariance, xi))
 
 
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:

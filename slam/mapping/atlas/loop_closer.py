@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,15 +12,16 @@ from scipy.linalg import eigvalsh
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.atlas import Anchor, Atlas
+from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.feature_file import FeatureFile
 from slam.mapping.atlas.keyframes import (
     Keyframe,
     Loop,
+    distance,
     features_with_depth,
     kept_features,
     step_covariance,
@@ -284,32 +285,52 @@ class LoopCloser:
         self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop where the path allows it and a keyframe just before has seen the same return."""
+        from slam.mapping.atlas.consensus import disagreement
         from slam.mapping.atlas.pose_graph import PoseGraph
 
         chain = atlas.chain(rig, path())
         common = None if atlas.anchor is None else atlas.anchor.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        T, P = graph.relative_pose(loop.first, loop.second)
         limit = self._config.gate_sigmas**2
-        if _distance(T, loop.T_first_second, P + loop.covariance) > limit:
-            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second))), None
+        if disagreement(graph, loop) > limit:
+            return self._refuse(atlas, chain, loop, seen, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
-            return atlas, None
+            return atlas.with_spare(loop, self._config.most_loops), None
         atlas = replace(atlas, confirmed=True)
         if atlas.loops and not says_more(graph, atlas.loops[-1], loop):
-            return atlas, None
+            return atlas.with_spare(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
-            return replace(atlas, refused=(*atlas.refused, (loop.first, loop.second)), pending=None), None
-        solution = graph.solution()
-        atlas = replace(
-            atlas.with_loop(loop, self._config.most_loops),
-            corrected=solution.poses,
-            anchor=Anchor(solution.covariance, solution.common, rig),
-            T_map_odom=solution.poses[-1] @ inverse(atlas.keyframes[-1].T_odom_left),
-        )
+            return self._refuse(replace(atlas, pending=None), chain, loop, seen, rig)
+        atlas = atlas.with_loop(loop, self._config.most_loops).solved_by(graph.solution(), rig)
         return atlas, self._returned(seen) if self._config.give_back else None
+
+    def _refuse(
+        self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError
+    ) -> tuple[Atlas, Returned | None]:
+        """Refuse a loop that contradicts the others; these instead, where fewer places speak for them."""
+        from slam.mapping.atlas.consensus import agreeing, spaced
+        from slam.mapping.atlas.pose_graph import PoseGraph
+
+        most, limit, refused = self._config.most_loops, self._config.gate_sigmas**2, {*atlas.refused, loop.pair}
+        atlas = replace(atlas.with_spare(loop, most), refused=(*atlas.refused, loop.pair))
+        left = self._config.return_depths * np.array([k.depth for k in atlas.keyframes])
+        every, start = (*atlas.loops, *atlas.spare), atlas.in_map(chain)
+
+        def places(loops: Sequence[Loop]) -> list[Loop]:
+            return spaced(loops, atlas.rows.travelled, left)
+
+        if not atlas.loops or len(places([x for x in atlas.spare if x.pair in refused])) < 2:
+            return atlas, None
+        rival = agreeing(chain, every, loop, chain.poses, limit)
+        if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
+            return atlas, None
+        before = {x.pair for x in atlas.loops}
+        held = {x.pair: x for x in (*places(rival), *(x for x in rival if x.pair in before), loop)}
+        atlas = atlas.with_loops(sorted(held.values(), key=lambda x: x.second), rival, most)
+        solution = PoseGraph.solved(chain, atlas.loops, start).solution()
+        return atlas.solved_by(solution, rig), self._returned(seen) if self._config.give_back else None
 
     def _agree(self, chain: Chain, before: Loop, loop: Loop) -> bool:
         """Whether two loops, a few keyframes one after the other, tell of the same return."""
@@ -320,7 +341,7 @@ class LoopCloser:
         expected = inverse(T_old) @ before.T_first_second @ T_new
         back, far = adjoint(inverse(T_new)), adjoint(inverse(expected))
         P = back @ before.covariance @ back.T + P_new + loop.covariance + far @ P_old @ far.T
-        return _distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
+        return distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
 
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's features that agree, in the coordinates of the present left camera."""
@@ -368,9 +389,3 @@ def _nearest(poses: Array, here: Array, depth: float, possible: BoolArray) -> ND
     distance = np.where(possible, places + views, np.inf)
     best = np.argsort(distance, kind="stable")[:_NEARBY]
     return np.asarray(best[np.isfinite(distance[best])])
-
-
-def _distance(expected: Array, found: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance of two poses (4, 4)."""
-    xi = log(inverse(expected) @ found)
-    return float(xi @ np.linalg.solve(covariance, xi))

@@ -1,0 +1,119 @@
+"""A false loop that was closed first does not keep the true ones out that come later."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from slam.config import SystemConfig
+from slam.geometry.se3 import Array, exp, inverse
+from slam.geometry.trajectory import Trajectory
+from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.chain import Chain
+from slam.mapping.atlas.consensus import agreeing, spaced
+from slam.mapping.atlas.keyframes import Keyframe, Loop
+from slam.mapping.atlas.loop_closer import LoopCloser
+from slam.rig_error import CommonError
+from tests.slam.scene import RIG
+
+LAP, DEPTH = 60, 2.0
+SIGMAS = np.repeat([2e-3, 0.05], 3)  # of a step
+SURE = np.repeat([1e-3, 0.01], 3)  # of a loop
+LIMIT = 25.0
+FALSE = exp(np.array([0.0, 0.0, 0.0, 1.5, 0.0, 0.0]))  # by which a place that looks alike is off: what drift may be
+
+
+def drive(count: int) -> tuple[Array, Array]:
+    """True poses and those of odometry (K, 4, 4) on rounds of 60 m."""
+    rng, turn = np.random.default_rng(3), exp(np.array([0.0, 2 * np.pi / LAP, 0.0, 0.0, 0.0, 1.0]))
+    true, odom = [np.eye(4)], [np.eye(4)]
+    for _ in range(count - 1):
+        true.append(true[-1] @ turn)
+        odom.append(odom[-1] @ turn @ exp(SIGMAS * rng.normal(size=6)))
+    return np.array(true), np.array(odom)
+
+
+TRUE, ODOM = drive(2 * LAP)
+CHAIN = Chain(ODOM, np.tile(np.diag(SIGMAS**2), (len(ODOM), 1, 1)))
+
+
+def loop(second: int, wrong: Array | None = None) -> Loop:
+    T = inverse(TRUE[second - LAP]) @ TRUE[second]
+    return Loop(second - LAP, second, T if wrong is None else T @ wrong, np.diag(SURE**2), 50)
+
+
+def test_the_largest_set_leaves_false_loops_out_whichever_came_first():
+    false, true = [loop(62, FALSE), loop(63, FALSE)], [loop(k) for k in range(66, 96, 5)]
+    found = agreeing(CHAIN, [*false, *true], true[-1], ODOM, LIMIT)
+    assert [x.pair for x in found] == [x.pair for x in true]
+    assert loop(62, FALSE).pair in [x.pair for x in agreeing(CHAIN, [*false, *true], false[0], ODOM, LIMIT)]
+
+
+def test_a_loop_that_contradicts_the_path_itself_agrees_with_nothing():
+    far = loop(70, exp(np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])))
+    assert agreeing(CHAIN, [loop(66)], far, ODOM, LIMIT) == []
+
+
+def test_keyframes_of_one_place_are_one_witness():
+    loops = [loop(k) for k in (62, 63, 66, 70, 80)]
+    chosen = spaced(loops, np.arange(len(TRUE), dtype=float), np.full(len(TRUE), 6.0))
+    assert [x.second for x in chosen] == [62, 70, 80]
+
+
+def atlas_of(count: int) -> Atlas:
+    atlas = Atlas()
+    for k in range(count):
+        none = np.zeros((6, 0))
+        points, descriptors = np.ones((1, 3), np.float32), np.ones((1, 16), np.float16)
+        atlas = atlas.with_new(
+            Keyframe(
+                k, 0.1 * k, ODOM[k], np.diag(SIGMAS**2), np.diag(SIGMAS**2), none, float(k), DEPTH, points,
+                descriptors, np.ones(1, np.int8), np.full(1, -1),
+            ),
+            descriptors.astype(np.float32),
+        )  # fmt: skip
+    return atlas
+
+
+def closed(loops: list[Loop]) -> Atlas:
+    """An atlas after these loops, seen one after the other as the camera drives on."""
+    config = SystemConfig.for_kind("driving", None, "ekf")
+    one = replace(config.atlas, agreeing=1, give_back=False)
+    closer, seen = LoopCloser(RIG, one, config.association, config.models, 0.3), SimpleNamespace()
+    kept = Atlas()
+    for each in loops:
+        whole = atlas_of(each.second + 1)
+        parts = {name: getattr(whole, name) for name in ("keyframes", "rows", "index")}
+        path = Trajectory(0.1 * np.arange(each.second + 1), ODOM[: each.second + 1])
+        kept, _ = closer._close(replace(kept, **parts), each, seen, CommonError(), lambda path=path: path)  # type: ignore[arg-type]
+    return kept
+
+
+def error(atlas: Atlas) -> float:
+    poses = atlas.poses_in_map()
+    return float(np.linalg.norm(poses[-1, :3, 3] - TRUE[len(poses) - 1, :3, 3]))
+
+
+def test_true_loops_take_the_place_of_a_false_one_before_them():
+    true = [loop(k) for k in range(70, 116, 5)]
+    false = loop(62, FALSE)
+    assert error(closed([false])) > 1.0  # it was believed, as the path allows it
+    assert closed([false, true[0]]).refused == (true[0].pair,)  # one place speaks for each
+    atlas = closed([false, *true])
+    assert false.pair in atlas.refused
+    assert false.pair not in [x.pair for x in atlas.loops]
+    assert len(atlas.loops) >= 5
+    assert error(atlas) < 0.3
+    assert atlas.closed_in(true[-1].second) is not None
+
+
+@pytest.mark.parametrize("number", [2, 4])
+def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
+    true, false = [loop(62), loop(70)], [loop(k, FALSE) for k in range(75, 75 + number)]
+    atlas = closed([*true, *false])
+    assert {x.pair for x in true} <= {x.pair for x in atlas.loops}
+    assert {x.pair for x in false} <= set(atlas.refused)
+    assert error(atlas) < 0.4
