@@ -102,7 +102,7 @@ def run(fault: Fault, backend: str, features: list[tuple[int, StereoFeatures]]) 
     for k, seen in features:
         result = system.process_features(seen)
         off = points.errors(k, result.matched, seen.uv_left[result.matched_features])
-        right, total = right + int((off < 3).sum()), total + len(off)
+        right, total = right + int((off < 3).sum()), total + int((~np.isnan(off)).sum())
         points.add(k, result.added, seen.uv_left[result.added_features])
         strays += len(result.added) if result.status.value == "lost" else 0
         if result.status.value == "started":  # errors count from where the map begins

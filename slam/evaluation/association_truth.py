@@ -77,20 +77,26 @@ class SurfacePoints:
         self._points.update(zip(np.asarray(ids).tolist(), points))
 
     def positions(self, ids: IdArray) -> Array:
-        """Where landmarks `ids` truly are (N, 3) [m], in the world of the truth; NaN for those on no still surface."""
-        return np.array([self._points[i] for i in np.asarray(ids).tolist()]).reshape(-1, 3)
+        """Where landmarks `ids` truly are (N, 3) [m], in the world of the truth; NaN for those on no still surface,
+        and for those that were never seen.
+        """
+        nowhere = np.full(3, np.nan)
+        return np.array([self._points.get(i, nowhere) for i in np.asarray(ids).tolist()]).reshape(-1, 3)
 
     def errors(self, frame: int, ids: IdArray, uv_left: Array) -> Array:
         """Distances (N,) [px] of left pixels (N, 2) from where the landmarks `ids` (N,) truly are.
 
-        Infinite for landmarks that were first seen on something that moves, or on nothing.
+        Infinite for landmarks that were first seen on something that moves, or on nothing; NaN for those of which this
+        is the first sight, as of landmarks that came back with a place: their points are those that it shows.
         """
         if not len(ids):
             return np.zeros(0)
+        known = np.array([i in self._points for i in np.asarray(ids).tolist()])
+        self.add(frame, ids[~known], uv_left[~known])
         points = np.array([self._points[i] for i in np.asarray(ids).tolist()])
         expected = self._world.rig.left.project(transform(inverse(self._world.ground_truth.poses[frame]), points))
         distance = np.linalg.norm(uv_left - expected, axis=1)
-        return np.where(np.isfinite(distance), distance, np.inf)
+        return np.where(known, np.where(np.isfinite(distance), distance, np.inf), np.nan)
 
 
 def surface_points(camera: PinholeCamera, depth: np.ndarray, uv: Array) -> Array:

@@ -27,6 +27,17 @@ def test_pixels_of_the_still_world_are_found_again(boxes):
     assert np.median(moved) > 1.0
 
 
+def test_landmarks_that_came_back_are_first_seen_where_they_are_matched(boxes):
+    points, uv = SurfacePoints(boxes), np.array([[20.0, 20.0], [280.0, 40.0]])
+    ids = np.array([3, 8])
+    points.add(0, ids[:1], uv[:1])
+    errors = points.errors(0, ids, uv)
+    assert errors[0] < 1e-6
+    assert np.isnan(errors[1])
+    assert (points.errors(0, ids, uv) < 1e-6).all()
+    assert np.isnan(points.positions(np.array([3, 99]))).all(axis=1).tolist() == [False, True]
+
+
 def test_surface_points_have_the_depth_of_their_pixel(boxes):
     depth = boxes.depth(0)
     uv = np.array([[100.3, 80.4], [30.0, 200.0]])
