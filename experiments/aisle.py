@@ -73,8 +73,8 @@ class AssociationCheck:
         """Take in one frame."""
         uv = result.features.uv_left
         error = self._points.errors(result.index, result.matched, uv[result.matched_features])
-        right = int((error < 3).sum())
-        self.score = AssociationScore(self.score.right + right, self.score.wrong + len(error) - right)
+        right, wrong = int((error < 3).sum()), int((error >= 3).sum())
+        self.score = AssociationScore(self.score.right + right, self.score.wrong + wrong)
         self._points.add(result.index, result.added, uv[result.added_features])
         new = result.features.descriptors[result.added_features]
         self._descriptors.update(zip(result.added.tolist(), new))
@@ -84,7 +84,7 @@ class AssociationCheck:
         from scipy.spatial import cKDTree
 
         with (folder / "landmarks.csv").open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+            rows = [row for row in csv.DictReader(file) if int(row["id"]) in self._descriptors]
         positions = np.array([[float(r[c]) for c in "xyz"] for r in rows]).reshape(-1, 3)
         first = np.array([self._descriptors[int(r["id"])] for r in rows])
         pairs = cKDTree(positions).query_pairs(0.02, output_type="ndarray")
