@@ -27,7 +27,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 
-_ITERATIONS = 100  # of Levenberg-Marquardt at most
+_ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 
 
 @dataclass(frozen=True)

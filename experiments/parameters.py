@@ -29,21 +29,33 @@ Every number in the algorithms that is not a setting, with what it is and where 
 `slam run --help` and in the [reference](running.md). The table is made by `python experiments/parameters.py`.
 """
 
+#: What kinds of numbers there are; a constant's comment begins with its kind, and is a choice where it does not.
+KINDS = {
+    "choice": "a threshold, a prior or a share that was chosen: these are what the columns ½ and 2 are for",
+    "derived": "a quantile of χ² of the probability named with it",
+    "paper": "as published",
+    "fixed": "what the thing is: the size of a state, the form of a file, the fewest points that give a pose",
+    "guard": "a bound of what is believed, or from where on a warning is given: what lies beyond is broken input",
+    "numerics": "iterations at most, tolerances, and small terms that keep a matrix invertible",
+    "cost": "how much time or memory something may take",
+}
+
 SENSITIVITY = """\
 The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position,
 and that of the bodies' motion, each as a ratio to the error with the default. It is the worse of both back ends, and
 the geometric mean over short runs of {cases} (`python experiments/sensitivity.py`).
 Under small perturbations of the pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose
-ratios lie within does not matter there.
+ratios lie within does not matter there. The words for what else may happen:
 
-{counts}
-
-- "same": the same bytes. Such a number is kept if it guards against input that these runs do not have (degenerate
-  geometry, wrong matches, a kidnapped camera, overflow), or if it only trades time: most iterations, sizes of blocks.
+- "same": the same bytes. Such a choice acts only on input that these runs do not have: degenerate geometry, wrong
+  matches, a kidnapped camera, bodies that hide each other.
 - "fails": a run did not end, or lost the camera or the bodies.
 - "not read": none of these runs comes to the code that reads the number, as that for faults and long runs.
 - Empty: not measured, as it is compiled into a kernel, read on import, part of the front end{rest}.
 """
+
+#: What a number does at half or twice its value, by column of the summary.
+OUTCOMES = ("same", "within the scatter", "beyond it", "fails", "not read", "not measured")
 
 
 @dataclass(frozen=True)
@@ -55,12 +67,14 @@ class Parameter:
         name: of the constant.
         value: a number or a tuple of numbers.
         comment: what its author says of it.
+        kind: one of `KINDS`.
     """
 
     file: str
     name: str
     value: Any
     comment: str
+    kind: str
 
     @property
     def module(self) -> str:
@@ -87,7 +101,10 @@ def _of_file(file: Path, name: str) -> list[Parameter]:
         for each, value in zip(names, values):
             number = _number(value)
             if number is not None and isinstance(each, ast.Name) and each.id == each.id.upper():
-                found.append(Parameter(name, each.id, number, _comment(comments, node.lineno, node.end_lineno)))
+                comment = _comment(comments, node.lineno, node.end_lineno)
+                kind, colon, rest = comment.partition(": ")
+                known = bool(colon) and kind in KINDS
+                found.append(Parameter(name, each.id, number, rest if known else comment, kind if known else "choice"))
     return found
 
 
@@ -128,45 +145,44 @@ def _comment(comments: dict[int, tuple[str, bool]], first: int, last: int | None
 
 def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
     """The page as Markdown."""
-    ratios = sensitivity.get("ratios", {})
-    lines = [INTRODUCTION]
+    ratios, scatter = sensitivity.get("ratios", {}), sensitivity.get("scatter", {})
+    measured = {p: ratios.get(f"{p.module}:{p.name}") for p in parameters}
+    lines = [INTRODUCTION, _row(["kind", "what it is", "numbers", *(OUTCOMES if ratios else [])])]
+    lines.append(_row(["---", "---", "---:", *(["---:"] * len(OUTCOMES) if ratios else [])]))
+    for kind, meaning in KINDS.items():
+        chosen = [p for p in parameters if p.kind == kind]
+        outcomes = [_outcome(measured[p], scatter) for p in chosen] if ratios else []
+        counts = [str(outcomes.count(o)) for o in OUTCOMES] if ratios else []
+        lines.append(_row([f"[{kind}](#{kind})", meaning, str(len(chosen)), *counts]))
+    lines.append("")
     if ratios:
         rest = "" if sensitivity["complete"] else ", or to be run still"
         cases = ", ".join(f"`{case}`" for case in sensitivity["cases"])
-        counts = _counts([ratios.get(f"{p.module}:{p.name}") for p in parameters], sensitivity["scatter"])
-        lines.append(SENSITIVITY.format(cases=cases, rest=rest, counts=counts, **sensitivity["scatter"]))
+        lines.append(SENSITIVITY.format(cases=cases, rest=rest, **scatter))
     titles = ["file", "name", "value", "what it is", *(["½", "2"] if ratios else [])]
     rule = ["---", "---", "---:", "---", *(["---:", "---:"] if ratios else [])]
-    for room in ROOMS:
-        chosen = [p for p in parameters if p.file.startswith(room + "/")]
-        if not chosen:
-            continue
-        lines += [f"## {room}\n", _row(titles), _row(rule)]
-        for p in chosen:
-            measured = ratios.get(f"{p.module}:{p.name}", [{}, {}]) if ratios else []
-            cells = [p.file.removeprefix(room + "/"), f"`{p.name}`", str(p.value), p.comment.replace("|", "\\|")]
-            lines.append(_row([*cells, *map(_ratio, measured)]))
+    for kind in KINDS:
+        lines += [f"## {kind}\n", _row(titles), _row(rule)]
+        for p in (p for p in parameters if p.kind == kind):
+            cells = [p.file, f"`{p.name}`", str(p.value), p.comment.replace("|", "\\|")]
+            lines.append(_row([*cells, *(map(_ratio, measured[p] or [{}, {}]) if ratios else [])]))
         lines.append("")
     return "\n".join(lines)
 
 
-def _counts(measured: list[list[dict[str, Any]] | None], scatter: dict[str, float]) -> str:
-    """How many numbers matter, in a sentence."""
-    known = [m for m in measured if m]
-    kinds = [{value for side in m for value in side.values()} for m in known]
-    texts = [{value for value in values if isinstance(value, str)} for values in kinds]
-    same, unread = (sum(values == {word} for values in kinds) for word in ("same", "not read"))
-    fails = sum("fails" in words for words in texts)
-    within = [
-        all(isinstance(v, str) or 1 / scatter[k] <= v <= scatter[k] for s in m for k, v in s.items()) for m in known
-    ]
-    small = sum(within) - same - unread - sum(w and "fails" in t for w, t in zip(within, texts))
-    more = len(known) - unread - same - small - fails
-    return (
-        f"Of {len(measured)} numbers {len(known)} are measured; {unread} of these are not read in these runs.\n"
-        f"At half or twice its value, {same} change nothing, {small} change errors by less than the scatter, {more}\n"
-        f"by more, and {fails} make a run fail."
-    )
+def _outcome(measured: list[dict[str, Any]] | None, scatter: dict[str, float]) -> str:
+    """What a number does at half or twice its value, the worse of both: one of `OUTCOMES`."""
+    if not measured:
+        return "not measured"
+    values = [(k, v) for side in measured for k, v in side.items()]
+    words = {v for _, v in values if isinstance(v, str)}
+    if "fails" in words:
+        return "fails"
+    if any(isinstance(v, float) and not 1 / scatter[k] <= v <= scatter[k] for k, v in values):
+        return "beyond it"
+    if any(isinstance(v, float) for _, v in values):
+        return "within the scatter"
+    return "same" if "same" in words else "not read"
 
 
 def _row(cells: list[str]) -> str:

@@ -27,12 +27,12 @@ from scipy.linalg.lapack import dpstrf
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
-CAMERA = 12  #: size of the camera's state [r, φ, v, ω]
-POSE = 6  #: its part [r, φ] that measurements depend on
+CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
+POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 
-_LOCAL = 150  # rows of the local part that are never too many
-_WHOLE = 2.5  # all are local where the state has at most so many times the rows of what is measured,
-_WHOLE_STILL = 4  # and stay so up to here
+_LOCAL = 150  # cost: rows of the local part that are never too many
+_WHOLE = 2.5  # cost: all are local where the state has at most so many times the rows of what is measured,
+_WHOLE_STILL = 4  # cost: and stay so up to here
 _THREE = np.arange(3)
 _LATER = np.maximum(_THREE[:, None], _THREE)  # row of an entry in the lower triangle of a symmetric block
 _EARLIER = np.minimum(_THREE[:, None], _THREE)

@@ -30,9 +30,9 @@ from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.agreement import INFLATION, landmarks_pose
 
-_PIXELS = 1e5  # no pixel of an image is further from its origin; such a measurement is rejected in any case
-_DISPARITY = 0.01  # below this [px] a disparity is none: the landmark is put where it would be so large
-_VAGUE = 1e3  # deviation of an innovation, in those of a pixel, above which all of P is brought up to date
+_PIXELS = 1e5  # guard: no pixel of an image is further from its origin; such a measurement is rejected in any case
+_DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
+_VAGUE = 1e3  # cost: deviation of an innovation, in those of a pixel, above which all of P is brought up to date
 
 
 class EkfBackend:

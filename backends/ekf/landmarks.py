@@ -20,7 +20,7 @@ from slam.data import IdArray, IndexArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array, hat
 
-_FARTHEST = 1e-6  # least inverse depth [1/m]
+_FARTHEST = 1e-6  # numerics: least inverse depth [1/m]
 _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an update
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 

@@ -11,7 +11,7 @@ from slam.geometry.euler import body_rate_matrix
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-_ANYWHERE = 1e3  # standard deviation of a position of which nothing is known [m]
+_ANYWHERE = 1e3  # numerics: standard deviation of a position of which nothing is known [m]
 
 
 def initial_covariance(models: EstimatorModels, phi: Array) -> Array:

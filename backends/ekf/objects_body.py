@@ -22,7 +22,7 @@ from slam.geometry.se3 import Array, adjoint, hat, inverse, pose, so3_exp, so3_l
 from slam.object_models import ObjectModels
 from slam.objects.points import drift
 
-RIGID = 12  #: size of [θ, τ, δω, δv]
+RIGID = 12  #: fixed: size of [θ, τ, δω, δv]
 
 
 @dataclass(frozen=True)

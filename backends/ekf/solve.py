@@ -20,9 +20,9 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, dtrtrs
 
 from backends.ekf.jacobian import Displacement, Jacobian
 from backends.ekf.measurement import Linearisation, Measurement
+from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
-from slam.tracking.gating import chi_square_limits
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
 #: further than needed does harm: a landmark's Gaussian in world coordinates comes from pixels by a linearisation at its
@@ -33,7 +33,7 @@ _LINEAR = 1.0
 #: Their errors together may move the pose by this share of its standard deviations: with a wide prior they all have the
 #: same sign, and each within its noise they moved it by 0.7 of them.
 _POSE_SHARE = 0.25
-_HALVINGS = 6  # of a step that does not lower the cost
+_HALVINGS = 6  # numerics: of a step that does not lower the cost
 
 _LATER = np.maximum(np.arange(3)[:, None], np.arange(3))  # row of an entry in the lower triangle of a symmetric block
 _EARLIER = np.minimum(np.arange(3)[:, None], np.arange(3))

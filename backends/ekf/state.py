@@ -24,8 +24,8 @@ from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
 _ANY_ATTITUDE = 2 * np.pi  # standard deviation of angles that say nothing of an attitude [rad]
-_PIECES = 64  # at most, of one step through the angles' singularity
-_SMALL_TURN = 0.2  # of a step whose error may be carried as a turn about the world's axes [rad]
+_PIECES = 64  # numerics: at most, of one step through the angles' singularity
+_SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn about the world's axes [rad]
 
 
 class FilterState:

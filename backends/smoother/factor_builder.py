@@ -15,10 +15,10 @@ from backends.smoother.variables import landmark_key, landmark_threshold, pose_k
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
-#: A landmark unseen for so many frames is seen again: a smart factor over the gap would touch all poses between.
+#: cost: A landmark unseen for so many frames is seen again: a smart factor over the gap would touch all poses between.
 _GAP = 20
 
-#: Landmarks seen within so many frames are likely to be seen again.
+#: cost: Landmarks seen within so many frames are likely to be seen again.
 _LATE = 60
 
 

@@ -24,24 +24,24 @@ from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, transform
 from slam.tracking.gating import chi_square_gate
 
-#: Poses before the window and all landmarks are read from the solver again once the window's oldest pose has been
+#: cost: Poses before the window and all landmarks are read from the solver again once the window's oldest pose has been
 #: revised by so much [m, or sine of an angle].
 _STALE = 0.005
 
-#: That takes time in proportion to the run, so it is not done again before the run is longer by this share, unless the
+#: cost: That takes time in proportion to the run, so it waits until the run is longer by this share, unless the
 #: revision is so many times as large.
 _SELDOM, _AT_ONCE = 0.01, 20
 
-#: Linearising a variable anew eliminates all that was measured since it was first seen, so it is done for many
+#: cost: Linearising a variable anew eliminates all that was measured since it was first seen, so it is done for many
 #: variables together every so many frames. A variable that is off by so many times the threshold does not wait.
 _EVERY, _OFF = 10, 10.0
 
-#: Gauss-Newton steps that move landmarks to where their changed measurements put them.
+#: numerics: Gauss-Newton steps that move landmarks to where their changed measurements put them.
 _REFINED = 3
 
-#: When all is solved to convergence, variables are linearised anew until they are within so much [px].
+#: numerics: When all is solved to convergence, variables are linearised anew until they are within so much [px].
 _LAST = 1e-4
-_ROUNDS = 6  # of linearising everything anew, at most
+_ROUNDS = 6  # numerics: of linearising everything anew, at most
 
 
 class FactorGraph:

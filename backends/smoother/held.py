@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 
-_FIRMER = 1e4  # information with which a pose is held, as a multiple of what is known of it
+_FIRMER = 1e4  # numerics: information with which a pose is held, as a multiple of what is known of it
 _PULLED = 0.25  # squared standard deviations
 
 

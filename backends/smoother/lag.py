@@ -17,7 +17,7 @@ from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of
 
-#: Poses leave once so many are there as the lag and one part in so many of it.
+#: cost: Poses leave once so many are there as the lag and one part in so many of it.
 _SHARE = 2
 
 

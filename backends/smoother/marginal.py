@@ -25,9 +25,9 @@ from backends.smoother.solver import FAILURES, SolverError
 from backends.smoother.variables import size_of
 from slam.geometry.se3 import Array, adjoint, hat, inverse, nearest_rotation, points_by_pose
 
-#: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
+#: numerics: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
 _JITTER = (1e-13, 1e-11, 1e-9)
-_NOTHING = 1e-12  # information [1/m², 1/rad²] that is none
+_NOTHING = 1e-12  # numerics: information [1/m², 1/rad²] that is none
 
 
 @dataclass(frozen=True)

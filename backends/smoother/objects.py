@@ -33,9 +33,9 @@ from slam.object_models import ObjectModels
 from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
 
 _LAG = 4  # frames of a window at least
-_BATCH = 2  # so many frames leave it together: that costs hardly more than for one
-_ITERATIONS = 2  # linearisations of a body's window in a frame
-# Keeps poses of the camera apart that are taken to move together: of each variance, and at least [rad², m²].
+_BATCH = 2  # cost: so many frames leave it together: that costs hardly more than for one
+_ITERATIONS = 2  # numerics: linearisations of a body's window in a frame
+# numerics: Keeps poses of the camera apart that are taken to move together: of each variance, and at least [rad², m²].
 _JITTER, _LEAST = 1e-8, 1e-14
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-FRAME = 12  #: unknowns of a frame: body pose (6), camera pose (6)
-_NEAREST = 1e-6  # no depth below this [m] is projected
-_SMALL = 1e-6  # sine of an angle below which series are exact
+FRAME = 12  #: fixed: unknowns of a frame: body pose (6), camera pose (6)
+_NEAREST = 1e-6  # numerics: no depth below this [m] is projected
+_SMALL = 1e-6  # numerics: sine of an angle below which series are exact
 
 
 @helper

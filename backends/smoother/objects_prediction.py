@@ -11,12 +11,12 @@ from backends.smoother.objects_factors import first_sigmas, impulse_sigmas, velo
 from backends.smoother.objects_kernels import FRAME
 from backends.smoother.objects_window import CameraWindow, Window
 from backends.smoother.stereo import RectifiedStereo
+from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
 from slam.object_models import ObjectModels
 from slam.objects.points import ENOUGH
 from slam.tracking.agreement import INFLATION
-from slam.tracking.gating import chi_square_limits
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def agreement(
         guess: T_world_object (4, 4) to start from, or None.
     """
     most = max(ENOUGH, (len(rows) + 1) // 2)
-    limit = float(chi_square_limits(np.array([6]), probability)[0])
+    limit = chi_square_limit(6, probability)
     starts = [expected.T_body_left] + ([] if guess is None else [inverse(guess) @ expected.X])
     first = None
     for factor in (0.0, *INFLATION):

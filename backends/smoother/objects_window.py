@@ -27,7 +27,7 @@ from slam.objects.points import Shape, drift
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _TURN = 0.01  # a point is seen from elsewhere by no less [rad]; what is less adds up
-_LINEAR = 0.01  # a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
+_LINEAR = 0.01  # cost: a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-NEAREST = 1e-6  # no depth below this [m] is projected
-_SMALL = 1e-5  # below this angle [rad] series are exact to double precision
-_SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken
+NEAREST = 1e-6  # numerics: no depth below this [m] is projected
+_SMALL = 1e-5  # numerics: below this angle [rad] series are exact to double precision
+_SMALL_CUBIC = 1e-2  # numerics: the same where a difference of third order is taken
 
 
 @helper

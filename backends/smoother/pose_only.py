@@ -19,8 +19,8 @@ from slam.geometry.se3 import Array, inverse
 from slam.tracking.gating import chi_square_gate, whiteners
 
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
-_ROUNDS = 3  # of solving and gating
-_CONVERGED = 1e-5  # [rad, m]; the steps shrink quadratically, so what is left is far smaller
+_ROUNDS = 3  # numerics: of solving and gating
+_CONVERGED = 1e-5  # numerics: [rad, m]; the steps shrink quadratically, so what is left is far smaller
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from backends.smoother.solver import Solver
 from slam.data import IndexArray
 from slam.geometry.se3 import Array, inverse
 
-#: A landmark is solved for iteratively where a single step would change its sum of squares by so much.
+#: cost: A landmark is solved for iteratively where a single step would change its sum of squares by so much.
 _FAR = 1.0
 
 

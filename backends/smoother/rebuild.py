@@ -14,7 +14,7 @@ from backends.smoother.variables import pose_key
 from slam.data import IndexArray
 from slam.geometry.se3 import Array, inverse
 
-_ITERATIONS = 30  # of Levenberg-Marquardt at most
+_ITERATIONS = 30  # numerics: of Levenberg-Marquardt at most
 _AS_FORETOLD = 0.75  # of the gain that the linear problem promises: with less, a step was not a small one
 
 

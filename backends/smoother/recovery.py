@@ -18,11 +18,12 @@ import numpy as np
 from scipy.special import bdtrc, comb
 
 from backends.smoother import pose_only
+from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse
 from slam.tracking.agreement import CONFIRMED, ENOUGH, HEEDED, share_by_chance
-from slam.tracking.gating import chi_square_limits, squared_distances
+from slam.tracking.gating import squared_distances
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
@@ -85,7 +86,7 @@ def unknown_turn(P: Array) -> bool:
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
     """At the pose on which landmarks agree; None where most do not agree with it after all."""
     x = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ there))
-    limit = chi_square_limits(np.array([6]), problem.probability)[0]
+    limit = chi_square_limit(6, problem.probability)
     jump = None
     if x @ problem.information @ x > limit:
         jump = np.repeat([float(x[:3] @ x[:3]), float(x[3:] @ x[3:])], 3)
@@ -106,7 +107,7 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
     rejected = distances[~used & np.isfinite(distances)]
     if not len(rejected):
         return True
-    share = share_by_chance(rejected, chi_square_limits(np.array([3]), problem.probability)[0])
+    share = share_by_chance(rejected, chi_square_limit(3, problem.probability))
     others, many = int(used.sum()) - MINIMAL_POINTS, len(used) - MINIMAL_POINTS
     return bool(
         others < 1 or comb(len(used), MINIMAL_POINTS) * bdtrc(others - 1, many, share) > 1 - problem.probability

@@ -23,7 +23,7 @@ _T = TypeVar("_T")
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
 
-#: ISAM2 starts from scratch whenever over 65 % of all variables are touched, as they are in a small map. So many
+#: cost: ISAM2 starts from scratch whenever over 65 % of all variables are touched, as they are in a small map. So many
 #: variables that nothing depends on keep it incremental from the start.
 _BALLAST = 2000
 

@@ -19,10 +19,10 @@ from backends.smoother.stereo import RectifiedStereo
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 
-#: Landmarks are refined until another step would lessen their sum of squares by less than this, in at most so many.
+#: numerics: Landmarks are refined until a step would lessen their sum of squares by less than this, in at most so many.
 _GAIN, _REFINEMENTS = 0.01, 10
-_DAMPING = 0.01  # the first that is tried where a plain step fails, as a share of the information
-_BEHIND = 1e4  # sum of squares of a measurement whose landmark lies behind the camera
+_DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
+_BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
 
 
 def linearise(

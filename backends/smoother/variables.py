@@ -14,9 +14,9 @@ from backends.smoother.stereo import RectifiedStereo
 _POSE = "x"
 _BALLAST = "z"
 _LETTERS = "ABCDEFGHIJKLMNOP"
-_FINEST = 1e-3  # threshold of the first letter [m]; each next one's is twice as large
+_FINEST = 1e-3  # cost: threshold of the first letter [m]; each next one's is twice as large
 
-#: Distance of near landmarks, in baselines; what is nearer is hardly seen by both cameras.
+#: cost: Distance of near landmarks, in baselines; what is nearer is hardly seen by both cameras.
 _NEAR = 8.0
 
 

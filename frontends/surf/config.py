@@ -90,7 +90,7 @@ class SurfConfig:
         return from_options(cls, "surf", {**base, **options})
 
 
-_MOST_CELLS = 1000  # bound of a setting
+_MOST_CELLS = 1000  # guard: bound of a setting
 
 _RANGES = (
     ("features", 1, 100_000),

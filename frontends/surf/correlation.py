@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
-_ITERATIONS = 12  # of the alignment at most
-_CONVERGED = 0.01  # px
+_ITERATIONS = 12  # numerics: of the alignment at most
+_CONVERGED = 0.01  # numerics: px
 _MARGIN = 3 * (_HALVES[1] + 1) // 2  # half width of a patch that is kept [px]: it may be seen 1.5 times as large
 
 

@@ -15,9 +15,9 @@ from slam.runtime.compilation import kernel, vector_helper
 #: Boxes somewhat wider than cells match better; turned cells gain more by it.
 TURNED_BOX, UPRIGHT_BOX = 1.6, 1.3
 
-_SIGMA = 3.3  # of the Gaussian weight, in cells
-_SUB = 5  # wavelets along a sub-area's side
-_LANES = 8  # rows of working arrays are padded to whole vector registers
+_SIGMA = 3.3  # paper: of the Gaussian weight, in cells
+_SUB = 5  # paper: wavelets along a sub-area's side
+_LANES = 8  # cost: rows of working arrays are padded to whole vector registers
 
 
 def gaussian_weights(areas: int) -> NDArray[np.float32]:

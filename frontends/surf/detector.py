@@ -14,7 +14,7 @@ from frontends.surf.filters import Filters
 from frontends.surf.integral import column_phases
 from slam.runtime.compilation import helper, kernel, vector_helper
 
-#: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
+#: fixed: Columns of a candidate row: centre x, y [px], size [px], response, sign of the Laplacian, octave.
 COLUMNS = 6
 
 #: What the sum of each box, see `filters.BOXES`, counts in Dxx, Dyy and Dxy.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam.runtime.compilation import helper, kernel, vector_helper
 
-_HALF = 4  # half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
+_HALF = 4  # fixed: half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
 _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it

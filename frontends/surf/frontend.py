@@ -20,9 +20,9 @@ from slam.data import ImagePair, Patches, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, SequenceError
 from slam.geometry.rig import StereoRig
 
-_SURPLUS = 1.35  # features detected for each one needed, to have a choice when spreading them
-_CHOICE = 1.5  # features localised for each one kept: some prove to be no maxima
-_TRIES = 4  # detections at most in one image
+_SURPLUS = 1.35  # cost: features detected for each one needed, to have a choice when spreading them
+_CHOICE = 1.5  # cost: features localised for each one kept: some prove to be no maxima
+_TRIES = 4  # cost: detections at most in one image
 _REACH = 3.0  # largest sub-pixel correction along the row [px]
 _FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
 _COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 #: Angle of upright features [rad]: OpenCV's convention, 270 degrees.
 UPRIGHT_ANGLE = 1.5 * np.pi
 
-_NO_ANGLE = -1.0  # of a cv2.KeyPoint [degrees]
+_NO_ANGLE = -1.0  # fixed: of a cv2.KeyPoint [degrees]
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
 _SIZE_STEP = 0.3  # of those in size
-_ITERATIONS = 10  # of the search for the continuous maximum at most
-_FOLLOWERS = 10  # features that repeated ones may lie apart, when sorted by x
-_CONVERGED = 0.05  # in units of the steps
+_ITERATIONS = 10  # numerics: of the search for the continuous maximum at most
+_FOLLOWERS = 10  # cost: features that repeated ones may lie apart, when sorted by x
+_CONVERGED = 0.05  # numerics: in units of the steps
 
 
 #: Places of the finite differences (x, y, size): the seven of the gradient, then those of the mixed derivatives.

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from slam.runtime.compilation import helper, kernel, vector_helper
 
-RADIUS = 6  # of the sampled disc, in units of the feature's scale s
-_SIGMA = 2.5  # of the Gaussian weight, in the same units
+RADIUS = 6  # paper: of the sampled disc, in units of the feature's scale s
+_SIGMA = 2.5  # paper: of the Gaussian weight, in the same units
 
 
-_BINS = 144  # two for each five degrees: the degree 5k alone, and the four after it
-_WINDOW = 23  # bins in 60 degrees, the ends left out
+_BINS = 144  # fixed: two for each five degrees: the degree 5k alone, and the four after it
+_WINDOW = 23  # fixed: bins in 60 degrees, the ends left out
 
 
 class Disc(NamedTuple):

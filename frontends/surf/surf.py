@@ -25,7 +25,7 @@ from slam.errors import ConfigurationError
 if TYPE_CHECKING:
     import cv2
 
-_SMALLEST_STRIPE = 48  # grid rows that are worth a task of their own
+_SMALLEST_STRIPE = 48  # cost: grid rows that are worth a task of their own
 _REACH = 0.15  # furthest that localisation moves a feature, in units of its size
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-_SMALLEST_SHARE = 32  # items that are worth a task
+_SMALLEST_SHARE = 32  # cost: items that are worth a task
 
 
 class Workers:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_positive
 
-_SIGMAS = (1e-4, 1e4)  # [px]
+_SIGMAS = (1e-4, 1e4)  # guard: [px]
 _RANGES = {
     "prior_scale": (1e-3, 1e3),
     "pixel_sigma": _SIGMAS,

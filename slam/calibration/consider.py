@@ -28,9 +28,9 @@ from slam.models import EstimatorModels
 #: the squares of a calibration board are known to some tenths of a percent.
 BASELINE = 0.002
 
-_FOLLOWED = 60  # landmarks in the filter at most
-_UNSEEN = 3  # frames after which a landmark that is not measured is followed no more
-_LONGEST = 1.0  # time [s] after which nothing is known of a motion
+_FOLLOWED = 60  # cost: landmarks in the filter at most
+_UNSEEN = 3  # cost: frames after which a landmark that is not measured is followed no more
+_LONGEST = 1.0  # guard: time [s] after which nothing is known of a motion
 
 
 class RigUncertainty:

@@ -15,7 +15,7 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, so3_exp
 
-_GRID = 25, 15  # pixels at which the cameras are to agree, columns and rows
+_GRID = 25, 15  # numerics: pixels at which the cameras are to agree, columns and rows
 
 
 class CorrectedRig(NamedTuple):

@@ -10,7 +10,7 @@ from slam.calibration.model import RigModel
 from slam.data import StereoFeatures
 from slam.geometry.se3 import Array
 
-_ROUNDS = 4  # of the fixed point that undoes a correction; each takes off a factor of some 30
+_ROUNDS = 4  # numerics: of the fixed point that undoes a correction; each takes off a factor of some 30
 
 
 @dataclass(frozen=True)

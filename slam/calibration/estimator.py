@@ -29,15 +29,15 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: times over which errors are surely correlated
-_SPACING = 0.5  # a view waits from when the last one has lost this part of what it loses until it is compared
+_SPACING = 0.5  # cost: a view waits from when the last one has lost this part of what it loses until it is compared
 _FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
-_LATER = 1.25  # after so many times the frames such a pair is solved anew: its parallax has grown as much at most
-_MOST_ROWS = 250  # of a frame: more say little more
-_MOST_FEATURES = 1000  # of a view, the strongest ones; half of the usual 800 made drives worse by a half
+_LATER = 1.25  # cost: after so many times the frames such a pair is solved anew: its parallax has grown as much at most
+_MOST_ROWS = 250  # cost: of a frame: more say little more
+_MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
 _LIKELIER = 1.0  # logarithm of how much: what a single parameter that is fitted must gain (Akaike)
 _CONFIGURED = 4  # pairs that the configured noise counts for
-_RARER = 20  # pairs after which every second frame is looked at, and so on: the n-th adds one part in n
+_RARER = 20  # cost: pairs after which every second frame is looked at, and so on: the n-th adds one part in n
 _TURN = 0.05  # but never rarer than once in this turn [rad]: turns are rare, and they alone show the focal length
 
 

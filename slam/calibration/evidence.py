@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 
-_MOST_BLOCKS = 32  # blocks of evidence that are kept apart, for their scatter
+_MOST_BLOCKS = 32  # cost: blocks of evidence that are kept apart, for their scatter
 _PRIOR_TERMS = 20.0  # degrees of freedom that the inflation known beforehand counts for
 
 

@@ -18,8 +18,8 @@ from slam.files import expanded, read_text, write_text
 from slam.geometry.rig import StereoRig
 
 _LIMIT = 2**24  # bytes of a file: the summary of a run with all its settings is far smaller
-_LARGEST = 1.0  # correction [rad, focal lengths, 1] and variance that a file may hold: others are no calibration's
-_SAME = 1e-5  # relative difference of numbers of the same calibration, written and read
+_LARGEST = 1.0  # guard: correction [rad, focal lengths, 1] and variance that a file may hold
+_SAME = 1e-5  # guard: relative difference of numbers of the same calibration, written and read
 _NOT_KEPT = (
     "neither a file of `slam calibrate` nor the summary.json of a run; the calibration file of a rig belongs to the "
     "sequence: 'FOLDER?calibration=FILE'"

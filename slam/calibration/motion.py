@@ -13,13 +13,14 @@ import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
-from slam.calibration.robust import chi_square_median, median, student_weights
+from slam.calibration.robust import median, student_weights
+from slam.chi_square import chi_square_limit
 from slam.geometry.se3 import Array, so3_exp
 
-_ITERATIONS = 20  # of Gauss-Newton at most
-_CONVERGED = 1e-3  # largest last change of a predicted point [px]; 0.02 let focal lengths be wrong by percents
-_NEARLY = 3e-3  # the same after all iterations: single points that jump to and fro keep some pairs from coming to rest
-_EXACT = 1e-3  # least noise of pixels and disparities [px]
+_ITERATIONS = 20  # numerics: of Gauss-Newton at most
+_CONVERGED = 1e-3  # numerics: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
+_NEARLY = 3e-3  # numerics: the same after all iterations: single points jump to and fro in some pairs
+_EXACT = 1e-3  # numerics: least noise of pixels and disparities [px]
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
 
@@ -162,7 +163,7 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
     growth = 1 + np.square(J) @ np.diag(noise) / np.diag(noise)
     squares = np.square(pair.second - moved) / growth
     squares = squares[np.isfinite(squares).all(axis=1)]
-    found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / chi_square_median(1)
+    found = np.array([median(squares[:, :2]), median(squares[:, 2])]) / chi_square_limit(1, 0.5)
     return np.maximum(found, _EXACT**2)
 
 

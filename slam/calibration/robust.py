@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
-from scipy.special import gammaincinv
 
+from slam.chi_square import chi_square_limit
 from slam.geometry.se3 import Array
 
 _DEGREES = 4.0  # of freedom of Student's t: its tails are those of matches, a few of which are wrong
-
-
-@lru_cache
-def chi_square_median(dof: int) -> float:
-    """The median of χ² with so many degrees of freedom."""
-    return 2 * float(gammaincinv(dof / 2, 0.5))
 
 
 def median(values: Array) -> float:
@@ -34,5 +26,5 @@ def student_weights(squared: Array, dof: int, least: float) -> Array:
     """
     if not len(squared):
         return squared
-    scale = max(median(squared) / chi_square_median(dof), least**2)
+    scale = max(median(squared) / chi_square_limit(dof, 0.5), least**2)
     return np.asarray((_DEGREES + dof) / (_DEGREES + squared / scale) / scale)

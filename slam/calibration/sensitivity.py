@@ -20,7 +20,7 @@ from scipy.linalg import cholesky, solve_triangular
 from slam.geometry.arrays import Array, IdArray
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 
-_ROUNDING = 1e-12  # of the trace of a covariance
+_ROUNDING = 1e-12  # numerics: of the trace of a covariance
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, fit_motion, move, squared_distance
-from slam.calibration.robust import chi_square_median, median
+from slam.calibration.robust import median
+from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
 from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
@@ -19,9 +20,9 @@ _RATIO = 0.8  # largest ratio of the best to the second best descriptor distance
 _NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
-_FARTHEST = 16.3  # largest squared distance of a match that agrees: 99.9 % of χ² with three degrees of freedom
+_FARTHEST = 16.3  # derived: χ²(3) at 99.9 %, largest squared distance of a match that agrees
 _REFITS = 2  # times that motion and matches that agree with it are found anew
-_HYPOTHESES = 100  # poses tried in the geometric check of a pair of views
+_HYPOTHESES = 100  # cost: poses tried in the geometric check of a pair of views
 
 
 #: Rows of features in one view and in another, in pairs.
@@ -152,5 +153,5 @@ def pair_of(
             break
         R, t = fitted.R, fitted.t
         distance = squared_distance(ideal[0], ideal[1], R, t, model.focal, noise)
-        agree = distance <= _FARTHEST * median(distance[agree]) / chi_square_median(3)
+        agree = distance <= _FARTHEST * median(distance[agree]) / chi_square_limit(3, 0.5)
     return Pair(one[agree], two[agree], R, t)

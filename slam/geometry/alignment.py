@@ -10,9 +10,9 @@ from slam.errors import TrajectoryError
 from slam.geometry.se3 import Array, nearest_rotation, so3_exp
 from slam.geometry.trajectory import Trajectory
 
-_FARTHEST = 1e100  # position [m] whose square is a number
-_STILL = 1e-12  # [m²] product of the two spreads: less than a micrometre each is no motion
-_COLLINEAR = 1e-12  # second singular value by the first, below which positions lie on a line
+_FARTHEST = 1e100  # guard: position [m] whose square is a number
+_STILL = 1e-12  # numerics: [m²] product of the two spreads: less than a micrometre each is no motion
+_COLLINEAR = 1e-12  # numerics: second singular value by the first, below which positions lie on a line
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from slam.geometry.se3 import Array
 #: Distortion models and the number of coefficients each accepts.
 DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 
-_MOST = 1e9  # of a calibration's numbers
-_WIDEST = 100_000  # width or height [px]
+_MOST = 1e9  # guard: of a calibration's numbers
+_WIDEST = 100_000  # guard: width or height [px]
 
-_UNDISTORT_ITERATIONS = 50  # of the fixed point at most; usual lenses need fewer than ten
-_UNDISTORT_TOLERANCE = 1e-13  # in normalised coordinates: 1e-10 px at any usual focal length
+_UNDISTORT_ITERATIONS = 50  # numerics: of the fixed point at most; usual lenses need fewer than ten
+_UNDISTORT_TOLERANCE = 1e-13  # numerics: in normalised coordinates: 1e-10 px at any usual focal length
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,17 @@ from slam.data import BoolArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse
 
-#: Stereo points that fix a pose.
+#: fixed: Stereo points that fix a pose.
 MINIMAL_POINTS = 3
 
-_REFINEMENTS = 3  # Gauss-Newton steps on each minimal set
+_REFINEMENTS = 3  # numerics: Gauss-Newton steps on each minimal set
 _CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
-_POLISHING_ROUNDS = 5  # of least squares on what agrees, at most
-STEPS = 10  #: of Gauss-Newton at most, from the last pose; it converges quadratically
-_BATCH = 50  # hypotheses tried at once
-_APPROACHES = 3  # steps towards the better half of the matches, from a guess that is far off
-_ENOUGH = 100  # matches that fix a pose far better than is needed to tell which others agree
-_CONVERGED = 1e-4  # step [rad], [m] after which the pose has converged: quadratically, so to far less than that
+_POLISHING_ROUNDS = 5  # numerics: of least squares on what agrees, at most
+STEPS = 10  #: numerics: of Gauss-Newton at most, from the last pose; it converges quadratically
+_BATCH = 50  # cost: hypotheses tried at once
+_APPROACHES = 3  # numerics: steps towards the better half of the matches, from a guess that is far off
+_ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell which others agree
+_CONVERGED = 1e-4  # numerics: step [rad], [m] after which the pose has converged, to far less than that
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_SMALL_SQUARE = 1e-4  # of an angle [rad²], below which series are exact to double precision
+_SMALL_SQUARE = 1e-4  # numerics: of an angle [rad²], below which series are exact to double precision
 
 
 @kernel

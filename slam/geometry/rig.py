@@ -13,9 +13,9 @@ from slam.errors import CalibrationError
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.se3 import Array, nearest_rotation
 
-_LONGEST = 1e6  # baseline [m]
+_LONGEST = 1e6  # guard: baseline [m]
 
-_ZERO_DISPARITY = 1024  # OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
+_ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 
 _FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
 

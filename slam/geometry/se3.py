@@ -17,11 +17,11 @@ import numpy as np
 
 from slam.geometry.arrays import Array as Array
 
-#: Variance [rad², m²] that a covariance has at least, or that is added to it, to keep it invertible.
+#: numerics: Variance [rad², m²] that a covariance has at least, or that is added to it, to keep it invertible.
 LEAST_VARIANCE = 1e-12
 
-_SMALL = 1e-5  # below this angle [rad] series are exact to double precision
-_SMALL_CUBIC = 1e-2  # the same where a difference of third order is taken
+_SMALL = 1e-5  # numerics: below this angle [rad] series are exact to double precision
+_SMALL_CUBIC = 1e-2  # numerics: the same where a difference of third order is taken
 
 
 def hat(w: Array) -> Array:

@@ -8,7 +8,7 @@ from slam.geometry.arrays import Array, BoolArray
 from slam.landmarks import LandmarkRows
 from slam.mapping.config import MapConfig
 
-_BLOCK = 256  # landmarks that are compared with all others at once
+_BLOCK = 256  # cost: landmarks that are compared with all others at once
 
 
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:

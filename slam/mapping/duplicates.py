@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.chi_square import SIGMAS
 from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
 from slam.landmarks import LandmarkRows
@@ -12,7 +13,6 @@ from slam.mapping.config import MapConfig
 from slam.tracking.association import pairs_in_boxes
 from slam.tracking.visibility import MapView
 
-_SIGMAS = 3.0  # standard deviations of the depth within which two positions along a line of sight are the same
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 
 
@@ -24,7 +24,7 @@ def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatu
     out = np.zeros(len(features), bool)
     feature, rows = _near_landmarks(features.uv_left, view, config)
     offset = view.points[feature] - view.local[rows]
-    along = np.abs(offset[:, 2]) < _SIGMAS * view.depth_sigma[feature]
+    along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
     same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
     same &= _alike(landmarks, rows, features.descriptors[feature], features.laplacian[feature], config)
     out[feature[same]] = True

@@ -9,8 +9,8 @@ from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
-_LARGEST = 1e18  # variance [m²]; those of a landmark that is hardly known at all are far smaller
-_SYMMETRIC = 1e-6  # largest share by which a covariance may differ from its transpose
+_LARGEST = 1e18  # guard: variance [m²]; those of a landmark that is hardly known at all are far smaller
+_SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
 def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:

@@ -40,15 +40,15 @@ class HasMap(Protocol):
 
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 4  # of the file's form
+_VERSION = 4  # fixed: of the file's form
 _WITHOUT_PLACES = "2"  # the version that is read as well; 3 had keyframes without the common errors of their poses
-_DATE = (1980, 1, 1, 0, 0, 0)  # of all members: the same map is the same file
+_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members: the same map is the same file
 
 #: World frame of a map that was begun without another one.
 FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
-_MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # of descriptors
+_MOST_DIMENSIONS, _LONGEST = 4096, 1e6  # guard: of descriptors
 
 _TYPES = {
     "ids": np.int64, "positions": np.float64, "covariances": np.float64, "descriptors": np.float32,

@@ -30,11 +30,11 @@ from slam.tracking.visibility import MapView
 
 _PARALLAX = np.deg2rad(1.0)  # between the two rays, at least
 _RADIUS = 20.0  # a feature moves no further between two frames than that, besides the camera's turn [px]
-_D_MATCH, _RATIO = 0.5, 0.7  # descriptor distance; ratio of the nearest two (paper B, 2.2)
-_KEPT = 45  # frames in which a view is kept at most
-_MISFIT = 6.6  # of the two views with one point: 99 % of χ² with one degree of freedom
-_STEPS = 4  # of Gauss-Newton on a point's depth
-_VIEWS = 400  # views kept at most
+_D_MATCH, _RATIO = 0.5, 0.7  # paper: descriptor distance; ratio of the nearest two (paper B, 2.2)
+_KEPT = 45  # cost: frames in which a view is kept at most
+_MISFIT = 6.6  # derived: χ²(1) at 99 %, of the two views with one point
+_STEPS = 4  # numerics: of Gauss-Newton on a point's depth
+_VIEWS = 400  # cost: views kept at most
 _CLAIM = 12.0  # a landmark claims features so near to where it is expected [px]
 
 

@@ -13,7 +13,7 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, so3_log
 from slam.object_data import ObjectEstimate
 from slam.object_models import ObjectModels
-from slam.objects.existence import FIRST, when_measured, when_missed
+from slam.objects.existence import EVEN, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
@@ -83,7 +83,7 @@ class Body:
     proved: bool = False
     alike: int = 0
     age: int = 0
-    existence: float = FIRST
+    existence: float = EVEN
     refused: int = 0
     measured_at: float = float("nan")
     reported: int = 0

@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
 from slam.geometry.gauss_kernels import squared_distances
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array
-from slam.objects.tracks import MOVES, ConstantVelocity
+from slam.objects.points import ENOUGH
+from slam.objects.tracks import AGREES, EXPLAINED, MOVES, ConstantVelocity
 
-_NEAR = 7.8  # χ²(3) at 95 %: tracks inside the region
-_AGREES = 11.3  # χ²(3) at 99 %: velocities that agree
-_BEGIN = 2  # tracks that begin a region
-_SUPPORT = 3  # tracks of a frame that are a region's support
-_FRAMES = 4  # with support
-_TRACKS = 4  # different ones that have supported it
-_EXPLAINED = 0.2  # share of the χ² of "still" that the region's motion may leave, as of members of a body
+_NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
+_BEGIN = 2  # fixed: tracks that begin a region
+_FRAMES = 4  # in which a region has had the tracks that fix a motion
 _SHARE = 0.6  # of the tracks inside that must agree with it
 _PATIENCE = 3  # frames for which a region is followed without a track
 _OVERLAP = 3.0  # velocities of successive frames come from the same window: their covariance is larger by so much
@@ -152,7 +150,7 @@ class Candidate:
         Args:
             min_speed: of bodies [m/s].
         """
-        enough = len(self.members) >= _SUPPORT and self.frames >= _FRAMES and len(self.supporters) >= _TRACKS
+        enough = len(self.members) >= MINIMAL_POINTS and self.frames >= _FRAMES and len(self.supporters) >= ENOUGH
         if not (enough and self.agreeing > _SHARE * (self.agreeing + self.contradicting)):
             return False
         length = float(np.linalg.norm(self.state[:3] - self.start))
@@ -243,7 +241,7 @@ def _claimed(regions: _Regions, tracks: MovingTracks, moving: NDArray[np.intp]) 
     """Which of the tracks `moving` (M,) lie in each region and move as it does (C, M): the first region has it."""
     fits = regions.near(tracks, moving, tracks.places)
     which, track = np.nonzero(fits)
-    fits[which, track] = regions.unexplained(tracks, which, moving[track]) <= _AGREES
+    fits[which, track] = regions.unexplained(tracks, which, moving[track]) <= AGREES
     return np.asarray(fits & (fits.cumsum(axis=0) == 1))
 
 
@@ -253,8 +251,8 @@ def _supported(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp],
     inside = after.near(tracks, _ALL, tracks.spread)
     which, within = np.nonzero(inside)
     left = after.unexplained(tracks, which, within)
-    agrees = left <= _AGREES
-    contradicts = ~agrees & (left > _EXPLAINED * tracks.motion.test[within])
+    agrees = left <= AGREES
+    contradicts = ~agrees & (left > EXPLAINED * tracks.motion.test[within])
     agreeing = np.bincount(which[agrees & tracks.moves[within]], minlength=len(mine)).tolist()
     contradicting = np.bincount(which[contradicts], minlength=len(mine)).tolist()
     followed = []
@@ -264,7 +262,7 @@ def _supported(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp],
         followed.append(after.candidate(
             i,
             supporters=candidate.supporters | frozenset(tracks.ids[rows].tolist()),
-            frames=candidate.frames + (len(rows) >= _SUPPORT),
+            frames=candidate.frames + (len(rows) >= MINIMAL_POINTS),
             agreeing=candidate.agreeing + agreeing[i],
             contradicting=candidate.contradicting + contradicting[i],
             unseen=0,
@@ -295,7 +293,7 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     if len(rows) < _BEGIN:
         return []
     at, places, speed, speeds = m.position[rows], tracks.places[rows], m.velocity[rows], m.velocity_covariance[rows]
-    near = _below(_NEAR, at, places, at, places) & _below(_AGREES, speed, speeds, speed, speeds)
+    near = _below(_NEAR, at, places, at, places) & _below(AGREES, speed, speeds, speed, speeds)
     left, found = np.ones(len(rows), bool), []
     for i in np.argsort(-near.sum(axis=1), kind="stable"):
         group = near[i] & left
@@ -314,7 +312,7 @@ def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
     velocity = P[3:, 3:] @ (towards / share).sum(axis=0)
     return Candidate(
         np.concatenate([place, velocity]), P, place, P[:3, :3].copy(), frozenset(tracks.ids[rows].tolist()),
-        frames=int(len(rows) >= _SUPPORT), members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
+        frames=int(len(rows) >= MINIMAL_POINTS), members=tracks.rows[rows], radius=float(tracks.radius[rows].mean()),
     )  # fmt: skip
 
 

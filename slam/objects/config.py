@@ -8,7 +8,7 @@ from slam.errors import ConfigurationError
 from slam.models import FORBID_UNKNOWN, require_not_negative
 
 MODES = ("detect", "procedure1", "off")
-_LONGEST = 200  # window [frames]: every track keeps so many measurements
+_LONGEST = 200  # guard: window [frames]: every track keeps so many measurements
 
 
 @dataclass(frozen=True)

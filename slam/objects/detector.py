@@ -36,6 +36,7 @@ from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
+from slam.objects.points import compact
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene
 from slam.objects.revision import Mend, revise_tracks
@@ -43,6 +44,7 @@ from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velociti
 from slam.objects.twists import fit_twist
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
+_FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _SETTLED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
@@ -217,7 +219,7 @@ class MovingObjectDetector:
         """
         c, tracks = self.config, self.tracks
         assert tracks is not None
-        members = members[membership.compact(tracks.position[members])]
+        members = members[compact(tracks.position[members], _FAR)]
         if len(members) < c.min_support:
             return
         for _ in range(_ROUNDS):

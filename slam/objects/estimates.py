@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam.data import StereoFeatures
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse, transform
 from slam.interfaces import ObjectBackend
 from slam.object_data import MovingObject, ObjectEstimate, ObjectObservations
@@ -15,11 +16,9 @@ from slam.object_models import ObjectModels
 from slam.objects import membership
 from slam.objects.bodies import CUT, Body, counted, from_estimate, outermost
 from slam.objects.config import ObjectsConfig
+from slam.objects.existence import EVEN
+from slam.objects.points import REJECTIONS
 from slam.objects.tracks import Tracks
-
-_TO_START = 3  # points with a depth that a back end needs to start a body
-_REFUSALS = 3  # so many frames running in which the back end used nothing of a body that was seen
-_LIKELY = 0.5  # probability from which a body rather exists than not
 
 
 class BodyEstimates:
@@ -53,7 +52,7 @@ class BodyEstimates:
             backend.remove_objects(gone)
         known = {body.id for body in bodies.values() if body.estimate is not None}
         observations = [_observations(body, tracks, features) for body in bodies.values() if body.measured]
-        told = [o for o in observations if o.id in known or o.has_stereo.sum() >= _TO_START]
+        told = [o for o in observations if o.id in known or o.has_stereo.sum() >= MINIMAL_POINTS]
         estimates = _restarted(bodies, backend, backend.update_objects(told), observations)
         strangers = [e.id for e in estimates if e.id not in bodies]  # of before a restart
         if strangers:
@@ -77,14 +76,14 @@ class BodyEstimates:
 
     def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
         """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
-        return body.refused < _REFUSALS and self._models.known(estimate.covariance, estimate.velocity_covariance)
+        return body.refused < REJECTIONS and self._models.known(estimate.covariance, estimate.velocity_covariance)
 
     def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
         """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
         c = self._config
         short = estimate.stamp - body.measured_at <= c.report_unmeasured
         seldom = body.reported_unmeasured + 1 <= c.unmeasured_share * body.reported
-        return estimate.measured or (short and seldom and body.existence > _LIKELY)
+        return estimate.measured or (short and seldom and body.existence > EVEN)
 
 
 def _restarted(
@@ -96,7 +95,7 @@ def _restarted(
     They bring the velocity that they had: what was wrong is where the back end has their points.
     """
     refused = {e.id for e in estimates if not e.measured}
-    anew = [o for o in observations if o.id in refused and o.has_stereo.sum() >= _TO_START]
+    anew = [o for o in observations if o.id in refused and o.has_stereo.sum() >= MINIMAL_POINTS]
     if not anew:
         return estimates
     ids = sorted(o.id for o in anew)

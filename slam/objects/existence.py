@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-FIRST = 0.5  #: probability of a body before its first evidence
+EVEN = 0.5  #: fixed: a body rather exists than not above this probability, which it has before its first evidence
 _LEAST = 2.0  # ratio of the likelihoods of a measured body, at least: a body at rest shows no motion, but is there
 _LARGEST = 20.0  # χ² that counts of the typical member: many members share one error of the camera's pose
 _CERTAIN = 1.0 - 1e-9  # a probability of 1 could never fall again

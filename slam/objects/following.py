@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.chi_square import SIGMAS
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
@@ -18,7 +19,6 @@ from slam.objects.pixel_kernels import pixel_deviations
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import LEAST_INFORMATION, Tracks
 
-_SIGMAS = 3.0  # standard deviations of the predicted pixel: half size of the window
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
 
@@ -88,7 +88,7 @@ def _expected(
     local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
     z, J = rig.project_stereo(local)
     spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
-    size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
+    size = SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
     radius = np.fmin(np.fmax(size, least), config.search_limit)  # the least where the size is NaN
     rows, columns = match_near(
@@ -151,7 +151,7 @@ def _look_at(
     local = (ahead - T_world_left[:3, 3]) @ T_world_left[:3, :3]
     z, J = rig.project_stereo(local)
     spread = pixel_deviations(J, T_world_left, tracks.covariance[rows] + covariance, np.arange(len(rows)), sigma)
-    size = _SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
+    size = SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
     radius = np.fmin(np.fmax(size, config.search_radius), config.search_limit)
     mine, columns = match_near(
         z[:, :2], radius, tracks.descriptors[rows], tracks.laplacian[rows], among, config.d_match, config.ratio
@@ -184,7 +184,7 @@ def _far(
     own = np.trace(tracks.covariance[left], axis1=1, axis2=2)
     start = tracks.position[left]
     squares = (start**2).sum(axis=1)[:, None] + (found**2).sum(axis=1) - 2 * start @ found.T
-    allowed = squares < (config.max_speed * dt + _SIGMAS * np.sqrt(own[:, None] + deviation**2)) ** 2
+    allowed = squares < (config.max_speed * dt + SIGMAS * np.sqrt(own[:, None] + deviation**2)) ** 2
     rows, columns = match_far(
         tracks.descriptors[left], tracks.laplacian[left], features, free, allowed, config.wide_d_match,
         config.wide_ratio,

@@ -11,7 +11,7 @@ from slam.data import BoolArray, StereoFeatures
 from slam.geometry.se3 import Array
 from slam.objects.pixel_kernels import best_in_windows, best_of_products
 
-_NEIGHBOURS = 8  # features looked at in a window: the nearest ones
+_NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 

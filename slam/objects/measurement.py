@@ -10,7 +10,7 @@ from slam.geometry.se3 import Array
 from slam.objects.pixel_kernels import information_in_world, move_along_rays
 
 _FAR = 3.0  # expected points so far off that linearising there is worse than at the measured point [px]
-_STEPS = 4  # of Gauss-Newton at most
+_STEPS = 4  # numerics: of Gauss-Newton at most
 
 
 def measure(

@@ -13,10 +13,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
+from slam.objects.points import REJECTIONS
 from slam.objects.track_kernels import (
     improve_members,
     squares,
@@ -24,31 +26,26 @@ from slam.objects.track_kernels import (
     squares_of_both,
     weighted_means,
 )
-from slam.objects.tracks import Tracks, fit_positions, median, times_vectors
-from slam.tracking.gating import chi_square_limits
+from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, median, times_vectors
 
-_MISFITS = 3  # times that a track may disagree with its body before it leaves
-_FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from an even motion, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
 _PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
-_FREEDOM = 6.0  # of a body's pose in every frame
+_FREEDOM = 6.0  # fixed: of a body's pose in every frame
 _PROOF = 8.0  # median of the members' χ² from which a body has moved for certain
-_PROBATION = 12  # frames after which it must have
-_NEAR = 9.0  # χ² of the distance from a body's extent up to which a track may join, and
+_PROBATION = 12  # frames after which it must have, and in which it is not told from another body for certain
+_NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
 _INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
 _EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
-_EXPLAINED = 0.2  # share of the χ² of "still" that the body's motion, itself uncertain, may leave
 _LOOSE = 4.0  # by how much it may exceed the 99 % limit then
 _BETTER = 6.0  # by how much χ² the body must explain a track better than the still world does, for it to join, and
 _BETTER_INSIDE = -4.0  # where it lies inside
 _WORSE = -9.0  # a member for which the still world is better by more leaves
 _MOST = 0.5  # share of the members that must fit for those to leave that do not: else it is the body's pose
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
-_RETURNED = 16.8  # χ²(6) at 99 %: place and velocity of a body that is seen again
-_WEAK = 1e-8  # variance that is added to a known pose's [m²]
-_YOUNG = 12  # frames in which a body's motion is not well enough known to tell it from another
+_RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
+_WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
 
 
@@ -77,7 +74,7 @@ def verdict(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Verdict:
     t = tracks
     fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
     limit = _limits(3 * t.dof.shape[1])[np.maximum(numbers - 3, 1)]
-    fits = (fixed < limit) | ((fixed < _EXPLAINED * still) & (fixed < _LOOSE * limit))
+    fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
     return Verdict(still - fixed, fits, count)
 
 
@@ -85,12 +82,6 @@ def verdict(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Verdict:
 def _limits(most: int) -> Array:
     """99 % limits of χ² for 0 to `most` degrees of freedom."""
     return chi_square_limits(np.arange(most + 1), 0.99)
-
-
-def compact(points: Array) -> BoolArray:
-    """Which of the points (N, 3) lie together: not much farther from the median point than most."""
-    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else np.zeros(0)
-    return np.asarray(distance <= _FAR * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
 def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
@@ -190,7 +181,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     v, seen = verdict(body, tracks, mine), tracks.seen[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
-    wrong = (tracks.misfit[mine] >= _MISFITS) | (seen & ((v.gain < _WORSE) | unfit))
+    wrong = (tracks.misfit[mine] >= REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
         leave(tracks, mine[wrong & ~seen], body)
@@ -256,10 +247,10 @@ def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp
         points, A, known = in_body_axes(body, tracks, rows)
         fixed = float(_squares(points, A).sum())
         still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
-        by_chance = float(chi_square_limits(np.array([6 * int(known.any(axis=0).sum())]), 0.99)[0])
+        by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
         certain = _squares_with_pose_error(points, A, body)
-        apart = body.seen > _YOUNG and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
-        if fixed < 2 * _EXPLAINED * still and not apart:
+        apart = body.seen > _PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
+        if fixed < 2 * EXPLAINED * still and not apart:
             return body
     return None
 

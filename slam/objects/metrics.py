@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from slam.data import FrameResult, StereoFeatures
 from slam.geometry.se3 import Array, inverse, log, rotation_angle, so3_exp, so3_log
+from slam.objects.points import ENOUGH
 
-_SINGULAR = 1e-9  # smallest eigenvalue of a matrix of correlations that counts
+_SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations that counts
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
-_SUPPORT = 4  # stereo features from which a body counts as in view
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class ObjectScore:
             life.measured.append(thing.estimate.measured)
             if thing.estimate.measured:
                 named.add((thing.id, life.truth))
-        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() >= _SUPPORT}
+        in_view = {b for b in range(1, len(self.bodies) + 1) if (moving & (labels == b)).sum() >= ENOUGH}
         for body in in_view:
             self.covered.setdefault(body, []).append(any(truth == body for _, truth in named))
         relevant = [truth for _, truth in named if truth == 0 or truth in in_view]

@@ -9,14 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
+from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
 
 Projection = Callable[[Array], tuple[Array, Array]]
 
 _FAR = 4.0  # so many times the median distance from the median point is no part of the body
-ENOUGH = 4  #: points that show a shape, and that can be judged to agree with each other
+ENOUGH = MINIMAL_POINTS + 1  #: points that can be judged to agree with each other: three agree with a pose in any case
 REJECTIONS = 3  #: so many running, and a point starts anew
-_STEPS = 3  # of Gauss-Newton; the prior is weak where depth is known well
+_STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
+
+
+def compact(points: Array, far: float) -> BoolArray:
+    """Which of the points (N, 3) lie less than `far` times the median distance from their median point."""
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else np.zeros(0)
+    return np.asarray(distance <= far * np.median(distance) if len(points) else np.zeros(0, bool))
 
 
 def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
@@ -33,10 +40,8 @@ def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
     """
     world = transform(T_world_left, h)
     seen = np.isfinite(world).all(axis=1)
-    middle = np.median(world[seen], axis=0)
-    distance = np.linalg.norm(world - middle, axis=1)
     near = np.zeros(len(h), bool)
-    near[seen] = distance[seen] <= _FAR * np.median(distance[seen])
+    near[seen] = compact(world[seen], _FAR)
     T = np.eye(4)
     T[:3, 3] = world[near].mean(axis=0)
     return T, near

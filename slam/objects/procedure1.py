@@ -29,9 +29,9 @@ from slam.objects.matching import match_far
 from slam.objects.revision import Mend
 
 _LARGEST = 2**28  # bytes of a database's file
-_FARTHEST = 1e8  # of its numbers
-_STEP = 1e-5  # of the finite differences [m]
-_CANDIDATES = 12  # features with the largest determinants among which a triple is looked for
+_FARTHEST = 1e8  # guard: of its numbers
+_STEP = 1e-5  # numerics: of the finite differences [m]
+_CANDIDATES = 12  # cost: features with the largest determinants among which a triple is looked for
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,12 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.tracks import LEAST_INFORMATION, Tracks, times_vectors
+from slam.objects.points import ENOUGH
+from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks, times_vectors
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
-_HYPOTHESES = 60  # poses tried for a body that is found again
-_LEAST = 4  # points that fix a pose: three agree with it whatever they are
-_LEAST_ANEW = 4  # points that must agree where a body is found again
+_HYPOTHESES = 60  # cost: poses tried for a body that is found again
 _LEAST_PREDICTED = 2  # points that must agree with the predicted motion
-_FITS = 11.3  # χ²(3) at 99 %
 _DEPTHS = 0.2  # share of the depth by which stereo may be off
 
 
@@ -43,7 +41,7 @@ def locate(
         found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
     if found is None or 2 * found[1].sum() < len(mine):
         wide, wide_rows = _by_looks(body, tracks, members, features, measured, T_world_left, config)
-        again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed, _LEAST_ANEW)
+        again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed)
         if (
             again is not None
             and (found is None or again[1].sum() > found[1].sum())
@@ -78,7 +76,7 @@ def _is_within_reach(body: Body, T: Array, T_world_left: Array, rig: StereoRig, 
     local = transform(inverse(T_world_left), T[None, :3, 3])
     spread = R @ body.covariance[3:, 3:] @ R.T + view @ rig.triangulation_covariance(local, sigma)[0] @ view.T
     gap = T[:3, 3] - body.T[:3, 3]
-    return bool(gap @ np.linalg.solve(spread, gap) < _FITS)
+    return bool(gap @ np.linalg.solve(spread, gap) < AGREES)
 
 
 def _is_expected(body: Body) -> bool:
@@ -88,16 +86,16 @@ def _is_expected(body: Body) -> bool:
 
 def _fit(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], rows: NDArray[np.intp], features: StereoFeatures,
-    T_world_left: Array, rig: StereoRig, sigma: float, seed: int, least: int = _LEAST,
+    T_world_left: Array, rig: StereoRig, sigma: float, seed: int,
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
     """Pose T_body_left, and which tracks agree with it as the features of these rows."""
-    if len(mine) < least:
+    if len(mine) < ENOUGH:
         return None
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     guess = inverse(body.T) @ T_world_left
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
     stereo = np.isfinite(z[fit.inliers, 2])
-    return None if stereo.sum() < least else (fit.T_world_left, fit.inliers)
+    return None if stereo.sum() < ENOUGH else (fit.T_world_left, fit.inliers)
 
 
 def _predicted(
@@ -121,14 +119,14 @@ def _predicted(
     noise += np.linalg.inv(tracks.local_information[mine[deep]] + LEAST_INFORMATION * np.eye(3))
     information, J = np.linalg.inv(noise), -points_by_pose(y)
     spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
-    agrees = _squares(gaps, np.linalg.inv(spread)) < _FITS
+    agrees = _squares(gaps, np.linalg.inv(spread)) < AGREES
     known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
     while agrees.sum() >= _LEAST_PREDICTED:
         normal = known + (JA[agrees] @ J[agrees]).sum(axis=0)
         change = np.linalg.solve(normal, (JA[agrees] @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
         off = np.where(agrees, _squares(gaps - J @ change, information), 0.0)
         worst = int(np.argmax(off))
-        if off[worst] < _FITS:
+        if off[worst] < AGREES:
             which = np.zeros(len(rows), bool)
             which[deep[agrees]] = True
             return inverse(body.T @ exp(change)) @ T_world_left, which
@@ -153,7 +151,7 @@ def _by_looks(
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
-    if len(mine) < _LEAST_ANEW or len(free) < _LEAST_ANEW:
+    if len(mine) < ENOUGH or len(free) < ENOUGH:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     local = measured[free]
     points = transform(T_world_left, local)

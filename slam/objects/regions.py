@@ -19,26 +19,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
 from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
 from slam.objects.tracks import median, times_vectors
-from slam.tracking.gating import chi_square_limits
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
-_ROUNDS = (3, 2)  # of reweighting: Huber's first, which has one minimum, then a sharper one
+_ROUNDS = (3, 2)  # numerics: of reweighting: Huber's first, which has one minimum, then a sharper one
 _LARGEST = 0.4  # share of all tracks that a body may have: the still world has most
 _PRIOR = np.array([1e-4] * 3 + [1e-6] * 3)  # keeps Λ of nearly collinear tracks invertible [1/rad², 1/m²]
-_FITS = 14.2  # χ²(3) at 99.7 %
+_FITS = 14.2  # derived: χ²(3) at 99.7 % of a member and its group's motion
 _BETTER = 4.0  # by how much χ² a member must fit its group's motion better than the rest's, and
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _TAIL = 3.0  # tracks; see `limit`
-_MEDIAN = float(chi_square_limits(np.array([3]), 0.5)[0])  # of χ²(3)
+_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
-_MOST = 20  # windows looked into for the next group
+_MOST = 20  # cost: windows looked into for the next group
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-_RIDGE = 1e-9  # share of the trace, for information over a whole window, and
-_PART = 1e-6  # for a part of it
-_LEAST = 1e-12  # and this for windows that are empty
+_RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
+_PART = 1e-6  # numerics: for a part of it
+_LEAST = 1e-12  # numerics: and this for windows that are empty
 
 
 # ---------------------------------------------------------------------------------------------- 3x3 matrices

@@ -17,9 +17,11 @@ from slam.geometry.se3 import Array
 from slam.objects.track_kernels import even_motions, fit_fixed_points, leave_window, measurements
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
-LEAST_INFORMATION = 1e-6  #: on a member's point that has none yet [1/m²]
-MOVES = 12.0  #: χ²(3) of the velocity from which it counts: 1 % of still points
-_ROOM = 1000  # rows that a table begins with
+LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
+MOVES = 12.0  #: derived: χ²(3) at 99.3 % of the velocity, from which it counts
+AGREES = 11.3  #: derived: χ²(3) at 99 %, of places or velocities that are the same
+EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain, may leave of what moves with it
+_ROOM = 1000  # cost: rows that a table begins with
 
 
 @dataclass

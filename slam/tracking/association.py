@@ -20,9 +20,9 @@ from slam.models import FORBID_UNKNOWN, require_not_negative
 Descriptors = NDArray[np.float32]
 
 _NONE = np.float32(np.inf)
-_LARGE = 0.03  # where windows take up more than this share of the image, comparing all descriptors first is quicker
+_LARGE = 0.03  # cost: where windows fill more than this share of the image, all descriptors are compared first
 
-_POSES = (0, 100_000)  # tried in a frame
+_POSES = (0, 100_000)  # guard: tried in a frame
 _RANGES = {
     "hypotheses": _POSES,
     "wide_hypotheses": _POSES,

@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
+from slam.chi_square import chi_square_limits
 from slam.data import BoolArray
 from slam.geometry.se3 import Array
-
-
-def chi_square_limits(dof: NDArray, probability: float) -> Array:
-    """Quantiles of χ² at `probability` for degrees of freedom (M,), integers."""
-    return np.asarray(_quantiles(int(np.max(dof, initial=0)), probability)[np.asarray(dof, int)])
-
-
-@lru_cache(maxsize=256)
-def _quantiles(most: int, probability: float) -> Array:
-    """Those for 0 to `most` degrees of freedom."""
-    return np.append(0.0, 2.0 * gammaincinv(np.arange(1, most + 1) / 2.0, probability))
 
 
 def squared_distances(residuals: Array, covariances: Array) -> Array:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam.chi_square import SIGMAS
 from slam.geometry.se3 import Array, inverse, log
 from slam.models import EstimatorModels
 
-_SIGMAS = 3.0  # standard deviations of a velocity within which two poses agree
 _SLACK = 0.05  # between two poses found one by one [m], [rad]
 
 
@@ -32,6 +32,6 @@ class PoseHypotheses:
         if self.T_world_left is None:
             return PoseHypotheses(1, stamp, T_world_left)
         step, dt = log(inverse(self.T_world_left) @ T_world_left), stamp - self.stamp
-        turn = np.linalg.norm(step[:3]) < _SLACK + _SIGMAS * models.initial_angular_velocity_sigma * dt
-        way = np.linalg.norm(step[3:]) < _SLACK + _SIGMAS * models.initial_velocity_sigma * dt
+        turn = np.linalg.norm(step[:3]) < _SLACK + SIGMAS * models.initial_angular_velocity_sigma * dt
+        way = np.linalg.norm(step[3:]) < _SLACK + SIGMAS * models.initial_velocity_sigma * dt
         return PoseHypotheses(self.count + 1 if turn and way else 1, stamp, T_world_left)

@@ -17,7 +17,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.models import EstimatorModels
 
-_ROUNDS = 10  # in which they are chosen: between one by one and all at once
+_ROUNDS = 10  # cost: in which they are chosen: between one by one and all at once
 
 
 def most_informative(

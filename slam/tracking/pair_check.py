@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
-_FEATURES = 1000  # of an image that are matched
-_TOLERANCE = 2.0  # [px] from an epipolar line: ORB places features to a pixel or two
+_FEATURES = 1000  # guard: of an image that are matched
+_TOLERANCE = 2.0  # guard: [px] from an epipolar line: ORB places features to a pixel or two
 
 #: Disparities below this are none [px].
 NO_DISPARITY = _TOLERANCE
 
-_SAMPLE = 8  # matches that any fundamental matrix can be made to fit
-_SIGMAS = 5.0  # a chance of 3e-7 to be wrong
+_SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
+_SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.chi_square import SIGMAS
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.tracking.association import pairs_in_boxes
 
-_SIGMAS = 3.0  # standard deviations of depth by which one point is nearer than another for certain
 _NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
 
 
@@ -98,7 +98,7 @@ def hidden_landmarks(view: MapView, rows: NDArray[np.intp], features: StereoFeat
         return np.zeros(len(rows), bool)
     at, which = pairs_in_boxes(view.uv_left[rows], np.full((len(rows), 2), radius), features.uv_left[stereo])
     feature = stereo[which]
-    depth = view.points[feature, 2] + _SIGMAS * view.depth_sigma[feature]
+    depth = view.points[feature, 2] + SIGMAS * view.depth_sigma[feature]
     nearer = depth < _NEARER * view.local[rows[at], 2]
     around = np.bincount(at, minlength=len(rows))
     return 2 * np.bincount(at, nearer, minlength=len(rows)) > around

@@ -12,7 +12,7 @@ import numpy as np
 from slam.errors import SlamError
 from slam.mapping.atlas.keyframes import Keyframe
 
-_ALIGNMENT = 8  # bytes
+_ALIGNMENT = 8  # fixed: bytes
 
 
 class FeatureFile:

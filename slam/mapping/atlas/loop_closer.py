@@ -40,15 +40,15 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph
 
-_NEARBY = 4  # keyframes that are compared as the path is near them, besides those that look alike
+_NEARBY = 4  # cost: keyframes that are compared as the path is near them, besides those that look alike
 _CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
-_VERIFIED = 3  # keyframes whose geometry is checked, of those that are compared in detail
+_VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
 _PATIENCE = 3  # keyframes within which another one must see the same return
 _MINIMAL = 6  # features that give a pose with a covariance
 _UNKNOWN_WAY = 1000.0  # [m] between the end of an earlier run and this one, or where the camera was kidnapped
 _UNKNOWN_MOTION = 1.0, 100.0  # standard deviations of the motion there [rad], [m]: it says nothing
-_LARGEST = 6e4  # number that a keyframe's descriptors hold
-_HYPOTHESES = 300  # poses tried: one in a hundred places is missed where a quarter of its matches are right
+_LARGEST = 6e4  # guard: number that a keyframe's descriptors hold
+_HYPOTHESES = 300  # cost: poses tried: one in a hundred places is missed where a quarter of its matches are right
 
 
 @dataclass(frozen=True)

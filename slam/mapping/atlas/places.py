@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 Vectors = NDArray[np.float32]
 
-_LENGTH = 1024  # of a keyframe's vector: 4 kB
-_TRAINING = 50  # descriptors for each word, before the words are learnt
-_ROUNDS = 10  # of k-means
+_LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
+_TRAINING = 50  # cost: descriptors for each word, before the words are learnt
+_ROUNDS = 10  # numerics: of k-means
 
 
 @dataclass(frozen=True)

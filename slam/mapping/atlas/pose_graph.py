@@ -23,10 +23,10 @@ from slam.mapping.atlas.keyframes import Loop
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
 
-_ROUNDS = 30  # of least squares, at most
-_CONVERGED = 1e-3  # decrease of χ² that is none any more
-_FAST = 0.1  # of the decrease of χ² in the step before, below which the normal equations are good enough
-_HALVINGS = 8  # of a step that makes χ² larger
+_ROUNDS = 30  # numerics: of least squares, at most
+_CONVERGED = 1e-3  # numerics: decrease of χ² that is none any more
+_FAST = 0.1  # numerics: of the decrease of χ² in the step before, below which the normal equations are good enough
+_HALVINGS = 8  # numerics: of a step that makes χ² larger
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from slam.geometry.se3 import Array
 from slam.mapping.atlas.keyframes import Keyframe
 
-_LEAST = 64  # rows that there is room for at first
+_LEAST = 64  # cost: rows that there is room for at first
 
 
 @dataclass(frozen=True)

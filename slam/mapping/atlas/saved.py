@@ -22,8 +22,8 @@ ATLAS_TYPES = {
     "loop_pairs": np.int64, "loop_motions": np.float64, "loop_covariances": np.float64, "loop_inliers": np.int64,
 }  # fmt: skip
 
-_LARGEST = 1e12  # entry of a covariance [rad², m²]
-_TURNED = 1e-6  # by which a rotation matrix may be none
+_LARGEST = 1e12  # guard: entry of a covariance [rad², m²]
+_TURNED = 1e-6  # guard: by which a rotation matrix may be none
 _LIMITS = {
     "keyframe_stamps": _LARGEST, "keyframe_poses": FARTHEST_POSITION, "keyframe_odometry": FARTHEST_POSITION,
     "keyframe_covariances": _LARGEST, "keyframe_steps": _LARGEST, "keyframe_shares": _LARGEST,

@@ -21,8 +21,8 @@ from slam.tracking.localizer import Localizer
 #: What descriptors find slides over the surface when it is seen from elsewhere, all features of a place alike [px].
 _SLIDE = 1.0
 
-_ROUNDS = 5  # of least squares, at most
-_CONVERGED = 1e-6  # step [rad], [m]
+_ROUNDS = 5  # numerics: of least squares, at most
+_CONVERGED = 1e-6  # numerics: step [rad], [m]
 
 
 @dataclass(frozen=True)

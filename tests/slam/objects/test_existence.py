@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import pytest
 
-from slam.objects.existence import FIRST, when_measured, when_missed
+from slam.objects.existence import EVEN, when_measured, when_missed
 
 
 def test_a_body_that_moves_clearly_is_soon_certain():
-    assert when_measured(FIRST, gain=8.0) > 0.98
-    assert when_measured(FIRST, gain=0.0) < 0.7  # at rest it shows little
+    assert when_measured(EVEN, gain=8.0) > 0.98
+    assert when_measured(EVEN, gain=0.0) < 0.7  # at rest it shows little
     assert when_measured(0.999999, gain=1e6) < 1.0  # and never so certain that it could not be forgotten
 
 

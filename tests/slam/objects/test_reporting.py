@@ -13,7 +13,7 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from tests.slam.objects.double import FitBackend
 
-FIRST, GONE = 50, 100  # frames: the box moves from 60 on, and is covered from 100 on
+EVEN, GONE = 50, 100  # frames: the box moves from 60 on, and is covered from 100 on
 
 
 class Spoilt(FitBackend):
@@ -48,7 +48,7 @@ def moving_box():
 @pytest.mark.slow
 def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
     step, _ = moving_box
-    rows = [thing for k in range(FIRST, GONE) for thing in step(k).objects]
+    rows = [thing for k in range(EVEN, GONE) for thing in step(k).objects]
     measured = sum(thing.estimate.measured for thing in rows)
     assert measured > 20 and rows[-1].existence > 0.99
     assert rows[-1].measured_at == rows[-1].estimate.stamp
@@ -63,7 +63,7 @@ def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
 
 def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(moving_box):
     step, backend = moving_box
-    ids = {thing.id for k in range(FIRST, GONE - 10) for thing in step(k).objects}
+    ids = {thing.id for k in range(EVEN, GONE - 10) for thing in step(k).objects}
     backend.spoilt = True
     assert not step(GONE - 10).objects
     backend.spoilt = False

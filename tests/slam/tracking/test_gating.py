@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slam.tracking.gating import chi_square_gate, chi_square_limits, squared_distances, whiteners
+from slam.chi_square import chi_square_limits
+from slam.tracking.gating import chi_square_gate, squared_distances, whiteners
 
 
 def covariances(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,28 @@
+"""Limits of χ² and of Gaussian numbers: from where on a value is an outlier."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+#: Standard deviations within which a Gaussian number lies (99.7 %): a difference of less is none.
+SIGMAS = 3.0
+
+
+def chi_square_limit(dof: int, probability: float) -> float:
+    """The quantile of χ² at `probability` for so many degrees of freedom."""
+    return float(_quantiles(dof, probability)[dof])
+
+
+def chi_square_limits(dof: NDArray, probability: float) -> NDArray[np.float64]:
+    """The same for degrees of freedom (M,), integers."""
+    return np.asarray(_quantiles(int(np.max(dof, initial=0)), probability)[np.asarray(dof, int)])
+
+
+@lru_cache(maxsize=256)
+def _quantiles(most: int, probability: float) -> NDArray[np.float64]:
+    """Those for 0 to `most` degrees of freedom."""
+    return np.append(0.0, 2.0 * gammaincinv(np.arange(1, most + 1) / 2.0, probability))
