@@ -32,6 +32,7 @@ OBSERVED = {
 RENDERED = {"aisle?frames=12": 0.005, "desk?frames=12": 0.005, "box?frames=12": 0.015, "street?frames=5": 0.06}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 @pytest.mark.parametrize("world", OBSERVED)
 def test_observed_world(world, backend):
@@ -52,6 +53,7 @@ def test_observed_world(world, backend):
     assert honesty["mean NEES"] < 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 @pytest.mark.parametrize("world", RENDERED)
 def test_rendered_world(world, backend, tmp_path):

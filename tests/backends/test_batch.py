@@ -43,6 +43,7 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
         assert off.max() < 1e-6, f"{name}: off by {off.max()}"
 
 
+@pytest.mark.slow
 def test_the_smoother_is_nearly_as_good_as_the_optimum():
     sequence = slam.open_sequence("synthetic:desk?frames=40&outliers=0")
     recording = true_recording(sequence, config=MapConfig(target_in_view=40))

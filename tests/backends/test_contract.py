@@ -96,6 +96,7 @@ class Buggy(FixedMapBackend):
 TIER_OF = {Forgetful: "runs", Careless: "right", Boastful: "right", Empty: "runs", Buggy: "runs"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", TIER_OF)
 def test_the_suite_finds_what_is_broken_and_says_it_in_a_sentence(broken):
     failed = [found for found in findings(broken) if found.failure]
@@ -138,6 +139,7 @@ def test_a_status_that_is_a_word_is_told_from_the_right_one():
     )
 
 
+@pytest.mark.slow
 def test_tiers_are_taken_one_after_the_other():
     assert [found.tier for found in findings(FixedMapBackend, "right")] == ["runs"] * len(RUNS) + ["right"] * len(RIGHT)
     check_backend(FixedMapBackend)

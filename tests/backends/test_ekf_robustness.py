@@ -250,6 +250,7 @@ def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     np.testing.assert_array_equal(backend._state.landmarks.points, points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("landmarks", ["inverse_depth", "euclidean"])
 def test_far_points_stay_before_the_camera(landmarks):
     """Points at 60 to 400 m, whose disparity is all noise: no position and no covariance loses its meaning.

@@ -55,6 +55,7 @@ def changed(members, **arrays):
     return packed(out)
 
 
+@pytest.mark.slow
 def test_a_file_that_would_unpack_to_gigabytes_is_not_unpacked(tmp_path, members):
     big = bytes(100_000_000)
     refused(tmp_path, packed({**members, "a.npy": big, "b.npy": big, "c.npy": big}), "would unpack to 3")

@@ -38,6 +38,7 @@ def read_picture(path):
     return cv2.imread(str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_figures_of_two_runs(runs, tmp_path, kind):
     (file,) = plot_runs([runs / "a", runs / "b"], tmp_path / f"{kind}.png", kind)
@@ -46,6 +47,7 @@ def test_figures_of_two_runs(runs, tmp_path, kind):
     assert np.ptp(picture, axis=2).max() > 60  # there is colour in it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("width", [88, 180])
 def test_a_figure_is_as_wide_as_asked(runs, tmp_path, kind, width):

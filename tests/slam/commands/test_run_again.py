@@ -38,6 +38,7 @@ def recording(tmp_path_factory):
     return folder / "rendered"
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_byte_for_byte(here):
     settings = ["--set", "map.max_landmarks=300", "--set", "frontend.max_depth=Infinity"]
     slam("run", WORLD, "--frames", "1:5", *settings, "--out", "first", "-q", "--no-picture")

@@ -46,6 +46,7 @@ def test_a_mistyped_command_is_answered_with_the_right_one():
     assert "settings" in done.output
 
 
+@pytest.mark.slow
 def test_short_options_are_the_long_ones(tmp_path):
     done = invoke("run", "synthetic:desk?frames=2&width=64&height=48", "-o", str(tmp_path / "out"), "-q")
     assert (done.exit_code, done.output) == (0, "")

@@ -20,6 +20,8 @@ from slam.compare.tables import groups, write_tables
 from slam.compare.trial import failure, result_files, run_trial
 from slam.errors import ConfigurationError, SlamError
 
+pytestmark = pytest.mark.slow  # all share one sweep
+
 PLAN = Plan(("synthetic:aisle?frames=8",), ("ekf", "smoother"), (Variant("simulated", "simulated"),), 2)
 TABLES = ("runs.csv", "means.csv", "differences.csv")
 

@@ -61,6 +61,7 @@ def test_a_body_out_of_view_is_reported_for_a_short_while_only(moving_box):
     assert (np.diff(sure) < 0).all() and sure[-1] > 0.5
 
 
+@pytest.mark.slow
 def test_a_body_whose_covariance_has_run_away_is_not_reported_and_starts_anew(moving_box):
     step, backend = moving_box
     ids = {thing.id for k in range(EVEN, GONE - 10) for thing in step(k).objects}

@@ -112,6 +112,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.txt", "frames.csv", "objects.csv"}
 
 
+@pytest.mark.slow
 def test_two_commands_do_not_share_a_folder(tmp_path):
     lock = lock_folder(tmp_path)
     command = [sys.executable, "-m", "slam", "run", "synthetic:desk?frames=2", "--out", str(tmp_path), "--quiet"]

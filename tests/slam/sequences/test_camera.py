@@ -258,6 +258,7 @@ class Watched:
         pass
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scene, slam_command, tmp_path, monkeypatch):
     image, out = np.hstack([scene[0].left, scene[0].right]), tmp_path / "out"
     monkeypatch.setattr(devices, "open_device", lambda *_: Watched(image, out / "frames.csv"))
@@ -280,6 +281,7 @@ def test_ctrl_c_ends_a_run_from_a_stuck_camera_with_all_its_files(rig_here, scen
     assert config["source"] == {"format": None, "given": "camera:0?wait=0"}
 
 
+@pytest.mark.slow
 def test_a_recording_runs_live_and_says_what_it_left_out(slam_command, tmp_path):
     world = f"synthetic:desk?frames=12&width={WIDTH}&height={HEIGHT}"
     done = slam_command("run", world, "--live", "--out", tmp_path / "out", "--no-picture", "--quiet")

@@ -173,6 +173,7 @@ def test_nothing_in_yaml_is_executed(tmp_path):
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 def test_aliases_and_many_numbers_are_taken_where_they_are_few_enough(tmp_path):
     (tmp_path / "a.yaml").write_text("a: &a [1, 2]\nb: *a\nc: {<<: {d: 3}}\nn: [" + "1.5, " * 50_000 + "2]\n")
     node = read_yaml(tmp_path / "a.yaml")

@@ -356,6 +356,7 @@ def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
         slam.open_sequence(write(tmp_path / "talk.bag", rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
 def test_damaged_recordings_end_in_one_line_or_are_read(version: int, tmp_path: Path) -> None:
     path = write(tmp_path / ("walk.bag" if version == 1 else "walk.mcap"), stereo(STORES[version], 2), version)

@@ -46,6 +46,7 @@ LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("field", "peopl
 SMALL = sorted(set(worlds.names()) - {"drive", "field", "people", "town"})  # a drive needs a file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [*SMALL, *LARGE])
 def test_worlds_are_right(world):
     sequence = slam.open_sequence(f"synthetic:{world}?frames=2")

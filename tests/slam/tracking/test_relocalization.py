@@ -51,6 +51,7 @@ def right_share(results, points):
     return right / total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_two_seconds_of_blackout(backend):
     poses = path(95)
@@ -75,6 +76,7 @@ def test_a_third_of_the_frames_dropped(backend):
     assert np.linalg.norm(system.trajectory().positions[-1] - last[:3, 3]) < 0.012
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_third_of_the_right_images_dropped(backend):
     rng = np.random.default_rng(2)
@@ -86,6 +88,7 @@ def test_a_third_of_the_right_images_dropped(backend):
     assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_carried_off_to_a_known_place(backend):
     """The camera jumps by half a metre and a turn within the map; it is found again, and the map does not double."""

@@ -128,6 +128,7 @@ def _copied_houses(sequence: WorldSequence) -> Array:
     return np.array([r for r in copies if hasattr(sequence.world.rectangles[r].texture, "windows")])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cars", "same"), [("same", True), ("other", False), ("none", True)])
 def test_a_round_later_images_are_the_same_but_for_other_cars(loop, cars, same):
     sequence = opened(loop, f"{SMALL}&noise=0&supersample=1&cars={cars}")

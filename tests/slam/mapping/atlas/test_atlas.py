@@ -168,6 +168,7 @@ def test_landmarks_are_as_sure_as_the_pose_that_a_loop_gives():
     np.testing.assert_array_equal(landmarks_by_pose(replace(estimate, covariances=1e-6 * P), corrected), 1e-6 * P)
 
 
+@pytest.mark.slow
 def test_a_loop_that_contradicts_the_path_is_refused(sequence):
     system, results = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.gate_sigmas=0.01")
     assert all(r.loop is None for r in results)
@@ -272,6 +273,7 @@ def test_loops_stay_bounded_and_spread_along_the_path(closed):
     assert gaps.max() < 0.5 * gaps.sum()
 
 
+@pytest.mark.slow
 def test_a_bounded_number_of_loops_still_corrects_the_path(closed, sequence):
     few, _ = drive(sequence, Odometry(sequence.rig, sequence.ground_truth), "atlas.most_loops=2")
     assert few.atlas.summary()["closed"] == closed[0].atlas.summary()["closed"] > 2
