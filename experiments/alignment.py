@@ -33,7 +33,7 @@ DRIVES = {
     "0001": "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync",
     "0013": "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
 }
-HEADER = ("sequence", "back end", "places of features", "measured a frame", "lifetime [frames]", "ATE online [m]",
+HEADER = ("sequence", "back end", "places of features", "measured a frame", "lifetime [frames]", "ATE online [cm]",
           "CPU [ms]")  # fmt: skip
 _LATER = 3  # frames by which a trial begins later than the one before
 
@@ -54,7 +54,7 @@ def run(sequence: Sequence, backend: str, align: bool, first: int, frames: int |
     for result in results:
         lifetimes.add(result)
     used = [len(result.report.used) for result in results]
-    error = online_error(results, sequence.ground_truth)
+    error = 100 * online_error(results, sequence.ground_truth)
     return [float(np.median(used)), lifetimes.figures()["lifetime_mean_frames"], error, float(np.median(times))]
 
 
