@@ -30,6 +30,7 @@ BASELINE = 0.002
 
 _FOLLOWED = 60  # cost: landmarks in the filter at most
 _UNSEEN = 3  # cost: frames after which a landmark that is not measured is followed no more
+_EVERY = 0.08  # cost: time between measurements that the filter takes [s]; frames in between show nearly the same
 _LONGEST = 1.0  # guard: time [s] after which nothing is known of a motion
 
 
@@ -54,7 +55,7 @@ class RigUncertainty:
         self.kept, self._applied = applied, applied
         self._noise = models.pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
-        self._stamp = 0.0
+        self._stamp = self._measured = 0.0
         self._followed: Followed | None = None
         self._others = Frozen.none(self._columns)
 
@@ -70,7 +71,7 @@ class RigUncertainty:
         T = T_world_left @ self._model.rig.rectified.T_left_rectified
         before, others = self._followed, self._others
         if before is None:
-            self._followed, self._stamp = Followed.start(T, self._columns), stamp
+            self._followed, self._stamp, self._measured = Followed.start(T, self._columns), stamp, stamp
             return
         local = transform(inverse(T), positions)
         ids, local = ids[local[:, 2] > 0], local[local[:, 2] > 0]
@@ -86,11 +87,16 @@ class RigUncertainty:
             others = others.select(np.delete(np.arange(len(others.ids)), again))
         place = {i: row for row, i in enumerate(now.ids.tolist())}
         rows = np.array([place.get(i, -1) for i in ids.tolist()], np.intp)
-        if (rows >= 0).any():
-            rows, points = rows[rows >= 0], local[rows >= 0]
+        rows, points = rows[rows >= 0], local[rows >= 0]
+        due = abs(stamp - self._measured) >= _EVERY
+        if due and len(rows):
             now = now.measured(rows, points, self._by_point(points), self._field(points), self._noise)
+        else:
+            now = now.met(rows, points)
         # In one statement, so that an interrupt finds all of it done or nothing.
-        self._followed, self._others, self._stamp = now, others, stamp
+        self._followed, self._others, self._stamp, self._measured = (
+            now, others, stamp, stamp if due else self._measured,
+        )  # fmt: skip
 
     def change(self, ids: IdArray, positions: Array, erased: IdArray) -> None:
         """Take in new landmarks (M,) at `positions` (M, 3) [m], seen from the present pose, and drop erased ones."""

@@ -110,8 +110,7 @@ class Followed:
             field: F = ∂z/∂δ (M, 3, m).
             noise: covariance of a measurement (3, 3).
         """
-        everywhere, unseen = self.local.copy(), self.unseen.copy()
-        everywhere[rows], unseen[rows] = local, 0
+        seen = self.met(rows, local)
         columns = 6 + 3 * rows[:, None] + np.arange(3)
         size, count, H = len(self.by_rig), 3 * len(rows), H @ self.T_world[:3, :3].T
         HC = (H @ self.covariance[columns]).reshape(count, size)
@@ -123,7 +122,13 @@ class Followed:
         whitened = solve_triangular(root, np.hstack([HC, residual]), lower=True, check_finite=False)
         gain, residual = whitened[:, :size], whitened[:, size:]
         by_rig, covariance = self.by_rig + gain.T @ residual, self.covariance - gain.T @ gain
-        return Followed(self.T_world, self.ids, everywhere, unseen, by_rig, covariance)
+        return replace(seen, by_rig=by_rig, covariance=covariance)
+
+    def met(self, rows: IdArray, local: Array) -> Followed:
+        """After landmarks were seen that are not measured: where they are now (M, 3) [m]."""
+        everywhere, unseen = self.local.copy(), self.unseen.copy()
+        everywhere[rows], unseen[rows] = local, 0
+        return replace(self, local=everywhere, unseen=unseen)
 
     def select(self, rows: IdArray) -> Followed:
         """With these landmarks alone."""
