@@ -8,6 +8,13 @@ from difflib import get_close_matches
 _LIKE = 0.6  # least similarity of a suggestion, from 0 to 1
 
 
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The most similar known name, upper and lower case alike; None where none is similar."""
+    by_case = {other.lower(): other for other in known}
+    near = get_close_matches(str(name).lower(), by_case, 1, _LIKE)
+    return by_case[near[0]] if near else None
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """The most similar known name as `` (did you mean 'x'?)``; empty where none is similar.
 
@@ -16,9 +23,8 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     >>> suggestion("kalman", ["batch", "ekf", "smoother"])
     ''
     """
-    by_case = {other.lower(): other for other in known}
-    near = get_close_matches(str(name).lower(), by_case, 1, _LIKE)
-    return f" (did you mean {by_case[near[0]]!r}?)" if near else ""
+    near = nearest(name, known)
+    return f" (did you mean {near!r}?)" if near else ""
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> str:

@@ -41,7 +41,7 @@ from slam.commands.options import (
     SetOption,
     ViewerOption,
 )
-from slam.commands.signals import Stopped, catch_signals, whole_frames
+from slam.commands.signals import catch_signals, leaving, whole_frames
 
 if TYPE_CHECKING:
     from slam.run.recorded import Recording
@@ -266,7 +266,8 @@ def compare_command(
     names = [[word for word in text.split(",") if word] for text in (backends, frontends)]
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
-    command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
+    with leaving("trials done so far are kept: the same command continues"):
+        command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -297,13 +298,9 @@ def calibrate_command(
     from slam.run.calibrating import Targets
     from slam.run.runner import parse_frames
 
-    try:
-        calibrate(
-            sequences, Targets(out, opencv, kalibr, overwrite), settings or [], parse_frames(frames), format, quiet
-        )
-    except Stopped as stopped:
-        stopped.leaves = "nothing is written"
-        raise
+    targets = Targets(out, opencv, kalibr, overwrite)
+    with leaving("nothing is written"):
+        calibrate(sequences, targets, settings or [], parse_frames(frames), format, quiet)
 
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")

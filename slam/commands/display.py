@@ -57,7 +57,8 @@ class Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self.last is not None:  # else it was never shown
+            self._bar.stop()
 
     def frame(self, result: FrameResult) -> None:
         """Show one more frame; the bar appears with the first."""

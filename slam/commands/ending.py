@@ -34,7 +34,7 @@ def one_line_errors() -> Iterator[None]:
     except MemoryError:
         _end("slam: there is not enough memory for this", 2)
     except Stopped as stopped:
-        _end(f"slam: stopped by {stopped}; {stopped.leaves}", 128 + stopped.number)
+        _end(f"slam: stopped by {stopped}{stopped.leaves and f'; {stopped.leaves}'}", 128 + stopped.number)
 
 
 def _end(line: str, status: int) -> None:

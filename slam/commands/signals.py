@@ -19,10 +19,10 @@ class Stopped(BaseException):
     """Asked to end by a signal; no handler of errors catches it, and files are completed on the way out.
 
     Attributes:
-        leaves: what there is of the work, in words.
+        leaves: what there is of the work, in words; empty where nothing is to be said.
     """
 
-    leaves = "frames done so far are kept"
+    leaves = ""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -35,6 +35,16 @@ def catch_signals() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores a closed terminal
             signal.signal(number, _stop)
+
+
+@contextmanager
+def leaving(text: str) -> Iterator[None]:
+    """Work of which a signal leaves something: `text` says what."""
+    try:
+        yield
+    except Stopped as stopped:
+        stopped.leaves = text
+        raise
 
 
 _pending: list[int] = []  # a signal that waits for the end of a frame
@@ -75,8 +85,9 @@ def whole_frames(
 
     _in_frames, _until = True, until
     try:
-        yield end_of_frame
-        if _pending:  # no frame came after it
-            raise Stopped(_pending.pop())
+        with leaving("frames done so far are kept"):
+            yield end_of_frame
+            if _pending:  # no frame came after it
+                raise Stopped(_pending.pop())
     finally:
         _in_frames, _until = False, None

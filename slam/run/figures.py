@@ -209,8 +209,9 @@ def draw_loops(axis: Axes, run: RunData) -> None:
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     """The map in 3D with covariance ellipsoids and the path (paper A, Fig. 5)."""
     import matplotlib.pyplot as plt
+    from matplotlib.transforms import Bbox
 
-    figure = plt.figure(figsize=(6.4 * len(runs), 5.4), layout="constrained")
+    figure = plt.figure(figsize=(6.4 * len(runs), 5.4))
     u, v = np.mgrid[0 : 2 * np.pi : 9j, 0 : np.pi : 6j]
     sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     for i, run in enumerate(runs):
@@ -225,11 +226,26 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
         axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5, label="path")
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
-        axis.legend(loc="upper left", fontsize=8, frameon=False)
-        axis.set(title=run.name, xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
-        axis.set_aspect("equal")
+        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        axis.yaxis.labelpad = axis.zaxis.labelpad = 9  # clear of the numbers
+        axis.set_box_aspect(np.ptp([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()], axis=1))  # one scale for all
         axis.view_init(elev=25, azim=-65)
-    _save(figure, path)
+    _, low, _, high = _ink(figure)
+    for axis, run in zip(figure.axes, runs):
+        figure.text(axis.get_position().x0 + axis.get_position().width / 2, high, run.name, ha="center", va="bottom")
+    shown = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="upper center", bbox_to_anchor=(0.5, low), ncols=3, fontsize=8, frameon=False)
+    corners = np.reshape(_ink(figure), (2, 2)) * figure.get_size_inches()
+    _save(figure, path, bbox_inches=Bbox(corners).padded(0.1))
+
+
+def _ink(figure: Any) -> tuple[float, float, float, float]:
+    """Left, lower, right and upper end of what is drawn, in parts of the figure: a 3D scene leaves much of it white."""
+    figure.canvas.draw()
+    drawn = (np.asarray(figure.canvas.buffer_rgba())[..., :3] < 255).any(axis=2)
+    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
+    height, width = drawn.shape
+    return columns[0] / width, 1 - (rows[-1] + 1) / height, (columns[-1] + 1) / width, 1 - rows[0] / height
 
 
 def widths(count: int, last: float) -> list[float]:
@@ -273,7 +289,7 @@ def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
     _draw_truth(inset, online, truth, (0, 2))
     inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
     inset.set(xticks=[], yticks=[])
-    inset.set_title(f"end of the path, {200 * half:.2g} cm wide", fontsize=7)
+    inset.set_title(f"end, {200 * half:.2g} cm wide", fontsize=7)
     axis.indicate_inset_zoom(inset, edgecolor="0.5")
 
 
@@ -305,8 +321,8 @@ def _figure(count: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
     return figure, list(axes.ravel())
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save(figure: Any, path: Path, **options: Any) -> None:
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    figure.savefig(path, dpi=110, metadata={"Software": None}, **options)
     plt.close(figure)

@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, reason
-from slam.naming import suggestion, unknown
+from slam.naming import nearest, suggestion, unknown
 from slam.sequences.base import RecordedSequence, Sequence, is_live
 
 __all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence"]
@@ -148,11 +148,12 @@ def _require_recording(folder: Path, text: str) -> None:
 
 
 def _world_meant(text: str) -> str:
-    """A suggestion where the text names a synthetic world, ``synthetic:`` left out; else empty."""
+    """A suggestion where the text is much like a synthetic world's, ``synthetic:`` left out; else empty."""
     from slam import worlds
 
     name, mark, query = text.partition("?")
-    return f" (did you mean '{_SYNTHETIC}{name}{mark}{query}'?)" if name in worlds.names() else ""
+    near = None if Path(name).name != name else nearest(name, worlds.names())
+    return f" (did you mean '{_SYNTHETIC}{near}{mark}{query}'?)" if near else ""
 
 
 def _detect(folder: Path, options: dict[str, str]) -> str:

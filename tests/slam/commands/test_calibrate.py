@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import re
-import signal
 
 import numpy as np
 import pytest
@@ -11,9 +10,7 @@ from typer.testing import CliRunner
 import slam
 from slam.calibration import RigModel
 from slam.calibration.corrected import corrected_rig
-from slam.commands import cli
 from slam.commands.cli import app
-from slam.commands.signals import Stopped
 from slam.errors import SlamError
 from slam.run.repeat import load
 
@@ -94,19 +91,6 @@ def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):
     with pytest.raises(SlamError, match=message):
         command(*words, "-q")
     assert not list(tmp_path.glob("*.yaml"))
-
-
-def test_stopped_by_a_signal_it_says_that_nothing_is_written(monkeypatch, capsys):
-    def stop(*_):
-        raise Stopped(signal.SIGTERM)
-
-    monkeypatch.setattr("slam.commands.calibrate.calibrate", stop)
-    monkeypatch.setattr(cli, "catch_signals", lambda: None)
-    monkeypatch.setattr("sys.argv", ["slam", "calibrate", WORLD])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 128 + signal.SIGTERM
-    assert capsys.readouterr().err == "slam: stopped by SIGTERM; nothing is written\n"
 
 
 def test_what_is_there_is_not_overwritten_and_no_recording_counts_twice(made, tmp_path):
