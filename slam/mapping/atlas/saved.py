@@ -102,7 +102,8 @@ def _require_fit(arrays: Mapping[str, np.ndarray], width: tuple[int, ...], sourc
         (total, 3), (total, *width), (total,), (total,), (number, 2), (number, 4, 4), (number, 6, 6), (number,),
     ]  # fmt: skip
     found = [arrays[name].shape for name in ATLAS_TYPES]
-    if found != shapes and not (n == total == number == 0):
+    empty = total == 0 and all(shape and shape[0] == 0 for shape in found)
+    if found != shapes and not empty:
         raise SlamError(f"{source}: the arrays of the keyframes do not fit together")
     pairs = arrays["loop_pairs"].reshape(-1, 2)
     if (pairs < 0).any() or (pairs >= n).any() or (pairs[:, 0] >= pairs[:, 1]).any():

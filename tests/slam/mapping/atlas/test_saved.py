@@ -101,3 +101,12 @@ def test_what_cannot_be_is_refused(name: str, value: np.ndarray):
     with pytest.raises(SlamError, match=r"^a\.map: ") as error:
         from_arrays(arrays | {name: value.astype(ATLAS_TYPES[name])}, (16,), "a.map")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["keyframe_covariances", "keyframe_poses", "loop_motions"])
+def test_an_empty_atlas_has_nothing_but_empty_arrays(name: str):
+    arrays = to_arrays((), np.zeros((0, 4, 4)), ())
+    assert from_arrays(arrays, (16,), "a.map")[0] == ()
+    for value in (np.array(1.0), np.zeros((3, 0))):
+        with pytest.raises(SlamError, match="do not fit together"):
+            from_arrays(arrays | {name: value}, (16,), "a.map")
