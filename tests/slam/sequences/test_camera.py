@@ -300,4 +300,4 @@ def test_cameras_cannot_be_compared(slam_command, tmp_path):
 def test_a_missing_file_is_said_before_a_missing_calibration(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SequenceError, match=r"both\.mp4: cannot be opened: there is no such file"):
-        open_sequence("camera:both.mp4")
+        slam.open_sequence("camera:both.mp4")
