@@ -64,9 +64,9 @@ class CameraSequence:
         self._wait = WAIT if wait is None else wait
         self._swap = rigs.flag(options, "swap")
         self._origin = time.time() - time.monotonic()
-        paths = self._calibration_files(options)
         self._cameras: _Cameras | None = self._open()
         try:
+            paths = self._calibration_files(options)
             _, left, _ = self._first(self._cameras)
             self.rig: StereoRig = self._rig(paths, (left.shape[1], left.shape[0]), options)
         except BaseException:

@@ -295,3 +295,9 @@ def test_cameras_cannot_be_compared(slam_command, tmp_path):
     done = slam_command("compare", "camera:0", "--out", tmp_path / "out")
     assert done.returncode == 2
     assert "compare recordings" in done.stderr
+
+
+def test_a_missing_file_is_said_before_a_missing_calibration(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SequenceError, match=r"both\.mp4: cannot be opened: there is no such file"):
+        slam.open_sequence("camera:both.mp4")
