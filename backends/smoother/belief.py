@@ -11,7 +11,7 @@ import numpy as np
 
 from backends.smoother import recovery, uncertainty
 from backends.smoother.factor_graph import FactorGraph
-from backends.smoother.pose_set import PoseSet
+from backends.smoother.pose_set import PoseSet, sound
 from backends.smoother.prediction import (
     PredictedPoints,
     PredictedPose,
@@ -66,7 +66,7 @@ class Belief:
         if self._window is None or self._window_at != self._graph.solutions:
             count = self._log.path.count
             frames = self._log.window(self._graph.config.window)
-            P = self._joint_covariance(frames) if count else np.zeros((0, 0))
+            P = sound(self._joint_covariance(frames)) if count else np.zeros((0, 0))
             self._window = PoseSet(frames, self._log.path.poses[frames], P)
             self._window_at = self._graph.solutions
         return self._window

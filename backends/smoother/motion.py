@@ -21,6 +21,13 @@ from slam.models import EstimatorModels
 
 _inverse_right = gtsam.Rot3.LogmapDerivative  # inverse of SO(3)'s right Jacobian
 
+_LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
+
+
+def bounded(dt: float) -> float:
+    """The time between two poses [s] that the motion model counts."""
+    return min(dt, _LONGEST)
+
 
 def motion_sigmas(models: EstimatorModels, dt: float) -> Array:
     """Standard deviations (6,) of w = [w_ω, w_v] over `dt` [s]."""

@@ -6,6 +6,7 @@ from copy import copy
 
 import numpy as np
 
+from backends.smoother.motion import bounded
 from backends.smoother.pose_set import PredictedPose
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
@@ -47,6 +48,10 @@ class Path:
     def poses(self) -> Array:
         """Poses (F, 4, 4); a view that may be written to."""
         return self._poses[: self.count]
+
+    def interval(self, i: int) -> float:
+        """The time from the frame before frame `i` to that frame [s], as far as the motion model counts it."""
+        return bounded(float(self._stamps[i] - self._stamps[i - 1]))
 
     def newest(self, most: int, first: int = 0) -> IndexArray:
         """The two newest frames and before them those with measurements, from `first` on, at most so many together.

@@ -9,6 +9,9 @@ import numpy as np
 from slam.data import IndexArray
 from slam.geometry.se3 import Array, adjoint, inverse
 
+_ROUNDING = 1e-7  # numerics: of correlations
+_TINY = 1e-150  # numerics: standard deviation that keeps a division possible
+
 
 @dataclass(frozen=True)
 class PoseSet:
@@ -50,7 +53,7 @@ class PredictedPose:
     def covariance(self) -> Array:
         """Covariance (6, 6)."""
         P = self.by_window @ self.window.covariance @ self.by_window.T + self.noise
-        return np.asarray(0.5 * (P + P.T))
+        return sound(0.5 * (P + P.T))
 
     def covariance_to(self, place: int) -> Array:
         """Covariance (6, 6) where one pose of the window is known: what all have in common moves the landmarks too."""
@@ -59,3 +62,20 @@ class PredictedPose:
         J = self.by_window.copy()
         J[:, 6 * place : 6 * place + 6] -= adjoint(inverse(self.T) @ self.window.poses[place])
         return J @ self.window.covariance @ J.T + self.noise
+
+
+def sound(P: Array) -> Array:
+    """A covariance (n, n) as it is; where rounding has spoilt it, the nearest one.
+
+    After hours without a frame variances are so large that their inverse holds no digit of the smallest.
+    """
+    scale = np.sqrt(np.abs(np.diag(P))) + _TINY
+    C = P / scale / scale[:, None]
+    try:
+        np.linalg.cholesky(C + _ROUNDING * np.eye(len(C)))
+        if np.abs(C - C.T).max(initial=0.0) < _ROUNDING:
+            return P
+    except np.linalg.LinAlgError:
+        pass
+    values, vectors = np.linalg.eigh(0.5 * (C + C.T))
+    return np.asarray((vectors * np.maximum(values, _ROUNDING)) @ vectors.T * scale * scale[:, None])

@@ -20,13 +20,13 @@ from slam.tracking.gating import whiteners
 def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: float) -> PredictedPose:
     """The next pose by the motion model."""
     stamps, poses = path.stamps, path.poses
-    dt = stamp - stamps[-1]
+    dt = motion.bounded(stamp - stamps[-1])
     J = np.zeros((6, 6 * len(window)))
     if len(stamps) == 1 or path.jumped(path.count - 1):
         T, J[:, -6:], Jw = motion.predict_from_rest(poses[-1], dt)
         sigmas = motion.first_velocity_sigmas(models, dt)
     else:
-        T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(poses[-2], poses[-1], stamps[-1] - stamps[-2], dt)
+        T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(poses[-2], poses[-1], path.interval(len(stamps) - 1), dt)
         sigmas = motion.motion_sigmas(models, dt)
     return PredictedPose(stamp, T, J, (Jw * sigmas**2) @ Jw.T, window)
 

@@ -50,7 +50,7 @@ def add_poses(change: Change, make: FactorMaker, log: MeasurementLog, restarted:
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
         if first < i < restarted:
             relative = inverse(path.poses[i - 1]) @ path.poses[i]
-            factor = make.step((pose_key(i - 1), pose_key(i)), relative, path.stamps[i] - path.stamps[i - 1])
+            factor = make.step((pose_key(i - 1), pose_key(i)), relative, path.interval(i))
         elif prior is not None and i < first + 2 and not (i > first and path.jumped(first)):
             continue  # the prior holds what ties it to those that left
         else:
@@ -60,13 +60,12 @@ def add_poses(change: Change, make: FactorMaker, log: MeasurementLog, restarted:
 
 def pose_factor(make: FactorMaker, path: Path, i: int) -> gtsam.NonlinearFactor:
     """What ties the pose of frame `i` to those before it, or to the world."""
-    stamps = path.stamps
     if i == 0:
         return make.prior(pose_key(0))
     if i == 1 or path.jumped(i - 1):
-        return make.first_motion((pose_key(i - 1), pose_key(i)), stamps[i] - stamps[i - 1])
+        return make.first_motion((pose_key(i - 1), pose_key(i)), path.interval(i))
     keys = (pose_key(i - 2), pose_key(i - 1), pose_key(i))
-    return make.motion(keys, stamps[i - 1] - stamps[i - 2], stamps[i] - stamps[i - 1])
+    return make.motion(keys, path.interval(i - 1), path.interval(i))
 
 
 def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:

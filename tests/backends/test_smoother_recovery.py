@@ -10,7 +10,7 @@ from backends.smoother.pose_only import PoseProblem
 from backends.smoother.stereo import RectifiedStereo
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
-from tests.backends.scenes import RIG, cloud, observe, path, step
+from tests.backends.scenes import RIG, cloud, observe, path, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
@@ -92,3 +92,18 @@ def test_a_few_wrong_matches_that_agree_by_chance_move_nothing():
     assert recovery.agreement(problem, np.eye(4), lambda: None, 0, False).used.sum() >= 8  # they are no chance
     z[:, :2] += rng.uniform(-150, 150, (60, 2))
     assert not recovery.agreement(problem, np.eye(4), lambda: None, 0, False).used.any()
+
+
+@pytest.mark.parametrize("stamps", [[0.1, 1e9, 2e9], [0.1, 0.1 + 1e-9, 1e5], [1e5, 2e5, 2e5 + 1e-9]])
+def test_covariances_hold_over_gaps_of_any_length(stamps):
+    data = scene(path(4, 0.1, np.array([0.0, 0.0, 0.5]), np.zeros(3)), points=60)
+    backend, known = SmootherBackend(RIG, EstimatorModels(pixel_sigma=0.5)), np.zeros(0, np.int64)
+    for stamp, (_, _, seen) in zip([0.0, *stamps], data):
+        covariances = [backend.predict(stamp).covariance]
+        old = np.isin(seen.ids, known)
+        backend.update(seen.select(old))
+        backend.add(seen.select(~old))
+        known = np.union1d(known, seen.ids)
+        for P in [*covariances, backend.estimate().covariance]:
+            scale = np.sqrt(np.diag(P))
+            assert np.linalg.eigvalsh(P / scale / scale[:, None]).min() > 0
