@@ -242,7 +242,7 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
 def _ink(figure: Any) -> tuple[float, float, float, float]:
     """Left, lower, right and upper end of what is drawn, in parts of the figure: a 3D scene leaves much of it white."""
     figure.canvas.draw()
-    drawn = (np.asarray(figure.canvas.buffer_rgba())[..., :3] < 255).any(axis=2)
+    drawn = np.asarray(figure.canvas.buffer_rgba())[..., :3].min(axis=2) < 255
     rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
     height, width = drawn.shape
     return columns[0] / width, 1 - (rows[-1] + 1) / height, (columns[-1] + 1) / width, 1 - rows[0] / height
