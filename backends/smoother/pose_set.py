@@ -73,7 +73,7 @@ def sound(P: Array) -> Array:
     C = P / scale / scale[:, None]
     try:
         np.linalg.cholesky(C + _ROUNDING * np.eye(len(C)))
-        if np.abs(C - C.T).max(initial=0.0) < _ROUNDING:
+        if (np.abs(C - C.T) < _ROUNDING).all():
             return P
     except np.linalg.LinAlgError:
         pass
