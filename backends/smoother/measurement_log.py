@@ -17,6 +17,8 @@ from slam.geometry.se3 import Array
 if TYPE_CHECKING:
     from backends.smoother.marginal import Held, MarginalPrior
 
+_SINGULAR = 1e-12  # numerics: smallest eigenvalue of a covariance, as a share of its trace
+
 
 class Measurements:
     """All accepted measurements, a row each, in the order in which they came."""
@@ -166,7 +168,7 @@ class MeasurementLog:
         marks.recent[slots], marks.seen[slots], marks.information[slots], marks.older[slots] = -1, 0, 0, 0
         marks.last[slots] = frame
         fixed = marks.prior[slots].any(axis=(1, 2))  # they are known in the world
-        marks.covariance[slots[~fixed]] = covariances[~fixed]
+        marks.covariance[slots[~fixed]] = _invertible(covariances[~fixed])
         relative = slots[~fixed]
         local = (marks.position[relative] - T[:3, 3]) @ T[:3, :3]
         covariances = T[:3, :3].T @ marks.covariance[relative] @ T[:3, :3]
@@ -227,3 +229,10 @@ class MeasurementLog:
         for track in self.landmarks.tracks.values():
             track.restart()
         self.landmarks.variable[:] = -1
+
+
+def _invertible(P: Array) -> Array:
+    """Covariances (M, 3, 3); those that rounding has left without an inverse are a little larger in all directions."""
+    size = np.trace(P, axis1=1, axis2=2)[:, None, None]
+    singular = np.linalg.eigvalsh(P)[:, 0] <= _SINGULAR * size[:, 0, 0]
+    return np.where(singular[:, None, None], P + 2 * _SINGULAR * np.abs(size) * np.eye(3), P)

@@ -167,6 +167,7 @@ def moved_with_pose(T: Array, points: Array) -> Array:
 
 
 def quadratic(A: Array, P: Array) -> Array:
-    """``A P Aᵀ`` (M, k, k) for A (M, k, n)."""
+    """``A P Aᵀ`` (M, k, k) for A (M, k, n), symmetric to the last digit."""
     count, k, n = A.shape
-    return (A.reshape(count * k, n) @ P).reshape(count, k, n) @ np.swapaxes(A, 1, 2)
+    Q = (A.reshape(count * k, n) @ P).reshape(count, k, n) @ np.swapaxes(A, 1, 2)
+    return np.asarray(0.5 * (Q + np.swapaxes(Q, 1, 2)))
