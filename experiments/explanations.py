@@ -8,6 +8,8 @@ from itertools import pairwise
 EVERYWHERE = {
     "tracked": "frames whose pose was measured against the map; the first frame, where the map begins, counts as well",
     "ATE online [m]": "absolute trajectory error: RMSE of the positions as given frame by frame, after alignment",
+    "ATE online [cm]": "absolute trajectory error: RMSE of the positions as given frame by frame, after alignment",
+    "ATE [mm]": "absolute trajectory error: RMSE of the positions as given frame by frame, after alignment",
     "ATE final [m]": "the same of the path as it is known at the end",
     "right associations [%]": "matches of a feature with the landmark that it really shows",
     "NIS/dof": "squared innovations over their claimed variance, per degree of freedom; 1 is right, less is cautious",
@@ -153,7 +155,6 @@ OF_ONE = {
     "frame_rate": {
         "frames per second": "of the frames that are taken; the others are left out",
         "tracked [%]": "frames whose pose was measured, median over the seeds",
-        "ATE online [cm]": "RMSE of the positions as given frame by frame, after alignment",
     },
 }  # fmt: skip
 

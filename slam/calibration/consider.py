@@ -260,6 +260,7 @@ def _chosen(ids: IdArray) -> IdArray:
     """At most `_FOLLOWED` of some landmarks (N,): by chance, but each time the same ones."""
     if len(ids) <= _FOLLOWED:
         return ids
+    # Knuth's multiplicative hash: as good as chance, and no two ids below 2³² are drawn alike.
     drawn = (ids.astype(np.uint64) * np.uint64(2654435761)) % np.uint64(2**32)
     return ids[np.lexsort((ids, drawn))[:_FOLLOWED]]
 
