@@ -181,3 +181,15 @@ def test_what_was_added_is_never_negative():
     np.testing.assert_allclose(what_was_added(P + Q, P), Q, atol=1e-10)
     assert np.linalg.eigvalsh(what_was_added(P, P + 0.5 * Q)).max() < 1e-10
     assert np.abs(what_was_added(P, P)).max() == 0
+
+
+def test_a_keyframe_whose_points_tell_no_pose_is_no_place_seen_again(monkeypatch):
+    old = keyframe(view(np.eye(4), *world(0), 0))
+
+    def untold(*_):
+        raise np.linalg.LinAlgError
+
+    seen = view(MOVED, *world(0), 1)
+    assert verify(old, seen, RIG, LOCALIZER, AtlasConfig(), 0) is not None
+    monkeypatch.setattr("slam.mapping.atlas.verification.refined_pose", untold)
+    assert verify(old, seen, RIG, LOCALIZER, AtlasConfig(), 0) is None
