@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
 
+@cache
 def texture(height, width, seed=0, finest=1.5):
-    """Random texture (height, width) float32, mean 120, deviation 35, without detail finer than a few pixels."""
+    """Random texture (height, width) float32, mean 120, deviation 35, without detail finer than a few pixels.
+
+    Made once and shared: it cannot be written to.
+    """
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((height, width)).astype(np.float32)
     total = sum(cv2.GaussianBlur(noise, (0, 0), finest * k) * k for k in (1, 2, 4, 8))
-    return (total - total.mean()) / total.std() * 35 + 120
+    values = (total - total.mean()) / total.std() * 35 + 120
+    values.flags.writeable = False
+    return values
 
 
 def photograph(values, noise=0.0, seed=0):
