@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import queue
 import threading
 from collections.abc import Iterable, Iterator
@@ -31,7 +32,7 @@ def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
     """The same items in the same order, made in a thread that is at most `depth` items ahead of the one in use.
 
     An exception of the iterator is raised where its item would have come. The thread ends with the generator: after its
-    last item, or when it is closed.
+    last item, when it is closed, or with the program, if an exception left the generator half used.
     """
     ready: queue.Queue[T | _End] = queue.Queue()
     places = threading.Semaphore(depth)
@@ -47,8 +48,14 @@ def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
         except BaseException as error:  # noqa: BLE001 - it is raised in the caller's thread
             ready.put(_End(error))
 
+    def end() -> None:
+        stopped.set()
+        places.release()
+        thread.join()
+
     thread = threading.Thread(target=work, name="ahead", daemon=True)
     thread.start()
+    atexit.register(end)  # a thread that runs on while Python is taken down may hang or abort it
     try:
         while not isinstance(item := _next(ready), _End):
             places.release()
@@ -56,6 +63,5 @@ def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
         if item.error is not None:
             raise item.error
     finally:
-        stopped.set()
-        places.release()
-        thread.join()
+        atexit.unregister(end)
+        end()

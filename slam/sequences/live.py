@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
 from collections import deque
@@ -60,15 +61,21 @@ class LiveFrames:
 
     def __iter__(self) -> Iterator[StereoFrame]:
         thread = threading.Thread(target=self._read, name="live frames", daemon=True)
+
+        def end() -> None:
+            self._closed = True
+            thread.join(_PARTING)
+
         thread.start()
+        atexit.register(end)  # a thread that runs on while Python is taken down may hang or abort it
         try:
             while (frame := self._take()) is not None:
                 yield frame
             if self._error is not None:
                 raise self._error
         finally:
-            self._closed = True
-            thread.join(_PARTING)
+            atexit.unregister(end)
+            end()
 
     @property
     def ended_early(self) -> bool:
