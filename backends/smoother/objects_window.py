@@ -47,6 +47,18 @@ class CameraWindow:
         """The inverse of the covariance."""
         return np.linalg.inv(self.covariance)
 
+    def given_later(self, count: int) -> Array:
+        """Information (6 n, 6 n) on the `count` oldest poses given the later ones: that on all less that on the later.
+
+        As a Schur complement: of a difference rounding would leave none that is positive.
+        """
+        old, later = slice(0, 6 * count), slice(6 * count, None)
+        conditional = self.information.copy()
+        conditional[later, later] = conditional[later, old] @ np.linalg.solve(
+            conditional[old, old], conditional[old, later]
+        )
+        return conditional
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -304,9 +316,7 @@ class Solver:
         n = len(window)
         is_camera = _cameras(n)
         system = self._system(window, camera.poses, count, range(min(count + 1, n - 1)))
-        system.information[np.ix_(is_camera, is_camera)] += camera.information
-        later = is_camera[6 * count :]
-        system.information[np.ix_(later, later)] -= np.linalg.inv(camera.covariance[6 * count :, 6 * count :])
+        system.information[np.ix_(is_camera, is_camera)] += camera.given_later(count)
         gone = np.arange(FRAME * count)
         prior = Prior(system.eliminated(gone), window.T[count:], camera.poses[count:], window.points)
         return replace(

@@ -12,7 +12,7 @@ from backends.ekf import EkfBackend
 from backends.ekf.objects_body import RIGID, CameraBelief, _learnt, advanced, found, transported
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
 from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
-from backends.smoother.objects_window import Prior, _prior_at, opened, with_frame, with_points
+from backends.smoother.objects_window import CameraWindow, Prior, _prior_at, opened, with_frame, with_points
 from backends.smoother.stereo import RectifiedStereo
 from slam.evaluation.metrics import chi_square_band, nees
 from slam.geometry import se3
@@ -366,3 +366,22 @@ def test_the_camera_is_consistent_with_bodies_and_after_them():
     low, high = chi_square_band(6, 8)
     assert low < found[[20, 29, 38]].mean() < high
     assert low < found[[41, 50, 59]].mean() < high
+
+
+def test_what_older_camera_poses_say_given_the_later_ones():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(24, 24))
+    P = A @ A.T
+    difference = np.linalg.inv(P)
+    difference[12:, 12:] -= np.linalg.inv(P[12:, 12:])
+    given = CameraWindow(np.tile(np.eye(4), (4, 1, 1)), P).given_later(2)
+    np.testing.assert_allclose(given, difference, atol=1e-9 * np.abs(difference).max())
+
+
+def test_it_never_says_less_than_nothing_though_poses_are_nearly_one():
+    """Poses of a camera that all have one large error, and small ones of their own."""
+    rng = np.random.default_rng(4)
+    A = rng.normal(size=(18, 18))
+    P = 1e-6 * A @ A.T + 1e6 * np.tile(np.eye(6), (3, 3))
+    given = CameraWindow(np.tile(np.eye(4), (3, 1, 1)), P).given_later(1)
+    assert np.linalg.eigvalsh((given + given.T) / 2).min() > -1e-9 * np.abs(given).max()

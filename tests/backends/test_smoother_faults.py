@@ -11,6 +11,7 @@ import pytest
 
 from backends import smoother
 from backends.smoother import SmootherBackend, rebuild, solver
+from backends.smoother.measurement_log import _invertible
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -348,3 +349,13 @@ def test_covariances_that_gtsam_gives_with_some_digits_only_come_out_symmetric(m
     monkeypatch.setattr(graph_solver, "_isam", BrokenIsam(gtsam.ISAM2Params()))
     P = graph_solver._joint_covariance([0])
     assert np.array_equal(P, P.T) and np.allclose(P, np.eye(6), atol=1e-5)
+
+
+def test_covariances_that_rounding_has_made_singular_get_an_inverse():
+    sound = np.diag([1.0, 4.0, 9.0])
+    flat = np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])  # known but for one direction: no inverse
+    negative = flat - 1e-14 * np.eye(3)
+    mended = _invertible(np.stack([sound, flat, negative]))
+    np.testing.assert_array_equal(mended[0], sound)
+    assert (np.linalg.eigvalsh(np.linalg.inv(mended)) > 0).all()
+    np.testing.assert_allclose(mended[1:], [flat, flat], atol=1e-8)
