@@ -122,8 +122,8 @@ class Tracks:
         self.forget_past(new)
         return new
 
-    def recognised_as(self, landmark: IdArray) -> None:
-        """Note which landmark every feature of the frame was recognised as (N,), −1 for none; no other track is it."""
+    def assign_landmarks(self, landmark: IdArray) -> None:
+        """Note which landmark each feature of the frame was matched to (N,), −1 for none; one track a landmark."""
         seen = np.flatnonzero(self.seen)
         known = seen[landmark[self.row[seen]] >= 0]
         ids = landmark[self.row[known]]
