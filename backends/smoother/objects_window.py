@@ -306,6 +306,7 @@ class Solver:
         system = self._system(window, camera.poses, count, range(min(count + 1, n - 1)))
         system.information[np.ix_(is_camera, is_camera)] += camera.information
         later = is_camera[6 * count :]
+        # What the camera alone says of the later frames is given anew each time: as a marginal, so by its covariance.
         system.information[np.ix_(later, later)] -= np.linalg.inv(camera.covariance[6 * count :, 6 * count :])
         gone = np.arange(FRAME * count)
         prior = Prior(system.eliminated(gone), window.T[count:], camera.poses[count:], window.points)

@@ -38,7 +38,7 @@ from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene
 from slam.objects.revision import Mend, revise_tracks
-from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
+from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, median, record
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
@@ -273,7 +273,7 @@ class MovingObjectDetector:
         assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
-        motion = even_motion(tracks, rows, times, c.max_speed)
+        motion = constant_velocity(tracks, rows, times, c.max_speed)
         depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
         noise = founding.depth_noise(depth)
         moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)

@@ -15,7 +15,7 @@ from slam.objects.bodies import Body, new_body
 from slam.objects.candidates import region_radius
 from slam.objects.config import ObjectsConfig
 from slam.objects.points import compact
-from slam.objects.tracks import Tracks, even_motion
+from slam.objects.tracks import Tracks, constant_velocity
 from slam.objects.twists import fit_twist
 
 _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
@@ -80,7 +80,7 @@ class Founding(NamedTuple):
 
     def _group(self, tracks: Tracks, members: NDArray[np.intp]) -> Group:
         """Tracks with the twist that fits them best."""
-        motion = even_motion(tracks, members, self.times, self.config.max_speed)
+        motion = constant_velocity(tracks, members, self.times, self.config.max_speed)
         centre = motion.position.mean(axis=0)
         information = np.linalg.inv(motion.velocity_covariance)
         twist, covariance = fit_twist(motion.position, motion.velocity, information, centre)
