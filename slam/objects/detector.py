@@ -32,7 +32,7 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
 from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
-from slam.objects.founding import Founding, Group
+from slam.objects.founding import Founding, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
@@ -206,13 +206,13 @@ class MovingObjectDetector:
         for whole, members in [*parts, *((None, members) for members in alone)]:
             members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
-                group = founding.moving_group(tracks, members[tracks.streak[members] > 0])
-                if group is not None:
-                    self._found(group, founding, whole)
+                new = founding.moving_group(tracks, members[tracks.streak[members] > 0])
+                if new is not None:
+                    self._found(new, founding, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
 
-    def _found(self, group: Group, founding: Founding, whole: int | None = None) -> None:
+    def _found(self, group: MovingGroup, founding: Founding, whole: int | None = None) -> None:
         """Make a body of tracks with a common twist, or let them join the one that they belong to.
 
         They may be a part of the body `whole` that moves otherwise: then they do not join that one.
@@ -287,7 +287,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(Group(candidate.members, centre, twist, uncertainty), founding)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), founding)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""

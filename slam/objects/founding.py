@@ -22,7 +22,7 @@ _ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 
 
-class Group(NamedTuple):
+class MovingGroup(NamedTuple):
     """Tracks that move alike.
 
     Attributes:
@@ -61,7 +61,7 @@ class Founding(NamedTuple):
     stamp: float
     eye: Array
 
-    def moving_group(self, tracks: Tracks, members: NDArray[np.intp]) -> Group | None:
+    def moving_group(self, tracks: Tracks, members: NDArray[np.intp]) -> MovingGroup | None:
         """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
         members = members[compact(tracks.position[members], _FAR)]
         if len(members) < self.config.min_support:
@@ -78,7 +78,7 @@ class Founding(NamedTuple):
                 return None
         return self._group(tracks, members)
 
-    def _group(self, tracks: Tracks, members: NDArray[np.intp]) -> Group:
+    def _group(self, tracks: Tracks, members: NDArray[np.intp]) -> MovingGroup:
         """Tracks with the twist that fits them best."""
         motion = constant_velocity(tracks, members, self.times, self.config.max_speed)
         centre = motion.position.mean(axis=0)
@@ -86,9 +86,9 @@ class Founding(NamedTuple):
         twist, covariance = fit_twist(motion.position, motion.velocity, information, centre)
         # The twist is the mean over the window: the present one differs by what a third of its time allows.
         linear, angular = self.models.velocity_variance(-float(self.times.min()) / 3.0)
-        return Group(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))
+        return MovingGroup(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))
 
-    def body(self, id: int, tracks: Tracks, group: Group) -> Body:
+    def body(self, id: int, tracks: Tracks, group: MovingGroup) -> Body:
         """A new body with a group's twist, fitted to its tracks."""
         body = new_body(id, group.centre, group.twist, self.times, self.stamp, self.config.size, group.covariance)
         return membership.fitted(body, tracks, group.members, self.slot)
