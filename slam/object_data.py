@@ -150,7 +150,7 @@ class MotionLabels:
 
     Attributes:
         moving: rows of features that move, or lie on a body that does (V,).
-        undecided: rows of features not seen for long enough to be judged, or in doubt (U,).
+        undecided: rows of features not seen for long enough to be classified, or in doubt (U,).
         landmarks: ids of landmarks that turned out to move (L,).
     """
 

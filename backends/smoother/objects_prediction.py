@@ -144,7 +144,7 @@ def _without_contradicted(
 ) -> tuple[Array, BoolArray]:
     """Without the observations that what all others say contradicts, the worst first; with the pose that remains.
 
-    An observation with leverage draws the pose to itself, and agrees with it then: so each is judged by the others.
+    An observation with leverage draws the pose to itself, and then agrees with it: so each is tested by the others.
     For its rows j, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``; given the others its innovation is off by ``Q_j⁻¹ y_j``,
     with covariance ``Q_j⁻¹``.
     """
@@ -161,6 +161,7 @@ def _without_contradicted(
         r[missing], by_all[missing] = 0, 0
         H = by_all.reshape(3 * count, -1)
         nu = r.reshape(-1) + H[:, :6] @ log(inverse(problem.predicted) @ Y)
+        # The inverse's own blocks are needed below, one for each observation.
         Q = np.linalg.inv(H @ belief @ H.T + sigma**2 * np.eye(len(H)))
         y = Q @ nu
         Y = problem.predicted @ exp(belief[:6] @ (H.T @ y))

@@ -121,8 +121,8 @@ def normalised_innovation(
 ) -> tuple[float, int]:
     """``νᵀ S⁻¹ ν`` of measurements (M, 3) taken together, and its degrees of freedom.
 
-    `points` are as seen from the solved pose, which lies `step` (6,) from the predicted one: the innovation is referred
-    to the prediction through a linearisation where the measurements agree, which holds over long steps too.
+    `points` are as seen from the solved pose, which lies `step` (6,) from the predicted one. The
+    innovation at the prediction follows by linearising at the solved pose, which holds for long steps too.
 
     S is the innovations' joint covariance: what the poses of the window and the motion do to all, and each landmark's
     own. It is inverted through the poses (Woodbury), which are fewer.

@@ -100,7 +100,7 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
     """Whether so many wrong observations may pass the gate as agree, at the gate's own level.
 
     Three observations agree with the pose that was made to fit them, whatever they are, and it may have been made to
-    fit any three: the number of others that agree is judged for all triples together (an a contrario test, as in
+    fit any three: the number of others that agree is tested for all triples together (an a contrario test, as in
     Moisan & Stival, IJCV 2004).
     """
     distances = squared_distances(pose_only.residuals(problem, T)[0], problem.noise)

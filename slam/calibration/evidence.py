@@ -34,6 +34,7 @@ class Evidence(NamedTuple):
 
         ``(S⁻¹ + V)⁻¹ = (1 + S V)⁻¹ S``, which needs no inverse of S.
         """
+        # Applied to a vector and two matrices, so it is formed once.
         reduced = np.linalg.inv(np.eye(len(self.e)) + self.S * variance)
         return Evidence(*(reduced @ x for x in self))
 

@@ -126,9 +126,9 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
         where = {"nees_10m_per_dof": "over 10 m of path", "nees_1m_per_dof": "over 1 m of path"}.get(
             key, "from the start"
         )
-        judged = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
+        claim = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
         lines.append(
-            f"{backend}: {judged}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
+            f"{backend}: {claim}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
             f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
         )
     return lines

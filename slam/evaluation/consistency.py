@@ -9,7 +9,7 @@ old place is measured again the former may not be positive definite; such stretc
 Truth has errors of its own. `TruthNoise` gives each true pose an independent one, the first included: the turn of a
 recording's first true pose would otherwise count as an error of the whole path. What is the same in all poses, a turn
 between the axes of the truth's sensor and the camera's, is found from all stretches of one length by least squares and
-taken out, of the rig's errors as well. Stretches over which the truth contradicts itself are not judged
+taken out, of the rig's errors as well. Stretches over which the truth contradicts itself are left out
 (`slam.evaluation.doubtful_truth`).
 """
 
@@ -26,7 +26,7 @@ from slam.geometry.se3 import adjoint, inverse, log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
 
-#: Lengths of the stretches over which relative poses are judged [m].
+#: Lengths of the stretches over which relative poses are compared [m].
 STRETCHES = (1.0, 10.0, 100.0)
 
 _DOF = 6

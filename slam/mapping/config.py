@@ -19,7 +19,7 @@ class MapConfig:
         max_depth_error: largest relative standard deviation of a new landmark's depth.
         erase_missed: a landmark is erased after so many successive frames in view without being measured ("not
             continuously detected"). Frames in which it may be hidden, or lies near the image's border, do not count.
-        erase_share: a landmark is erased where it was measured in less than this share of the frames in view, judged
+        erase_share: a landmark is erased where it was measured in less than this share of the frames in view, tested
             after more than `erase_missed` frames.
         confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
         spacing: of landmarks that have gone out of view, and lie nearer to each other than this share of the distance

@@ -14,8 +14,8 @@ _BLOCK = 256  # cost: landmarks that are compared with all others at once
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV)."""
     lost = landmarks.missed >= config.erase_missed
-    judged = landmarks.in_view > config.erase_missed
-    rare = judged & (landmarks.seen < config.erase_share * landmarks.in_view)
+    tested = landmarks.in_view > config.erase_missed
+    rare = tested & (landmarks.seen < config.erase_share * landmarks.in_view)
     unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
     unconfirmed &= landmarks.last_seen >= 0  # what an earlier run kept stays until this one has seen it
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen

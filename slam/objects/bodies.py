@@ -17,7 +17,7 @@ from slam.objects.existence import EVEN, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
-_SETTLED = 4  # frames after which the back end's velocity is better than that with which the body was found
+_CONVERGED = 4  # frames after which the back end's velocity is better than that with which the body was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -111,7 +111,7 @@ class Body:
 def new_body(
     id: int, centre: Array, twist: Array, times: Array, stamp: float, size: float, uncertainty: Array | None = None
 ) -> Body:  # fmt: skip
-    """A body found with a twist at its centre; its poses over the window follow from an even motion.
+    """A body found with a twist at its centre; its poses over the window follow from a constant velocity.
 
     Args:
         id: for it.
@@ -164,10 +164,10 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
     speed = float(np.linalg.norm(estimate.velocity[3:]) + size * np.linalg.norm(estimate.velocity[:3]))
     v, P = estimate.velocity, estimate.velocity_covariance
-    settled = body.seen > _SETTLED
+    converged = body.seen > _CONVERGED
     certain = float(v @ np.linalg.solve(P, v)) > (9.0 if body.moving else 16.8)  # χ²(6): 83 % and 99 %
     T_estimate = estimate.T_world_object
-    stays = body.measured or not settled
+    stays = body.measured or not converged
     T_body_estimate = inverse(body.T) @ T_estimate if stays else body.T_body_estimate
     T = body.T if stays else np.asarray(T_estimate @ inverse(T_body_estimate), np.float64)
     change = adjoint(T_body_estimate)
@@ -176,10 +176,10 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
         body,
         T=T,
         T_body_estimate=T_body_estimate,
-        velocity=at_origin if settled else body.velocity,
-        velocity_covariance=estimate.velocity_covariance if settled else body.velocity_covariance,
+        velocity=at_origin if converged else body.velocity,
+        velocity_covariance=estimate.velocity_covariance if converged else body.velocity_covariance,
         covariance=change @ estimate.covariance @ change.T,
-        moving=not settled or (certain and speed > min_speed),
+        moving=not converged or (certain and speed > min_speed),
         estimate=estimate,
         measured_at=estimate.stamp if estimate.measured else body.measured_at,
         refused=body.refused + 1 if body.measured and not estimate.measured else 0,

@@ -41,12 +41,12 @@ def region_radius(depth: Any, size: float) -> Any:
 
 @dataclass(frozen=True)
 class MovingTracks:
-    """Tracks of a frame with their even motions, a row each.
+    """Tracks of a frame with their constant velocities, a row each.
 
     Attributes:
         rows: in the table of tracks (N,).
         ids: of the tracks (N,).
-        motion: their even motions.
+        motion: their constant velocities.
         radius: of the region about each (N,) [m].
         moves: whether a fixed point does not explain it (N,).
     """
@@ -67,7 +67,7 @@ class MovingTracks:
         Args:
             rows: of the tracks in their table (N,).
             ids: of the tracks (N,).
-            motion: their even motions.
+            motion: their constant velocities.
             depth: of each (N,) [m].
             noise: standard deviation of one measured depth (N,) [m].
             size: what bodies measure across at least [m].

@@ -18,7 +18,7 @@ class ObjectsConfig:
     Attributes:
         mode: ``"detect"`` finds moving bodies without being told; ``"procedure1"`` is the papers' detector with a
             database of known features (paper B, 3); ``"off"``.
-        window: number of frames over which a feature is judged.
+        window: number of frames over which a feature is classified.
         patience: a track that belongs to no body is given up after so many frames without a match.
         max_speed: no point of a body is faster [m/s]; bounds the search for features that are not where a still point
             would be.
@@ -27,7 +27,7 @@ class ObjectsConfig:
         d_match: largest descriptor distance in the search windows.
         ratio: largest ratio of the best to the second best descriptor distance.
         wide_d_match, wide_ratio: as `d_match` and `ratio`, for features far from where a still point would be.
-        min_frames: a feature is judged from so many measurements on.
+        min_frames: a feature is classified from so many measurements on.
         doubtful: χ²(3) of a track's displacement from which it becomes no landmark.
         suspect: χ²(6) of a large cluster's motion against the rest of the scene's from which its landmarks measure the
             camera no more.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,29 +24,25 @@ from slam.objects.bodies import (
     advanced,
     continued,
     from_fit,
-    new_body,
     with_evidence,
     with_extent,
 )
-from slam.objects.candidates import Candidate, MovingTracks, follow_candidates, region_radius
+from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
 from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
+from slam.objects.founding import Founding, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
-from slam.objects.points import compact
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene
 from slam.objects.revision import Mend, revise_tracks
-from slam.objects.tracks import Tracks, even_motion, fit_positions, fit_velocities, make_room, median, record
-from slam.objects.twists import fit_twist
+from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, median, record
 
-_ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
-_FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
-_SETTLED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
+_ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
 class MovingObjectDetector:
@@ -105,11 +100,14 @@ class MovingObjectDetector:
             self.config,
         )  # fmt: skip
         self._measure(tracks, features, local, T_world_left)
-        tracks.recognised_as(landmark)
+        tracks.assign_landmarks(landmark)
         self._fit(tracks, times)
-        self._change_members()
-        self._find_bodies(times, T_world_left)
-        self._follow_candidates(times, T_world_left)
+        founding = Founding(
+            self.rig, self.config, self.sigma, self.models, times, self.slot, features.stamp, T_world_left[:3, 3]
+        )
+        self._change_members(founding)
+        self._find_bodies(founding, T_world_left)
+        self._follow_candidates(founding, T_world_left)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._motion_labels(features)
 
@@ -139,7 +137,7 @@ class MovingObjectDetector:
         """Predict all bodies; forget those that were not seen for long."""
         now, dt = self._stamps[self.slot], self._dt(times)
         for body in list(self.bodies.values()):
-            fresh = (body.seen + 0.5) * dt < _SETTLED  # to the nearest frame
+            fresh = (body.seen + 0.5) * dt < _ESTABLISHED  # to the nearest frame
             if now - body.seen_at > self.config.forget_after or (fresh and body.missed >= _PATIENCE + body.seen):
                 self._forget(body.id)
             else:
@@ -179,9 +177,9 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- bodies and members
 
-    def _find_bodies(self, times: Array, T_world_left: Array) -> None:
+    def _find_bodies(self, founding: Founding, T_world_left: Array) -> None:
         """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
-        c, tracks = self.config, self.tracks
+        c, tracks, times = self.config, self.tracks, founding.times
         assert tracks is not None
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows, place = known_well(tracks, free, T_world_left, c.min_frames)
@@ -208,68 +206,20 @@ class MovingObjectDetector:
         for whole, members in [*parts, *((None, members) for members in alone)]:
             members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
-                self._perhaps_found(members[tracks.streak[members] > 0], times, whole)
+                new = founding.moving_group(tracks, members[tracks.streak[members] > 0])
+                if new is not None:
+                    self._found(new, founding, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
 
-    def _perhaps_found(self, members: NDArray[np.intp], times: Array, whole: int | None = None) -> None:
-        """Make a body of tracks that have moved alike for long enough, if they lie together.
-
-        They may be a part of the body `whole` that moves otherwise.
-        """
-        c, tracks = self.config, self.tracks
-        assert tracks is not None
-        members = members[compact(tracks.position[members], _FAR)]
-        if len(members) < c.min_support:
-            return
-        for _ in range(_ROUNDS):
-            twist, uncertainty, centre = self._common_motion(members, times)
-            if not self._is_resolved(centre):
-                return  # what stands still beside it could not be told from it
-            body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
-            body = membership.fitted(body, tracks, members, self.slot)
-            moves = membership.verdict(body, tracks, members).gain > 0
-            if moves.all():
-                self._found(members, centre, twist, uncertainty, times, whole)
-                return
-            members = members[moves]  # what lies among them and rather stands still slows them down
-            if len(members) < c.min_support:
-                return
-        twist, uncertainty, centre = self._common_motion(members, times)
-        self._found(members, centre, twist, uncertainty, times, whole)
-
-    def _is_resolved(self, centre: Array) -> bool:
-        """Whether the noise of a depth is less than the region that a body at this place may fill."""
-        depth = float(np.linalg.norm(centre - self._poses[self.slot, :3, 3]))
-        return bool(self._depth_noise(depth) < region_radius(depth, self.config.size))
-
-    def _depth_noise(self, depth: Any) -> Any:
-        """Standard deviation [m] of one measured depth [m]."""
-        return depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
-
-    def _common_motion(self, members: NDArray[np.intp], times: Array) -> tuple[Array, Array, Array]:
-        """Twist (6,) that fits tracks best, its covariance (6, 6), and the middle (3,) that it is about."""
-        assert self.tracks is not None
-        motion = even_motion(self.tracks, members, times, self.config.max_speed)
-        centre = motion.position.mean(axis=0)
-        twist, uncertainty = fit_twist(
-            motion.position, motion.velocity, np.linalg.inv(motion.velocity_covariance), centre
-        )
-        linear, angular = self.models.velocity_variance(-float(times.min()) / 3.0)  # it is the mean over the window
-        return twist, uncertainty + np.diag([angular] * 3 + [linear] * 3), centre
-
-    def _found(
-        self, members: NDArray[np.intp], centre: Array, twist: Array, uncertainty: Array, times: Array,
-        whole: int | None = None,
-    ) -> None:  # fmt: skip
+    def _found(self, group: MovingGroup, founding: Founding, whole: int | None = None) -> None:
         """Make a body of tracks with a common twist, or let them join the one that they belong to.
 
-        That is not the body `whole`, of which they have just been told.
+        They may be a part of the body `whole` that moves otherwise: then they do not join that one.
         """
-        c, tracks = self.config, self.tracks
+        tracks, members = self.tracks, group.members
         assert tracks is not None
-        body = new_body(self._next_body, centre, twist, times, self._stamps[self.slot], c.size, uncertainty)
-        body = membership.fitted(body, tracks, members, self.slot)
+        body = founding.body(self._next_body, tracks, group)
         others = {id: other for id, other in self.bodies.items() if id != whole}
         known = membership.overlapped(others, tracks, members, body)
         known = known or membership.whole_of(others, tracks, members)
@@ -317,15 +267,15 @@ class MovingObjectDetector:
         membership.enter(grown, tracks, mine, sure=True)
         return grown
 
-    def _follow_candidates(self, times: Array, T_world_left: Array) -> None:
+    def _follow_candidates(self, founding: Founding, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
-        c, tracks = self.config, self.tracks
+        c, tracks, times = self.config, self.tracks, founding.times
         assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
-        motion = even_motion(tracks, rows, times, c.max_speed)
+        motion = constant_velocity(tracks, rows, times, c.max_speed)
         depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
-        noise = self._depth_noise(depth)
+        noise = founding.depth_noise(depth)
         moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
         followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
         self._candidates = []
@@ -337,7 +287,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(candidate.members, centre, twist, uncertainty, times)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), founding)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""
@@ -345,12 +295,13 @@ class MovingObjectDetector:
         R = T_world_left[:3, :3]
         return np.asarray(R @ J @ self._pose_covariance @ J.T @ R.T)
 
-    def _change_members(self) -> None:
+    def _change_members(self, founding: Founding) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
         tracks = self.tracks
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
-        gains = membership.regroup(measured, self._resolved(), tracks, self.slot, self.config)
+        resolved = {body.id for body in self.bodies.values() if founding.resolves(body.T[:3, 3])}
+        gains = membership.regroup(measured, resolved, tracks, self.slot, self.config)
         for id, body in list(self.bodies.items()):
             typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
             self.bodies[id] = with_evidence(body, typical)
@@ -364,10 +315,6 @@ class MovingObjectDetector:
             else:
                 self.bodies[id] = with_extent(kept, tracks.local[mine[tracks.sure[mine]]])
         self._merge()
-
-    def _resolved(self) -> set[int]:
-        """Ids of the bodies so near that the noise of a depth is less than what they measure across."""
-        return {body.id for body in self.bodies.values() if self._is_resolved(body.T[:3, 3])}
 
     def _merge(self) -> None:
         """A body whose members go with an older one is a part of that: at once while young, later only after a while.

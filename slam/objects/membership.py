@@ -29,7 +29,7 @@ from slam.objects.track_kernels import (
 from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, median, times_vectors
 
 _ROUNDS = 3  # of fitting poses and points in turn
-_TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from an even motion, before anything is known [rad], [m]
+_TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
 _PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
 _FREEDOM = 6.0  # fixed: of a body's pose in every frame
@@ -87,7 +87,7 @@ def _limits(most: int) -> Array:
 def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Body:
     """A new body with its poses over the window and its extent fitted to what tracks measured.
 
-    An even motion is but the first guess of a body that starts to move: poses and points are improved in turn.
+    A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
     """
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
@@ -121,7 +121,7 @@ def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
 
 
 def _go_their_own_way(tracks: Tracks, rows: NDArray[np.intp]) -> None:
-    """Make seen members free tracks, in place, that are judged by what they have measured so far."""
+    """Make seen members free tracks, in place, tested by what they have measured so far."""
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
     fit_positions(tracks, rows)
 

@@ -41,7 +41,7 @@ class ObjectDetector(Protocol):
         Args:
             features: of the frame.
             estimate: the camera's pose after the update.
-            landmark: id of the landmark that each feature was recognised as (N,), -1 for none.
+            landmark: id of the landmark that each feature was matched to (N,), -1 for none.
         """
         ...
 

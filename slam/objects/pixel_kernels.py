@@ -110,17 +110,19 @@ def information_in_world(points, usable, J, measured, T_world_left, sigma):
 
 
 @kernel
-def best_in_windows(uv, radius, first, looks, signs, feature_uv, feature_looks, feature_signs, most, d_match, ratio):
+def best_in_windows(
+    uv, radius, first, descriptors, signs, feature_uv, feature_descriptors, feature_signs, most, d_match, ratio
+):
     """Features that continue tracks: the best inside a track's window, and that track the best of the feature's.
 
     Args:
         uv: middles of the windows (N, 2); NaN where there is none.
         radius: their half sizes (N,) [px].
         first: the first feature in the rows of pixels of every window (N,).
-        looks: descriptors of the tracks (N, D).
+        descriptors: of the tracks (N, D).
         signs: of their Laplacians (N,).
         feature_uv: pixels of the features (M, 2), by ascending v.
-        feature_looks: their descriptors (M, D).
+        feature_descriptors: their descriptors (M, D).
         feature_signs: of their Laplacians (M,).
         most: so many features are looked at in a window, the nearest ones.
         d_match: largest descriptor distance.
@@ -141,7 +143,7 @@ def best_in_windows(uv, radius, first, looks, signs, feature_uv, feature_looks, 
             m = near[c]
             if feature_signs[m] != signs[n]:
                 continue
-            gap = _distance(looks[n], feature_looks[m])
+            gap = _distance(descriptors[n], feature_descriptors[m])
             if gap < distance[n]:
                 best[n], distance[n], second = m, gap, distance[n]
             elif gap < second:

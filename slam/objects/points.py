@@ -15,7 +15,7 @@ from slam.geometry.se3 import Array, transform
 Projection = Callable[[Array], tuple[Array, Array]]
 
 _FAR = 4.0  # so many times the median distance from the median point is no part of the body
-ENOUGH = MINIMAL_POINTS + 1  #: points that can be judged to agree with each other: three agree with a pose in any case
+ENOUGH = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
 REJECTIONS = 3  #: so many running, and a point starts anew
 _STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 

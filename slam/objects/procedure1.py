@@ -263,7 +263,7 @@ class Procedure1Detector:
         """Nothing measured is kept."""
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
-        """Recognise the object's features and find its motion; no other feature is judged."""
+        """Recognise the object's features and find its motion; no other feature is classified."""
         c, d = self.config, self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:
             raise ConfigurationError(

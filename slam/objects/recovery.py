@@ -40,7 +40,7 @@ def locate(
     if found is None:
         found = _fit(body, tracks, mine, rows, features, T_world_left, rig, sigma, seed)
     if found is None or 2 * found[1].sum() < len(mine):
-        wide, wide_rows = _by_looks(body, tracks, members, features, measured, T_world_left, config)
+        wide, wide_rows = _by_descriptors(body, tracks, members, features, measured, T_world_left, config)
         again = _fit(body, tracks, wide, wide_rows, features, T_world_left, rig, sigma, seed)
         if (
             again is not None
@@ -59,11 +59,11 @@ def locate(
         return None
     tracks.row[members] = np.where(np.isin(followed, tracks.row[tracks.seen]), -1, followed)
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
-    good, looks = mine[agrees], rows[agrees]
-    tracks.row[members[np.isin(followed, looks)]] = -1
-    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.seen & np.isin(tracks.row, looks)))
-    tracks.row[good], tracks.missed[good] = looks, 0
-    tracks.descriptors[good] = features.descriptors[looks]
+    good, matched = mine[agrees], rows[agrees]
+    tracks.row[members[np.isin(followed, matched)]] = -1
+    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.seen & np.isin(tracks.row, matched)))
+    tracks.row[good], tracks.missed[good] = matched, 0
+    tracks.descriptors[good] = features.descriptors[matched]
     return T
 
 
@@ -119,6 +119,7 @@ def _predicted(
     noise += np.linalg.inv(tracks.local_information[mine[deep]] + LEAST_INFORMATION * np.eye(3))
     information, J = np.linalg.inv(noise), -points_by_pose(y)
     spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
+    # `_squares` takes matrices: all are (3, 3) but that of the body's pose.
     agrees = _squares(gaps, np.linalg.inv(spread)) < AGREES
     known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
     while agrees.sum() >= _LEAST_PREDICTED:
@@ -139,11 +140,11 @@ def _squares(gaps: Array, information: Array) -> Array:
     return np.asarray((gaps * times_vectors(information, gaps)).sum(axis=1))
 
 
-def _by_looks(
+def _by_descriptors(
     body: Body, tracks: Tracks, mine: NDArray[np.intp], features: StereoFeatures, measured: Array,
     T_world_left: Array, config: ObjectsConfig,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
-    """Members whose looks are seen, and the features' rows, no farther off than the body can have gone.
+    """Members matched by descriptor, and the features' rows, no farther off than the body can have gone.
 
     A body that may be anywhere has been out of view for long and looks otherwise: more is tried, and the fit decides.
     Free tracks have no claim to their features: where the body was out of view, they follow its points.

@@ -140,7 +140,7 @@ def fit_fixed_points(A, p, anchor, rows, position, covariance):
 
 
 @kernel
-def even_motions(A, p, rows, times, prior):
+def constant_velocities(A, p, rows, times, prior):
     """Points with an even velocity that fit the windows best.
 
     Args:

@@ -1,4 +1,4 @@
-"""Features followed from frame to frame: what a track remembers, and how it fits a fixed point or an even motion.
+"""Features followed from frame to frame: what a track remembers, and how it fits a fixed point or a constant velocity.
 
 Every measurement is kept as a point in world coordinates with its information: the point ``p`` that the pixels say,
 relative to the track's own anchor, and ``A = Jᵀ J / σ²``. Sums over the window give the least-squares fixed point, the
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.track_kernels import even_motions, fit_fixed_points, leave_window, measurements
+from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window, measurements
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
@@ -122,8 +122,8 @@ class Tracks:
         self.forget_past(new)
         return new
 
-    def recognised_as(self, landmark: IdArray) -> None:
-        """Note which landmark every feature of the frame was recognised as (N,), −1 for none; no other track is it."""
+    def assign_landmarks(self, landmark: IdArray) -> None:
+        """Note which landmark each feature of the frame was matched to (N,), −1 for none; one track a landmark."""
         seen = np.flatnonzero(self.seen)
         known = seen[landmark[self.row[seen]] >= 0]
         ids = landmark[self.row[known]]
@@ -186,7 +186,7 @@ class ConstantVelocity:
     test: Array
 
 
-def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> ConstantVelocity:
+def constant_velocity(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> ConstantVelocity:
     """Points with an even velocity, fitted to the windows of tracks.
 
     Args:
@@ -195,13 +195,13 @@ def even_motion(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed:
         times: of the window's slots less the present (W,) [s].
         max_speed: deviation of velocities before anything is known [m/s].
     """
-    points, *rest = even_motions(tracks.A, tracks.p, rows, times, max_speed**-2)
+    points, *rest = constant_velocities(tracks.A, tracks.p, rows, times, max_speed**-2)
     return ConstantVelocity(tracks.anchor[rows] + points, *rest)
 
 
 def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_speed: float) -> None:
-    """Give tracks their even motion, in place, where a fixed point does not explain them; see `even_motion`."""
-    m = even_motion(tracks, rows, times, max_speed)
+    """Give tracks a velocity, in place, where a fixed point does not explain them; see `constant_velocity`."""
+    m = constant_velocity(tracks, rows, times, max_speed)
     moves = m.test > MOVES
     moving = rows[moves]
     tracks.velocity[moving], tracks.velocity_covariance[moving] = m.velocity[moves], m.velocity_covariance[moves]

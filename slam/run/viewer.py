@@ -16,7 +16,7 @@ from slam.data import Estimate, FrameResult, StereoFrame
 from slam.errors import SlamError
 from slam.files import require_utf8
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, quaternion
+from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import RunData, read_objects
 from slam.system import StereoSlam
@@ -139,7 +139,7 @@ class Viewer:
         """The true path, placed by the first pose."""
         assert self._truth is not None
         at = int(np.argmin(np.abs(self._truth.stamps - first.stamp)))
-        placed = first.T_world_left @ np.linalg.inv(self._truth.poses[at]) @ self._truth.poses
+        placed = first.T_world_left @ inverse(self._truth.poses[at]) @ self._truth.poses
         self._log("world/truth", self._rr.LineStrips3D([placed[:, :3, 3]], colors=_TRUTH), static=True)
 
     def _at(self, number: int, stamp: float) -> None:

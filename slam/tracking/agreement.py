@@ -11,7 +11,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-ENOUGH = 6  #: observations that can be judged to agree with each other
+ENOUGH = 6  #: observations whose agreement can be tested
 HEEDED = 3  #: one in so many observations is enough to agree with a prediction
 CONFIRMED = 5  #: observations that agree on a pose by more than chance: three fix it
 INFLATION = (3.0, 10.0)  #: process noise that is tried where they disagree, in standard deviations of the usual one

@@ -13,10 +13,10 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
     """Squared Mahalanobis distances ``νᵀ S⁻¹ ν`` (M,).
 
     Args:
-        residuals: ν (M, 3) = (uL, vL, uR) [px]; where uR is NaN the left pixel alone is judged.
+        residuals: ν (M, 3) = (uL, vL, uR) [px]; where uR is NaN the left pixel alone is tested.
         covariances: S (M, 3, 3) [px²], lower triangles; the last row of a missing uR does not count.
 
-    A row that cannot be judged (left residual not finite, S not finite or not positive definite) has distance ∞.
+    A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
     with np.errstate(invalid="ignore", divide="ignore"):  # what is not positive definite becomes NaN here
         l00, l10, l11, l20, l21, l22 = _cholesky(covariances)

@@ -62,6 +62,7 @@ def _greedy(A: Array, information: Array, most: int) -> NDArray[np.intp]:
     free, chosen = np.ones(len(A), bool), np.zeros(len(A), bool)
     at_once = -(-most // _ROUNDS)
     while (missing := most - int(chosen.sum())) > 0:
+        # One inverse (6, 6) serves all K rows.
         gains = np.linalg.det(np.eye(3) + A @ np.linalg.inv(information) @ np.swapaxes(A, 1, 2))
         best = np.argsort(np.where(free, -gains, np.inf), kind="stable")[: min(at_once, missing)]
         free[best], chosen[best] = False, True

@@ -22,7 +22,7 @@ SHORTEST, LONGEST = 1e-3, 10.0
 #: guard: Baselines that rigs have [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
-_INTERVALS = 5  # guard: times between frames whose median is judged: single frames may be missing
+_INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: frames in a row that must show too little before it is said
 _LAST_LOOK = 64  # guard: frame at which the pair is looked at for the last time
 _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))

@@ -199,8 +199,8 @@ class Localizer:
         self, prediction: Prediction, landmarks: LandmarkRows, rows: NDArray[np.intp], features: StereoFeatures
     ) -> Matches:
         """Matches by rows of the whole map."""
-        looks = (landmarks.descriptors, landmarks.laplacian)
-        found = match_in_windows(prediction, *looks, features, self.config, among=rows)
+        descriptors = (landmarks.descriptors, landmarks.laplacian)
+        found = match_in_windows(prediction, *descriptors, features, self.config, among=rows)
         return Matches(rows[found.landmarks], found.features)
 
     def _consensus(

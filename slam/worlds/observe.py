@@ -144,7 +144,7 @@ def _candidates(world: World, points: Array) -> IdArray:
 
 
 def simulate(
-    world: World, looks: Appearance, model: ObservationModel, frame: int, stamp: float, rng: np.random.Generator
+    world: World, appearance: Appearance, model: ObservationModel, frame: int, stamp: float, rng: np.random.Generator
 ) -> SimulatedFeatures:
     """Features of one frame, in random order.
 
@@ -174,12 +174,12 @@ def simulate(
     order = order[_inside(world.rig, uv_left[order])]
     source = np.concatenate([rows, np.full(extra + len(passing_left), _FALSE)])[order]
     false_stereo = np.concatenate([false_stereo, np.zeros(extra + len(passing_left), bool)])[order]
-    return _features(world, looks, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
+    return _features(world, appearance, frame, stamp, seen, source, uv_left[order], uv_right[order], false_stereo, rng)
 
 
 def _features(
-    world: World, looks: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray, uv_left: Array,
-    uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
+    world: World, appearance: Appearance, frame: int, stamp: float, seen: VisibleLandmarks, source: IdArray,
+    uv_left: Array, uv_right: Array, false_stereo: BoolArray, rng: np.random.Generator,
 ) -> SimulatedFeatures:  # fmt: skip
     """Features with the descriptors of their landmarks; `source` are their rows in `seen`, −1 for false ones."""
     ids = np.append(seen.ids, _FALSE)[source]  # row −1 is the last one
@@ -187,15 +187,15 @@ def _features(
     false = np.flatnonzero(ids == _FALSE)
     landmark = ids.copy()
     landmark[false] = rng.integers(0, max(len(world.landmarks), 1), len(false))
-    views = _views(world, frame, seen, source) if looks.drifting else None
-    descriptors = looks.describe(landmark, views, float(world.stamps[frame]), rng)
-    descriptors[false] = looks.of_nothing(len(false), rng)
+    views = _views(world, frame, seen, source) if appearance.drifting else None
+    descriptors = appearance.describe(landmark, views, float(world.stamps[frame]), rng)
+    descriptors[false] = appearance.of_nothing(len(false), rng)
     descriptors /= np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))[:, None]
     objects = world.landmarks.object[landmark]
     objects[false] = _FALSE
     features = StereoFeatures(
-        stamp, uv_left, uv_right, size, np.zeros(len(ids)), looks.response[landmark], looks.laplacian[landmark],
-        descriptors,
+        stamp, uv_left, uv_right, size, np.zeros(len(ids)), appearance.response[landmark],
+        appearance.laplacian[landmark], descriptors,
     )  # fmt: skip
     return SimulatedFeatures(features, ids, objects, false_stereo)
 

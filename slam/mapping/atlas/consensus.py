@@ -16,7 +16,7 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limi
     """The loops that agree with the path, with one of them and with each other, by their second keyframes; maybe none.
 
     The set grows from the seed: loops nearest to it on the path are tried first, then twice as many as the set was
-    asked before. What joins sharpens the path's covariance, by which the next ones are judged.
+    asked before. What joins sharpens the path's covariance, against which the next ones are tested.
 
     Args:
         chain: the path.

@@ -289,6 +289,7 @@ class _Normal:
         through = solver.solve(flat) if m else flat
         follow = np.concatenate([np.zeros((1, 6, m)), through.reshape(count - 1, 6, m)])
         rest = C - A @ follow[a] - B @ follow[b]  # squares of what poses cannot follow; no difference of large squares
+        # Part of a covariance, and used in every step; m is small.
         inner = np.linalg.inv(np.eye(m) + np.tensordot(rest, W @ rest, axes=((0, 1), (0, 1))))
         return cls(solver, flat, through, inner)
 

@@ -28,10 +28,10 @@ def test_fixed_points_solve_the_normal_equations():
     assert not position[1].any()
 
 
-def test_even_motions_are_least_squares_in_point_and_velocity():
+def test_constant_velocities_are_least_squares_in_point_and_velocity():
     A, p, _ = windows()
     times = np.linspace(-0.5, 0.0, SLOTS)
-    points, P, velocity, PV, test = track_kernels.even_motions(A, p, np.arange(TRACKS), times, 0.25)
+    points, P, velocity, PV, test = track_kernels.constant_velocities(A, p, np.arange(TRACKS), times, 0.25)
     for n in range(TRACKS):
         H = np.stack([np.hstack([np.eye(3), t * np.eye(3)]) for t in times])
         normal = np.einsum("wki,wkl,wlj->ij", H, A[n], H) + np.diag([0.0] * 3 + [0.25] * 3)

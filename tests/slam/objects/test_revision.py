@@ -10,7 +10,7 @@ from slam.geometry.se3 import inverse, transform
 from slam.models import models_for
 from slam.objects.config import ObjectsConfig
 from slam.objects.detector import MovingObjectDetector
-from slam.objects.tracks import even_motion
+from slam.objects.tracks import constant_velocity
 
 RIG = StereoRig.rectified_pair(700.0, 620, 188, 0.54, 1241, 376)
 CHANGE = 0.4  # of all disparities [px]
@@ -49,7 +49,7 @@ def velocities(revised):
         detector.classify(features, estimate, np.full(len(points), -1))
     rows = np.flatnonzero(detector.tracks.seen)
     times = detector._times(features)
-    return even_motion(detector.tracks, rows, times, 25.0).velocity[:, 2]
+    return constant_velocity(detector.tracks, rows, times, 25.0).velocity[:, 2]
 
 
 def test_tracks_stand_still_when_the_correction_changes():

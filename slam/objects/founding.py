@@ -1,0 +1,103 @@
+"""What a new body is founded on: tracks that lie together and share a twist that standing still does not explain."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+from slam.object_models import ObjectModels
+from slam.objects import membership
+from slam.objects.bodies import Body, new_body
+from slam.objects.candidates import region_radius
+from slam.objects.config import ObjectsConfig
+from slam.objects.points import compact
+from slam.objects.tracks import Tracks, constant_velocity
+from slam.objects.twists import fit_twist
+
+_ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
+_FAR = 3.0  # so many times the median distance from the median point is no part of a new body
+
+
+class MovingGroup(NamedTuple):
+    """Tracks that move alike.
+
+    Attributes:
+        members: their rows (K,).
+        centre: the point (3,) that the twist is about [m], world coordinates.
+        twist: [ω, v] (6,) at the centre [rad/s, m/s].
+        covariance: of the twist (6, 6).
+    """
+
+    members: NDArray[np.intp]
+    centre: Array
+    twist: Array
+    covariance: Array
+
+
+class Founding(NamedTuple):
+    """Founds bodies in one frame.
+
+    Attributes:
+        rig: the cameras.
+        config: settings.
+        sigma: pixel noise [px].
+        models: how bodies are assumed to move.
+        times: of the window's slots less the present (W,) [s].
+        slot: the present frame's place in the window.
+        stamp: of the present frame [s].
+        eye: the left camera's place (3,) in the world [m].
+    """
+
+    rig: StereoRig
+    config: ObjectsConfig
+    sigma: float
+    models: ObjectModels
+    times: Array
+    slot: int
+    stamp: float
+    eye: Array
+
+    def moving_group(self, tracks: Tracks, members: NDArray[np.intp]) -> MovingGroup | None:
+        """Those of the tracks `members` (K,) that lie together and move alike; None if they are too few or too far."""
+        members = members[compact(tracks.position[members], _FAR)]
+        if len(members) < self.config.min_support:
+            return None
+        for _ in range(_ROUNDS):
+            group = self._group(tracks, members)
+            if not self.resolves(group.centre):
+                return None  # what stands still beside it could not be told from it
+            moves = membership.verdict(self.body(0, tracks, group), tracks, members).gain > 0
+            if moves.all():
+                return group
+            members = members[moves]  # what lies among them and rather stands still slows them down
+            if len(members) < self.config.min_support:
+                return None
+        return self._group(tracks, members)
+
+    def _group(self, tracks: Tracks, members: NDArray[np.intp]) -> MovingGroup:
+        """Tracks with the twist that fits them best."""
+        motion = constant_velocity(tracks, members, self.times, self.config.max_speed)
+        centre = motion.position.mean(axis=0)
+        information = np.linalg.inv(motion.velocity_covariance)
+        twist, covariance = fit_twist(motion.position, motion.velocity, information, centre)
+        # The twist is the mean over the window: the present one differs by what a third of its time allows.
+        linear, angular = self.models.velocity_variance(-float(self.times.min()) / 3.0)
+        return MovingGroup(members, centre, twist, covariance + np.diag([angular] * 3 + [linear] * 3))
+
+    def body(self, id: int, tracks: Tracks, group: MovingGroup) -> Body:
+        """A new body with a group's twist, fitted to its tracks."""
+        body = new_body(id, group.centre, group.twist, self.times, self.stamp, self.config.size, group.covariance)
+        return membership.fitted(body, tracks, group.members, self.slot)
+
+    def resolves(self, place: Array) -> bool:
+        """Whether the noise of a depth is less than the region that a body at a place (3,) may fill."""
+        depth = float(np.linalg.norm(place - self.eye))
+        return bool(self.depth_noise(depth) < region_radius(depth, self.config.size))
+
+    def depth_noise(self, depth: Any) -> Any:
+        """Standard deviation [m] of one measured depth [m]."""
+        return depth**2 * self.sigma / (self.rig.left.fu * self.rig.baseline)
