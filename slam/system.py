@@ -86,6 +86,7 @@ class StereoSlam:
         >>> results = [system.process(frame) for frame in sequence]
     """
 
+    @one_blas_thread
     def __init__(
         self,
         rig: StereoRig,
@@ -315,6 +316,7 @@ class StereoSlam:
             self._rig_error.uncertainty.see_anew(back, self._positions(back))
         return step, atlas, change
 
+    @one_blas_thread
     def roll_back(self) -> None:
         """After a step that an exception ended: take back what it did to the map, in the back end as well.
 
@@ -345,6 +347,7 @@ class StereoSlam:
         """The path as the back end has it, in its own frame."""
         return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
 
+    @one_blas_thread
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
         with self._stepping, self._named("the estimate"):
@@ -359,6 +362,7 @@ class StereoSlam:
         estimate = self._rig_error.added_to(require_estimate(self.backend.estimate(), self.backend))
         return self.atlas.estimate(estimate, self._rig_error.common(as_given=False))
 
+    @one_blas_thread
     def snapshot(self) -> SavedMap:
         """The map as it is now, apart from the system; one that the camera has not been found in is itself.
 

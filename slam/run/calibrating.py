@@ -20,6 +20,7 @@ from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
 from slam.files import require_target, write_text
 from slam.geometry.rig import StereoRig
+from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
 from slam.sequences.calibration_files import require_kalibr, write_kalibr, write_opencv
@@ -110,6 +111,7 @@ class Calibrated:
     units: Sequence[tuple[float, str]]
 
 
+@one_blas_thread
 def calibrate(
     sequences: Sequence[StereoSequence],
     targets: Targets,

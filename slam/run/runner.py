@@ -31,6 +31,7 @@ from slam.run.schema import schema
 from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
 from slam.run.warm_up import BACKENDS, warm_up
+from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
@@ -76,6 +77,7 @@ class RunOptions:
     origin: Mapping[str, Any] = field(default_factory=dict)
 
 
+@one_blas_thread
 def run(
     sequence: Sequence,
     options: RunOptions,
@@ -134,6 +136,7 @@ def run(
     return _drive(sequence, options, system, results, record, on_frame, live)
 
 
+@one_blas_thread
 def run_recording(
     recording: Recording, options: RunOptions, on_frame: Callable[[FrameResult], None] | None = None
 ) -> dict[str, Any]:
