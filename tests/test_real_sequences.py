@@ -42,8 +42,8 @@ def test_kitti_raw_0013_with_two_overtaking_cars(slam_data, tmp_path, backend):
 def test_euroc_keyframes_up_to_seconds_apart(slam_data, tmp_path, backend):
     """Unrectified, and turned by up to 48 degrees from one to the next; measured 0.01 to 0.05 m.
 
-    All are tracked with the newest OpenCV. With 4.10, which rectifies to other last digits, `ekf` misses three and finds
-    the place again: in the largest turn 7 to 14 matches agree, and 8 are needed.
+    All are tracked with the newest OpenCV. With 4.10, which rectifies to other last digits, `ekf` misses three and then
+    finds the place again: in the largest turn 7 to 14 matches agree, and 8 are needed.
     """
     summary = run_defaults(slam_data / EUROC, backend, tmp_path)
     assert summary["frames"] == 20
