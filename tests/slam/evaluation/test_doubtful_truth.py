@@ -57,6 +57,14 @@ def test_interpolated_truth_is_noticed_where_it_is():
     assert not found[31:].any()
 
 
+def test_interpolated_truth_is_noticed_where_there_is_little_else():
+    true, (first, last) = drive(25), stretches(25)
+    step = exp(np.array([0, 0.004, 0.001, 0, 0, 1.0]))
+    for k in range(1, 20):
+        true.poses[k] = true.poses[k - 1] @ step
+    assert doubtful(true, NOISE, first, last).all()
+
+
 def test_truth_without_noise_is_exact():
     still = Trajectory(0.1 * np.arange(20), np.tile(np.eye(4), (20, 1, 1)))
     assert not doubtful(still, TruthNoise(), *stretches(20)).any()
