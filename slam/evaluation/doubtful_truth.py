@@ -2,8 +2,7 @@
 
 An estimate is not at fault where it contradicts these. Two signs are looked for in truth that was measured:
 
-- It turns at a constant rate from pose to pose, far more evenly than elsewhere or than its own noise allows: it was
-  interpolated over a gap.
+- It turns at a constant rate from pose to pose, far more evenly than elsewhere: it was interpolated over a gap.
 - A vehicle on wheels slips sideways by more than the truth's noise allows: a drift of the satellite receiver.
 """
 
@@ -18,7 +17,8 @@ from slam.geometry.trajectory import Trajectory, TruthNoise
 
 RowArray = NDArray[np.intp]
 
-_EVEN = 0.01  # of the usual change of the turn from step to step: chance makes this in one of a million
+_EVEN = 0.01  # of the large changes of the turn from step to step: chance makes this in one of some 100,000
+_LARGE = 0.9  # quantile of the changes: even where most of a short path was interpolated, some tenth was not
 _LEVER, _LEVER_SIGMA = 1.5, 1.0  # from the axle that does not steer forward to the camera [m]
 _SIGMAS = 3.0  # of what may seem to be a slip
 
@@ -36,18 +36,14 @@ def doubtful(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArra
         return np.zeros(len(first), bool)
     motion = inverse(true.poses[:-1]) @ true.poses[1:]
     turn = so3_log(motion[:, :3, :3])
-    bad = _within(_interpolated(motion, turn, noise), first, last - 1)
+    bad = _within(_interpolated(turn), first, last - 1)
     return bad | _slips(motion, turn, noise, first, last) if noise.wheels else bad
 
 
-def _interpolated(motion: Array, turn: Array, noise: TruthNoise) -> BoolArray:
-    """Whether a step's turn (N, 3) [rad] and the next one's are the same to rounding (N − 1,); what stands may.
-
-    Usual is the median change, or what the noise of three poses makes of it: of a short path most may be interpolated.
-    """
+def _interpolated(turn: Array) -> BoolArray:
+    """Whether a step's turn (N, 3) [rad] and the next one's are the same to rounding (N − 1,)."""
     change = np.linalg.norm(np.diff(turn, axis=0), axis=1)
-    moves = np.linalg.norm(motion[1:, :3, 3], axis=1) > noise.translation
-    return np.asarray(moves & (change < _EVEN * max(np.median(change), np.sqrt(6.0) * noise.rotation)))
+    return np.asarray(change < _EVEN * np.quantile(change, _LARGE))
 
 
 def _slips(motion: Array, turn: Array, noise: TruthNoise, first: RowArray, last: RowArray) -> BoolArray:
