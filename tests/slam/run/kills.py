@@ -1,4 +1,4 @@
-"""``python -m tests.slam.run.kills BACKEND FOLDER COUNT``: runs that are killed, the k-th after k/COUNT of its time.
+"""``python -m tests.slam.run.kills BACKEND FOLDER COUNT``: runs that are killed, the k-th after k/COUNT of its frames.
 
 Each is a fork of a process that has loaded everything, so that many take no longer than one.
 """
@@ -33,6 +33,11 @@ class Seen(Scripted):
         yield from (_Numbered(k, seen) for k, seen in enumerate(self.features))
 
 
+def _rows(path: Path) -> int:
+    """Lines of a file so far."""
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
 def main() -> None:
     backend, folder, count = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     sequence, ends = Seen(), []
@@ -45,15 +50,20 @@ def main() -> None:
     work(folder / "whole")
     start = time.monotonic()
     work(folder / "timed")
-    whole = time.monotonic() - start
+    frame = (time.monotonic() - start) / FRAMES
     for k in range(count):
         child = os.fork()
         if not child:
             work(folder / str(k))
             os._exit(0)
-        time.sleep(whole * k / count)
-        os.kill(child, signal.SIGKILL)
-        ends.append(os.WIFSIGNALED(os.waitpid(child, 0)[1]))
+        ended = 0
+        while not ended and _rows(folder / str(k) / "trajectory.txt") < k * FRAMES // count:
+            ended = os.waitpid(child, os.WNOHANG)[0]  # where this process was not given the processor in time
+            time.sleep(frame / 10)
+        if not ended:
+            time.sleep(frame * (k % 4) / 4)  # anywhere in a frame
+            os.kill(child, signal.SIGKILL)
+            ends.append(os.WIFSIGNALED(os.waitpid(child, 0)[1]))
     print(sum(ends))
 
 
