@@ -29,6 +29,8 @@ def camera_info(header, rig, baseline):
 
 
 sequence = slam.open_sequence(sys.argv[1])
+if not sequence.rig.is_rectified:
+    sys.exit("its images are not rectified: as image_rect they would give a wrong path")
 with Writer(sys.argv[2], version=9) as bag:
     topics = {
         (side, name): bag.add_connection(f"/stereo/{side}/{name}", kind.__msgtype__, typestore=store)
