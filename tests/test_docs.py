@@ -55,7 +55,6 @@ def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
     assert errors.translation_statistics.rmse < 0.02  # measured 4 mm, on 25 cm of path
 
 
-@pytest.mark.slow
 def test_the_back_end_in_50_lines_keeps_as_much_of_the_contract_as_its_page_says():
     check_backend(pose_fit(), "runs")
     page = (DOCS / "adding_a_backend.md").read_text(encoding="utf-8")
@@ -394,7 +393,6 @@ def reader_has(name):
     return {}
 
 
-@pytest.mark.slow  # those with images take seconds each
 @each_page
 def test_python_in_pages_runs(page, tmp_path, monkeypatch):
     name = page.relative_to(ROOT).as_posix()

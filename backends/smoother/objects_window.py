@@ -48,9 +48,9 @@ class CameraWindow:
         return np.linalg.inv(self.covariance)
 
     def given_later(self, count: int) -> Array:
-        """Information (6 n, 6 n) on the `count` oldest poses given the later ones: that on all less that on the later.
+        """Information (6 n, 6 n) of the `count` oldest poses given the later ones: all poses' less the later ones' own.
 
-        As a Schur complement: of a difference rounding would leave none that is positive.
+        It is a Schur complement: a difference of two inverses is not positive where poses share a large error.
         """
         old, later = slice(0, 6 * count), slice(6 * count, None)
         conditional = self.information.copy()

@@ -1,4 +1,4 @@
-"""``python -m tests.slam.run.kills BACKEND FOLDER COUNT``: runs that are killed, the k-th after k/COUNT of its frames.
+"""``python -m tests.slam.run.kills BACKEND FOLDER COUNT``: runs killed after more and more frames.
 
 Each is a fork of a process that has loaded everything, so that many take no longer than one.
 """
@@ -17,6 +17,7 @@ from slam.sequences import open_sequence
 from tests.fuzz.runs import Scripted, _Frontend, _Numbered
 
 FRAMES = 25
+_LAST_FILES = 0.15  # of the frames' time: kills are spread over so much more, in which the last files are written
 
 
 class Seen(Scripted):
@@ -56,12 +57,12 @@ def main() -> None:
         if not child:
             work(folder / str(k))
             os._exit(0)
-        ended = 0
-        while not ended and _rows(folder / str(k) / "trajectory.txt") < k * FRAMES // count:
+        ended, after = 0, k / count * (1 + _LAST_FILES) * FRAMES
+        while not ended and _rows(folder / str(k) / "trajectory.txt") < min(int(after), FRAMES):
             ended = os.waitpid(child, os.WNOHANG)[0]  # where this process was not given the processor in time
             time.sleep(frame / 10)
         if not ended:
-            time.sleep(frame * (k % 4) / 4)  # anywhere in a frame
+            time.sleep(frame * (after - min(int(after), FRAMES)))
             os.kill(child, signal.SIGKILL)
             ends.append(os.WIFSIGNALED(os.waitpid(child, 0)[1]))
     print(sum(ends))
