@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -113,9 +114,7 @@ class SystemConfig:
         try:
             return TypeAdapter(cls).validate_python(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise ConfigurationError(f"setting {where}: {first['msg']}") from None
+            raise ConfigurationError(_refused(error.errors()[0])) from None
 
     def with_settings(self, settings: list[str]) -> SystemConfig:
         """A copy with ``section.key=value`` settings applied, for instance ``map.max_landmarks=300``.
@@ -128,3 +127,19 @@ class SystemConfig:
         tree = self.to_json()
         apply_settings(tree, settings)
         return self.from_json(tree)
+
+
+#: What is wanted of a setting, by pydantic's name of the fault.
+_WANTED = {
+    "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
+    "string": "a text", "list": "a list", "tuple": "a list", "is": "a list", "dict": "an object", "none": "null",
+}  # fmt: skip
+
+
+def _refused(fault: Mapping[str, Any]) -> str:
+    """The line for a value that pydantic refuses: the setting, what it must be, and what it is."""
+    where = ".".join(str(part) for part in fault["loc"])
+    wanted = _WANTED.get(fault["type"].partition("_")[0])
+    if wanted is None:
+        return f"setting {where}: {fault['msg']}"
+    return f"setting {where}: must be {wanted}, got {fault['input']!r:.80}"

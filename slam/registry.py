@@ -64,6 +64,11 @@ def resolve(role: str, name: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         return getattr(import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        where = ""
+        if target is name and error.name == module.partition(".")[0]:
+            where = f"; looked for in {Path.cwd()}, where `slam` runs, and among the installed packages"
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
@@ -80,6 +85,8 @@ def create(role: str, name: str, rig: Any, **options: Any) -> Any:
     """
     what = role[:-1].replace("end", " end")
     made = resolve(role, name)
+    if "models" in options and options["models"] is None:
+        raise ConfigurationError(f"{what} {name!r}: models is None; give EstimatorModels, or leave it out")
     try:
         created = made(rig, **options)
     except SlamError:

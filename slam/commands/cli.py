@@ -133,10 +133,11 @@ def run_command(
         options = replace(options, origin=origin.to_json(folder))
         watches = _watches(stack, opened, viewer, draw)
         until = threading.Event() if live or is_live(opened) else None
-        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, until))
+        if until is not None and not quiet:
+            print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
+        end_of_frame = stack.enter_context(whole_frames(stack.enter_context(progress).frame, folder, until))
         summary = run(opened, options, end_of_frame, watches=watches, until=until)
-    _leave_picture(folder, picture)
-    _finish(summary, folder, quiet)
+    _finish(summary, folder, picture, quiet)
 
 
 def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None) -> list[Watch]:
@@ -177,10 +178,9 @@ def replay_command(
     progress = Progress(len(loaded), _title(loaded, name), quiet)
     with run_folder(out, loaded.name, name, overwrite) as folder:
         options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
-        with progress, whole_frames(progress.frame) as end_of_frame:
+        with progress, whole_frames(progress.frame, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
-    _leave_picture(folder, picture)
-    _finish(summary, folder, quiet)
+    _finish(summary, folder, picture, quiet)
 
 
 @app.command("plot", short_help="Draw finished runs.")
@@ -372,24 +372,26 @@ def _title(sequence: Sequence | Recording, backend: str) -> str:
     return f"{name if len(name) <= 12 else f'…{name[-11:]}'} · {backend}"
 
 
-def _finish(summary: dict[str, Any], folder: Path, quiet: bool) -> None:
-    """Print the table of a run, and one line where most frames were not tracked; exit status 1 where none was."""
+def _finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
+    """Leave the picture of a run and print its table, and a line where most frames were not tracked.
+
+    The exit status is 1 where none was.
+    """
     from slam.commands.display import print_summary
+    from slam.commands.plot import leave_picture
     from slam.run.outcome import nothing_tracked
 
+    if not summary["frames"]:
+        print(f"slam: the run ended before its first frame; files: {folder}", file=sys.stderr)
+        return
+    if picture:
+        leave_picture(folder)
     if not quiet:
         print_summary([summary], folder)
     if summary["tracking"]:
         print(f"slam: {summary['tracking']}", file=sys.stderr)
     if nothing_tracked(summary):
         raise typer.Exit(1)
-
-
-def _leave_picture(folder: Path, wanted: bool) -> None:
-    if wanted:
-        from slam.commands.plot import leave_picture
-
-        leave_picture(folder)
 
 
 def _frame_count(sequence: Sequence, start: int, stop: int | None) -> int | None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -68,26 +70,33 @@ def _stop(number: int, frame: object) -> None:
 
 @contextmanager
 def whole_frames(
-    after_frame: Callable[[FrameResult], None], until: threading.Event | None = None
+    after_frame: Callable[[FrameResult], None], folder: Path, until: threading.Event | None = None
 ) -> Iterator[Callable[[FrameResult], None]]:
     """A callback for the end of every frame, at which a signal that came meanwhile takes effect.
 
     Args:
         after_frame: is called, too.
+        folder: of the run, named in what a signal leaves.
         until: set by a signal; its run then has no more frames, and Ctrl-C has no further effect.
     """
     global _in_frames, _until
+    done = 0
 
     def end_of_frame(result: FrameResult) -> None:
+        nonlocal done
         after_frame(result)
+        done += 1
         if _pending:
             raise Stopped(_pending.pop())
 
     _in_frames, _until = True, until
     try:
-        with leaving("frames done so far are kept"):
-            yield end_of_frame
-            if _pending:  # no frame came after it
-                raise Stopped(_pending.pop())
+        yield end_of_frame
+        if _pending:  # no frame came after it
+            raise Stopped(_pending.pop())
+    except Stopped as stopped:
+        kept = f"frames done so far are kept: `slam plot {shlex.quote(str(folder))}` draws them"
+        stopped.leaves = kept if done else "no frame was done yet"
+        raise
     finally:
         _in_frames, _until = False, None

@@ -23,6 +23,7 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import widths
 from slam.sequences import open_sequence
+from slam.sequences.faults import said_before
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +104,8 @@ def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:
     """The path that a run said online (the final one of a replay), and the true one in its axes."""
     file = run.folder / "trajectory.txt"
     own = Trajectory.read_tum(file if file.exists() else run.folder / "trajectory_final.txt")
-    truth = open_sequence(run.trial.source).ground_truth
+    with said_before():
+        truth = open_sequence(run.trial.source).ground_truth
     if truth is None:
         return own, None
     estimated, true = associate(own, truth, 0.02, interpolated=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ from slam.errors import SlamError
 from slam.files import read_object
 from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
+from slam.sequences.faults import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
 
@@ -103,11 +105,12 @@ def check(plan: Plan) -> dict[str, int]:
     Returns:
         number of frames of a run, by sequence.
     """
-    frames = {}
+    frames: dict[str, int] = {}
     for trial in plan.trials_of(CLOSED_LOOP):
         if trial.seed:
             continue
-        sequence = open_sequence(trial.source)
+        with said_before() if trial.sequence in frames else nullcontext():
+            sequence = open_sequence(trial.source)
         frames[trial.sequence] = len(range(len(sequence))[trial.start : trial.stop])
         config = config_of(trial, sequence)
         if frontend_of(trial, sequence) is None:

@@ -24,6 +24,7 @@ from slam.interfaces import Frontend
 from slam.run.recording import load_recording
 from slam.run.runner import RunOptions, run, run_recording
 from slam.sequences import Sequence, open_sequence
+from slam.sequences.faults import said_before
 from slam.worlds import WorldSequence
 
 #: Files of a run by name.
@@ -114,7 +115,8 @@ def one_thread() -> Iterator[None]:
 
 def _closed_loop(trial: Trial, out: Path) -> Measured:
     """The system on the sequence; what it gave its back end is recorded."""
-    sequence = open_sequence(trial.source)
+    with said_before():
+        sequence = open_sequence(trial.source)
     config, frontend = config_of(trial, sequence), frontend_of(trial, sequence)
     record = out / RECORDING
     options = RunOptions(trial.backend, trial.variant.frontend, config, out, trial.start, trial.stop, record)
@@ -132,7 +134,8 @@ def _replay(trial: Trial, recording: bytes | None, out: Path) -> Measured:
     path.write_bytes(recording)
     loaded = load_recording(path)
     path.unlink()
-    sequence = open_sequence(trial.source)
+    with said_before():
+        sequence = open_sequence(trial.source)
     options = RunOptions(trial.backend, trial.variant.frontend, config_of(trial, sequence), out)
     collector = Collector(sequence, trial.start, score=False)
     return _measured(collector, out, run_recording(loaded, options, collector.add))

@@ -8,21 +8,34 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import inverse, log
+from slam.models import MotionModel
 from slam.run.summary import RunRecord
 from slam.tracking.input_warnings import baseline_doubt
 from slam.tracking.state import ENOUGH_FEATURES
 
 _TRACKED = "tracked"
 
+#: guard: So many times the expected change of velocity in the median says that times or the kind of motion are wrong.
+#: The median over the recordings and worlds at hand is .02 to .4; of times ten times too short it is 30 times as large.
+_JERKY = 3.0
+_LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
+
 #: What may be the cause where each step gave enough.
 _ANY = (
     "features are found in both images, but not again in the next frame: a vehicle's camera without --kind "
-    "driving, frames too far apart, images that are not in order of time, or the calibration of another camera"
+    "driving, frames too far apart, images that are not in order of time or have other times than theirs (fps=…, "
+    "times=…), or the calibration of another camera"
 )
 
 
 def outcome(
-    record: RunRecord, rig: StereoRig, warnings: Sequence[str] = (), in_map: bool = False, dropped: int = 0
+    record: RunRecord,
+    rig: StereoRig,
+    warnings: Sequence[str] = (),
+    in_map: bool = False,
+    dropped: int = 0,
+    doubt: str = "",
 ) -> str:
     """What to say of a run in which most frames were not tracked, with the likely cause; empty for others.
 
@@ -32,12 +45,13 @@ def outcome(
         warnings: what looked wrong with the images and their times; the first is taken for a cause.
         in_map: the run began in the map of an earlier one.
         dropped: frames of a live run that came too late.
+        doubt: of the motion, see `motion_doubt`; a cause where nothing else is one.
     """
     frames, tracked = len(record.statuses) - 1, record.statuses[1:].count(_TRACKED)
     if frames < 1 or 2 * tracked >= frames:
         return ""
     how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
-    first = warnings[0] if warnings else _cause(record, rig, in_map)
+    first = warnings[0] if warnings else _cause(record, rig, in_map) or doubt
     if not first and dropped < frames:  # where most came, the gaps are hardly all of it
         first = _ANY
     causes = [first] if first else []
@@ -48,6 +62,32 @@ def outcome(
             "objects.mode=off), or move more slowly"
         )
     return f"{how} tracked; likely cause: {'; and '.join(causes)}"
+
+
+def motion_doubt(record: RunRecord, motion: MotionModel) -> str:
+    """What to say where velocities change from frame to frame far more than the motion model lets them; else empty.
+
+    Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand.
+    """
+    measured = np.array(record.measured, bool)
+    stamps, poses = np.array(record.stamps), np.array(record.poses).reshape(-1, 4, 4)
+    if len(stamps) < _LEAST_CHANGES + 2:
+        return ""
+    durations = np.diff(stamps)
+    velocities = log(inverse(poses[:-1]) @ poses[1:]) / durations[:, None]  # of the camera, in its own axes
+    between = 0.5 * (durations[1:] + durations[:-1])[:, None]
+    densities = np.repeat([motion.angular_acceleration, motion.acceleration], 3)
+    changes = np.diff(velocities, axis=0) / (np.sqrt(between) * densities)
+    counted = changes[measured[2:] & measured[1:-1] & measured[:-2]]
+    if len(counted) < _LEAST_CHANGES:
+        return ""
+    ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
+    if ratio < _JERKY:
+        return ""
+    return (
+        f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
+        "images (fps=…, or seconds in times=…), and whether this is a vehicle (--kind driving)"
+    )
 
 
 def nothing_tracked(summary: dict[str, Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,7 +22,7 @@ from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.run.last_files import LastFiles
-from slam.run.outcome import outcome
+from slam.run.outcome import motion_doubt, outcome
 from slam.run.outputs import RunFiles
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
@@ -35,6 +36,8 @@ from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
+
+logger = logging.getLogger("slam.run")
 
 _MOST_FRAMES = 10**12  # of a sequence: more than any has
 
@@ -304,6 +307,12 @@ def _finish(
 ) -> dict[str, Any]:
     """Write the last files, each whether or not another fails, and return the summary."""
     warnings = getattr(system, "warnings", ())
+    doubt = motion_doubt(record, options.config.models.motion)
+    tracking = outcome(
+        record, sequence.rig, warnings, options.prior_map is not None, live.dropped if live else 0, doubt
+    )
+    if doubt and not tracking:
+        logger.warning("%s", doubt)
     summary: dict[str, Any] = {
         "sequence": sequence.name,
         "format": sequence.format,
@@ -312,8 +321,8 @@ def _finish(
         "ended": ended,
         "frames": len(record.numbers),
         "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "tracking": outcome(record, sequence.rig, warnings, options.prior_map is not None, live.dropped if live else 0),
-        "warnings": [*sequence.warnings, *warnings],
+        "tracking": tracking,
+        "warnings": [*sequence.warnings, *warnings, *([doubt] if doubt else [])],
     }
     if live is not None:
         summary["live"] = live_frames(live, record)

@@ -34,6 +34,7 @@ _FORMATS = {
 }
 _MOST_OPTIONS = 100
 _LOOKED_AT = 1000  # files and folders below one that is no sequence
+_LEVELS_ABOVE = 3  # folders above one that is no sequence: mav0/cam0/data
 _COMMON_OPTIONS = frozenset({"kind"})
 
 
@@ -140,7 +141,7 @@ def _require_recording(folder: Path, text: str) -> None:
     if _is_ros(folder):
         return
     if not folder.exists():
-        raise SequenceError(f"{folder}: there is no such folder{_world_meant(text)}")
+        raise SequenceError(f"{folder}: there is no such folder{_world_meant(text) or _folder_meant(folder)}")
     if not folder.is_dir():
         raise SequenceError(f"{folder}: a file where the sequence's folder should be")
     if not any(folder.iterdir()):
@@ -156,6 +157,29 @@ def _world_meant(text: str) -> str:
     return f" (did you mean '{_SYNTHETIC}{near}{mark}{query}'?)" if near else ""
 
 
+def _folder_meant(folder: Path) -> str:
+    """A folder with a similar name, or the part of the path that is missing first; empty where neither helps."""
+    there = next((parent for parent in folder.parents if parent.is_dir()), None)
+    if there is None:
+        return ""
+    missing = folder.relative_to(there).parts[0]
+    with suppress(OSError):
+        near = nearest(missing, (path.name for path in islice(there.iterdir(), _LOOKED_AT)))
+        if near is not None:
+            return f" (did you mean '{there / near}'?)"
+    return "" if there == folder.parent else f": {there} has no {missing!r}"
+
+
+def _sequence_above(folder: Path) -> str:
+    """A hint where the folder lies in a sequence; else empty."""
+    for parent in islice(folder.parents, _LEVELS_ABOVE):
+        with suppress(OSError):
+            name = _format_of(parent)
+            if name is not None:
+                return f"; it is a part of one: give {parent} (format {name})"
+    return ""
+
+
 def _detect(folder: Path, options: dict[str, str]) -> str:
     """The first format that the folder looks like; told where left and right are, it needs not look."""
     if _is_ros(folder):
@@ -166,7 +190,7 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
     if name is None:
         below = _sequences_below(folder)
         names = ", ".join(str(p.relative_to(folder)) for p in below[:3]) + (", …" if len(below) > 3 else "")
-        hint = _two_cameras(folder) + (f"; below it are {names}" if below else "")
+        hint = _two_cameras(folder) + (f"; below it are {names}" if below else "") or _sequence_above(folder)
         raise SequenceError(f"{folder}: no sequence of a known format ({', '.join(_FORMATS)}){hint}")
     return name
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 
 from slam.errors import one_line
 
 logger = logging.getLogger("slam.sequences")
+
+_silent: ContextVar[bool] = ContextVar("lines are kept, but not logged", default=False)
 
 #: So many faults of one kind are reported one by one; the others are counted.
 _LINES_PER_KIND = 5
@@ -24,6 +29,7 @@ class FaultLog:
     def __init__(self, lines: list[str]) -> None:
         self._lines = lines
         self._counts: Counter[str] = Counter()
+        self._assumptions: list[str] = []
 
     def report(self, kind: str, line: str) -> None:
         """Report one fault; faults of the same `kind` are counted together."""
@@ -31,8 +37,15 @@ class FaultLog:
         if self._counts[kind] <= _LINES_PER_KIND:
             self._emit(line)
 
+    def assume(self, line: str) -> None:
+        """Report what is assumed for want of better, at the end, and not at all where an error ends the work."""
+        self._assumptions.append(line)
+
     def close(self) -> None:
-        """Report how many faults were only counted."""
+        """Report what is assumed, and how many faults were only counted."""
+        for line in self._assumptions:
+            self._emit(line)
+        self._assumptions.clear()
         for kind, count in self._counts.items():
             if count > _LINES_PER_KIND:
                 self._emit(f"{kind}: {count} in all, {count - _LINES_PER_KIND} not listed")
@@ -40,7 +53,8 @@ class FaultLog:
 
     def _emit(self, line: str) -> None:
         line = one_line(line)
-        logger.warning("%s", line)
+        if not _silent.get():
+            logger.warning("%s", line)
         if line not in self._lines:
             self._lines.append(line)
 
@@ -50,4 +64,16 @@ class FaultLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if kind is not None:
+            self._assumptions.clear()
         self.close()
+
+
+@contextmanager
+def said_before() -> Iterator[None]:
+    """For opening a sequence once more: what its files lack was logged the first time, and is only kept."""
+    token = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(token)

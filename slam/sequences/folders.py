@@ -231,7 +231,7 @@ def _times(
     """
     if path is None:
         if rate is None:
-            faults.report("stamps", f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
+            faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
         return np.arange(len(paired)), (paired.keys - paired.keys[0]) / (rate or RATE)
     rows = read_rows(path, seconds, faults)
     if len(rows) != len(left):

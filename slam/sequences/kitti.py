@@ -89,7 +89,7 @@ def choose_pair(folder: Path, pattern: str, pairs: tuple[tuple[str, str], ...]) 
 def _times(path: Path, faults: FaultLog) -> Array | None:
     """Times by frame number (T,), NaN for unreadable rows; None for 10 frames per second where there is no file."""
     if not path.exists():
-        faults.report("stamps", f"{path} is missing: {RATE:g} frames per second assumed")
+        faults.assume(f"{path} is missing: {RATE:g} frames per second assumed")
         return None
     rows = read_rows(path, seconds, faults)
     return np.array([np.nan if row is None else row for row in rows])

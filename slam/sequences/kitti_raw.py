@@ -77,7 +77,7 @@ def _day(folder: Path) -> Path:
 def _times(path: Path, faults: FaultLog) -> tuple[int | None, Array | None]:
     """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on; None without file."""
     if not path.exists():
-        faults.report("stamps", f"{path} is missing: {RATE:g} frames per second assumed")
+        faults.assume(f"{path} is missing: {RATE:g} frames per second assumed")
         return None, None
     rows = read_rows(path, date_time, faults)
     origin = next(row for row in rows if row is not None)

@@ -20,6 +20,8 @@ MOST_NANOSECONDS = 2**63 - 1
 
 _MOST_SECONDS = 1e11  # of a time, either side of zero: in nanoseconds it would not fit into 64 bits long before
 
+_EARLIEST, _LATEST = 1e8, 1e10  # of a likely time since 1970 [s]: 1973 to 2286
+
 _DATE_TIME = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", re.ASCII)
 
 
@@ -63,8 +65,16 @@ def seconds(text: str) -> float:
     if not np.isfinite(value):
         raise ValueError(f"{shorten(text)} is not a finite time")
     if abs(value) > _MOST_SECONDS:
-        raise ValueError(f"{shorten(text)} is no possible time in seconds")
+        raise ValueError(f"{shorten(text)} is no possible time in seconds{_other_unit(abs(value))}")
     return value
+
+
+def _other_unit(value: float) -> str:
+    """A hint where a number is a likely time since 1970 in a smaller unit; else empty."""
+    for unit, size in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        if _EARLIEST <= value / size <= _LATEST:
+            return f" (is it in {unit}?): give it in seconds"
+    return ""
 
 
 def nanoseconds(text: str) -> int:

@@ -69,6 +69,13 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
     ):
         with pytest.raises(UnknownNameError, match=f"back end '{name}' cannot be loaded"):
             registry.resolve("backends", name)
+    with pytest.raises(UnknownNameError, match=f"looked for in {tmp_path}, where `slam` runs"):
+        registry.resolve("backends", "no_module_of_this_name:Mine")
+
+
+def test_models_may_be_left_out_but_are_never_none():
+    with pytest.raises(ConfigurationError, match="back end 'ekf': models is None; give EstimatorModels, or leave it"):
+        registry.create("backends", "ekf", "rig", models=None)
 
 
 FOREIGN = """

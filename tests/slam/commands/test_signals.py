@@ -3,7 +3,7 @@ import signal
 import pytest
 
 from slam.commands import cli
-from slam.commands.signals import Stopped
+from slam.commands.signals import Stopped, whole_frames
 
 WORLD = "synthetic:desk?frames=3"
 
@@ -17,7 +17,7 @@ WORLD = "synthetic:desk?frames=3"
             "slam.commands.compare.compare",
             "; trials done so far are kept: the same command continues",
         ),
-        (["run", WORLD, "--out", "one"], "slam.run.runner.run", "; frames done so far are kept"),
+        (["run", WORLD, "--out", "one"], "slam.run.runner.run", "; no frame was done yet"),
         (["settings"], "slam.commands.settings.print_settings", ""),
     ],
 )
@@ -33,3 +33,10 @@ def test_a_signal_ends_a_command_with_what_it_leaves(monkeypatch, tmp_path, caps
         cli.main()
     assert ended.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err == f"slam: stopped by SIGTERM{left}\n"
+
+
+def test_a_run_that_did_frames_says_where_they_are_and_how_to_see_them(tmp_path):
+    with pytest.raises(Stopped) as stopped, whole_frames(lambda result: None, tmp_path / "my run") as end_of_frame:
+        end_of_frame(None)
+        raise Stopped(signal.SIGTERM)
+    assert stopped.value.leaves == f"frames done so far are kept: `slam plot '{tmp_path}/my run'` draws them"

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slam.commands import completion
-from slam.commands.cli import _title, app
+from slam.commands.cli import _finish, _title, app
 from slam.commands.display import Progress, print_listing, print_summary
 
 COMMANDS = ["run", "replay", "plot", "settings", "compare", "calibrate", "render", "view", "list", "warm-up", "demo"]
@@ -121,3 +121,11 @@ def test_tables_fit_on_80_columns_and_are_whole(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     assert not [line for line in lines if "…" in line]
+
+
+def test_a_run_without_a_frame_has_no_table_and_no_picture(tmp_path, capsys):
+    _finish({"frames": 0, "tracking": ""}, tmp_path, picture=True, quiet=False)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == f"slam: the run ended before its first frame; files: {tmp_path}\n"
+    assert not list(tmp_path.iterdir())

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from slam.geometry.rig import StereoRig
-from slam.run.outcome import nothing_tracked, outcome
+from slam.geometry.se3 import exp
+from slam.models import MotionModel
+from slam.run.outcome import motion_doubt, nothing_tracked, outcome
 from slam.run.summary import RunRecord
 
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
@@ -59,3 +62,37 @@ def test_a_run_of_one_frame_has_nothing_to_track():
     assert not nothing_tracked({"frames": 1, "status": {"started": 1}})
     assert nothing_tracked({"frames": 2, "status": {"started": 1, "lost": 1}})
     assert not nothing_tracked({"frames": 2, "status": {"started": 1, "tracked": 1}})
+
+
+def moving(times_too_short: float, frames: int = 40, measured: bool = True) -> RunRecord:
+    """A camera in a hand: its velocity changes as the motion model says, its stamps may be wrong."""
+    rng = np.random.default_rng(0)
+    interval = 0.05
+    velocities = np.cumsum(rng.normal(size=(frames, 6)) * np.sqrt(interval), axis=0)
+    poses = [np.eye(4)]
+    for velocity in velocities[1:]:
+        poses.append(poses[-1] @ exp(velocity * interval))
+    stamps = (np.arange(frames) * interval / times_too_short).tolist()
+    return RunRecord(stamps=stamps, poses=poses, measured=[measured] * frames)
+
+
+def test_motion_as_the_model_expects_it_is_not_doubted():
+    assert motion_doubt(moving(1.0), MotionModel()) == ""
+    assert motion_doubt(moving(0.1), MotionModel()) == ""  # times too long: nothing is torn
+
+
+def test_times_that_are_too_short_are_doubted():
+    said = motion_doubt(moving(10.0), MotionModel())
+    factor = int(said.partition("changes ")[2].split()[0])
+    assert factor == pytest.approx(10**1.5, rel=0.3)
+    assert "fps=…" in said
+
+
+def test_frames_that_were_not_measured_do_not_count():
+    assert motion_doubt(moving(10.0, measured=False), MotionModel()) == ""
+    assert motion_doubt(moving(10.0, frames=8), MotionModel()) == ""
+
+
+def test_doubts_of_the_motion_are_a_cause_where_nothing_else_is():
+    assert outcome(record(0), RIG, doubt="torn").endswith("likely cause: torn")
+    assert "found in the right image" in outcome(record(0, features=(200, 3)), RIG, doubt="torn")

@@ -49,6 +49,21 @@ def test_a_folder_of_no_known_format(tmp_path: Path) -> None:
         open_sequence(tmp_path)
 
 
+def test_a_misspelt_folder_is_answered_with_the_one_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "corridor").mkdir()
+    with pytest.raises(SequenceError, match=f"did you mean '{tmp_path / 'corridor'}'"):
+        open_sequence(tmp_path / "coridor" / "left")
+    with pytest.raises(SequenceError, match=f"{tmp_path} has no 'garden'"):
+        open_sequence(tmp_path / "garden" / "left")
+
+
+def test_a_folder_in_a_sequence_names_the_sequence(kitti: Path, euroc: Path) -> None:
+    for folder, name in ((kitti / "image_0", "kitti"), (euroc / "mav0" / "cam0" / "data", "euroc")):
+        root = kitti if name == "kitti" else euroc
+        with pytest.raises(SequenceError, match=f"give {root}(/mav0)? .format {name}"):
+            open_sequence(folder)
+
+
 def test_two_folders_of_images_by_other_names_are_named(tmp_path: Path) -> None:
     for name in ("cam_l", "cam_r"):
         (tmp_path / name).mkdir()

@@ -13,6 +13,7 @@ import pytest
 
 from slam.errors import CalibrationError, ConfigurationError, SequenceError
 from slam.sequences import open_sequence
+from slam.sequences.faults import said_before
 from slam.sequences.opencv_storage import opencv_rig
 
 SIZE = (64, 48)
@@ -81,6 +82,28 @@ def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert sequence.warnings == []
     (two_folders / "t.txt").rename(two_folders / "times.txt")
     assert np.allclose(open_sequence(two_folders).stamps, 7 + 0.3 * np.arange(6))
+
+
+@pytest.mark.parametrize(("size", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+def test_times_since_1970_in_another_unit_are_named(two_folders: Path, size: float, unit: str) -> None:
+    rows = [f"{(1.7e9 + 0.1 * k) * size:.0f}\n" for k in range(len(list((two_folders / "left").iterdir())))]
+    (two_folders / "times.txt").write_text("".join(rows))
+    with pytest.raises(SequenceError, match=f"is it in {unit}"):
+        open_sequence(two_folders)
+
+
+def test_an_assumed_rate_is_said_once_and_not_above_an_error(
+    two_folders: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    said = [open_sequence(two_folders).warnings]
+    assert [record.getMessage() for record in caplog.records] == said[0]
+    with said_before():
+        assert open_sequence(two_folders).warnings == said[0]
+    assert len(caplog.records) == 1
+    next(two_folders.glob("*.y*ml")).write_text("")
+    with pytest.raises(CalibrationError):
+        open_sequence(two_folders)
+    assert len(caplog.records) == 1
 
 
 def test_times_belong_to_the_left_images_in_order(two_folders: Path) -> None:
