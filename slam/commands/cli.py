@@ -201,8 +201,8 @@ def plot_command(
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.commands.plot import plot_runs
 
-    for file in plot_runs(folders, out, figure, width):
-        print(file)
+    for file, caption in plot_runs(folders, out, figure, width):
+        print(f"{file}: {caption}")
 
 
 @app.command("settings", short_help="List all settings.")

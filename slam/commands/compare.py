@@ -14,6 +14,7 @@ from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import count_tests, groups, write_tables
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError
+from slam.sequences.faults import said_before
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
@@ -61,7 +62,10 @@ def compare(
     count = workers or available_cores()
     where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
     frames = check(plan)  # before there is a progress bar
-    with SweepProgress([frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)], quiet) as bar:
+    planned = [frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)]
+    if not quiet:
+        print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}", flush=True)
+    with said_before(), SweepProgress(planned, quiet) as bar:  # `check` has said what opening says
         scheduler: Scheduler = LocalScheduler(count, bar.frames) if address is None else DaskScheduler(address)
         runs = sweep(
             plan, out, scheduler,

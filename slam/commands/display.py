@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,6 +107,7 @@ class SweepProgress:
         )
         self._runs, self._ended, self._ended_frames, self._counted, self._before = len(frames), 0, 0, 0, 0
         self._round = 0  # frames that were counted in scheduler calls that are over
+        self._began = time.monotonic()
         self._task = self._bar.add_task("", total=sum(frames), runs=f"0/{self._runs}", rate="")
 
     def __enter__(self) -> SweepProgress:
@@ -139,7 +141,8 @@ class SweepProgress:
         """Frames of runs that are over, or where that is more, those counted while they run."""
         done = max(self._ended_frames, self._before + self._round + self._counted)
         task = self._bar.tasks[0]
-        rate = f"{task.speed:.1f} Hz" if task.speed else ""
+        own = done - self._before  # what was kept took no time now
+        rate = f"{own / (time.monotonic() - self._began):.1f} Hz" if own > 0 else ""
         runs = f"{self._ended}/{self._runs}"
         self._bar.update(self._task, completed=min(done, task.total or 0), runs=runs, rate=rate)
 

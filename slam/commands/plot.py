@@ -10,8 +10,10 @@ from slam.errors import ConfigurationError, SlamError
 from slam.run.plots import PICTURE, plot, read_runs
 
 
-def plot_runs(folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None) -> list[Path]:
-    """Draw runs, those of one sequence in one picture; returns the files.
+def plot_runs(
+    folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None
+) -> list[tuple[Path, str]]:
+    """Draw runs, those of one sequence in one picture; returns files and captions.
 
     Args:
         folders: of finished runs.
@@ -29,8 +31,7 @@ def plot_runs(folders: Sequence[Path], out: Path | None, kind: str, width: float
     files = []
     for runs in groups:
         file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
-        plot(runs, file, kind, width)
-        files.append(file)
+        files.append((file, plot(runs, file, kind, width)))
     return files
 
 

@@ -22,13 +22,13 @@ from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import widths
+from slam.run.style import COLOURS, DASHES, repeated, stage_colour, stage_name, stages
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#ad1457", "#558b2f")
 _WIDTH = 5.2  # [inch] about that of a phone: text stays readable where the picture fills the screen
 
 
@@ -123,7 +123,8 @@ def draw_pairs(group: Group, metric: Metric) -> Figure:
     axis.set_xticks(range(len(names)), names)
     axis.set_xlim(-0.5, len(names) - 0.5)
     axis.set_ylabel(metric.title)
-    axis.set_ylim(0, 1.1 * float(np.nanmax(values, initial=1e-9)))
+    low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
+    axis.set_ylim(0 if low < 0.5 * high else low - 0.2 * (high - low), high + 0.1 * (high - min(low, 0.5 * high)))
     return figure
 
 
@@ -147,13 +148,16 @@ def draw_paths(group: Group) -> Figure:
 def draw_errors(group: Group) -> Figure:
     """Position error of the first trial over time, component by component, inside the ±3σ that each run claims."""
     figure, axes = _rows(3, 1.5)
-    for width, (name, run) in zip(widths(len(group.runs), 1.0), example(group).items()):
-        s = read_series(run)
+    shown = example(group)
+    for dashes, width, (name, run) in zip(repeated(DASHES, len(shown)), widths(len(shown), 1.0), shown.items()):
+        s, colour = read_series(run), colours(group)[name]
         t = s["stamp"] - s["stamp"][0]
         for axis, c in zip(axes, "xyz"):
             band = 300 * s[f"sd_{c}"]
-            axis.fill_between(t, -band, band, color=colours(group)[name], alpha=0.13, lw=0)
-            axis.plot(t, 100 * s[f"error_{c}"], color=colours(group)[name], lw=width, label=name)
+            axis.fill_between(t, -band, band, color=colour, alpha=0.13, lw=0)
+            for side in (-1, 1):  # an outline each: where bands lie over each other their colours mix
+                axis.plot(t, side * band, color=colour, alpha=0.7, lw=0.6, ls=dashes)
+            axis.plot(t, 100 * s[f"error_{c}"], color=colour, lw=width, label=name)
     for axis, label in zip(axes, ("right", "down", "forward")):
         axis.axhline(0, color="0.6", lw=0.5)
         axis.set_ylabel(f"{label} [cm]")
@@ -179,34 +183,33 @@ def draw_nees(group: Group) -> Figure:
         axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colours(group)[name], lw=1.2, label=name)
     axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
-    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band of {fewest}")
+    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % of honest means of {fewest}")
     axis.set_yscale("log")
     bottom, top = axis.get_ylim()
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
     axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    _legend_above(axis)
+    _legend_above(axis, 3)
     return figure
 
 
 def draw_timing(group: Group) -> Figure:
     """Milliseconds per frame and stage, median of the trials' medians."""
     names = list(group.runs)
-    figure, axis = _axes(0.8 + 0.45 * len(names))
+    figure, axis = _axes(1.1 + 0.45 * len(names))
     left = np.zeros(len(names))
     runs = {name: [r for r in group.runs[name] if r.milliseconds] for name in names}
-    stages = dict.fromkeys(stage for rs in runs.values() for r in rs for stage in r.milliseconds if stage != "total")
-    for i, stage in enumerate(stages):
+    for stage in stages(stage for rs in runs.values() for r in rs for stage in r.milliseconds):
         width = np.array(
             [np.median([r.milliseconds.get(stage, 0.0) for r in runs[n]]) if runs[n] else 0.0 for n in names]
         )
-        axis.barh(range(len(names)), width, left=left, color=f"C{i}", label=stage)
+        axis.barh(range(len(names)), width, left=left, color=stage_colour(stage), label=stage_name(stage))
         left += width
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_xlabel("ms per frame, one thread")
-    _legend_above(axis)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=8)
     return figure
 
 
@@ -264,9 +267,9 @@ _STYLE: Mapping[str, Any] = {
 }
 
 
-def _legend_above(axis: Any) -> None:
+def _legend_above(axis: Any, columns: int = 4) -> None:
     """A legend that hides nothing."""
-    axis.legend(frameon=False, fontsize=8, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
+    axis.legend(frameon=False, fontsize=8, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
 
 
 def _axes(height: float) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from slam.compare.figures import as_pdf, pictures
 from slam.compare.measure import Metric
 from slam.compare.plan import Plan, short_name
-from slam.compare.statistics import LEVEL, Difference
+from slam.compare.statistics import FEWEST, LEVEL, Difference
 from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
 from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
@@ -19,6 +20,8 @@ from slam.files import whole_file, write_text
 TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
 
 _HEAD = "% Written by slam compare. Needs: \\usepackage{{{}}}\n"
+
+_NARROW = 3  # columns that fit into one of a page's two columns
 
 #: What LaTeX reads otherwise, and what older engines lack.
 _LATEX = str.maketrans(
@@ -38,7 +41,7 @@ def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
     """
     every = groups(plan, runs)
     tests = count_tests(every)
-    tables = [table for group in every for table in (means_table(group), differences_table(group, tests))]
+    tables = [table for group in every for table in (means_table(group), differences_table(group, tests)) if table]
     write_text(out / TABLES, _HEAD.format("booktabs") + "\n" + "\n".join(tables))
     (out / FOLDER).mkdir(exist_ok=True)
     shown = [text for group in every for text in _figures(group, out / FOLDER)]
@@ -46,19 +49,27 @@ def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
 
 
 def means_table(group: Group) -> str:
-    """Mean, standard deviation and confidence interval of every figure of each back end."""
-    names = list(group.runs)
-    head = ["figure", *(f"{latex(name)} & {round(100 * LEVEL)} \\% CI" for name in names)]
+    """Mean, standard deviation and confidence interval of every figure of each back end; of one trial its figures."""
+    names, label = list(group.runs), f"tab:{_label(group)}_means"
+    if group.trials == 1:
+        rows = [[latex(m.title), *(_value_cell(group, name, m) for name in names)] for m in group.shown]
+        caption = f"{_what(group)}: one trial. {_given(group)}."
+        return _table("l" + "r" * len(names), ["figure", *map(latex, names)], rows, caption, label)
     rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.shown]
-    caption = (
-        f"{_what(group)}: mean $\\pm$ standard deviation over the completed of {group.trials} trials, and the "
-        f"{round(100 * LEVEL)} \\% bootstrap confidence interval (BCa) of the mean. {_given(group)}."
-    )
-    return _table("l" + "rl" * len(names), head, rows, caption, f"tab:{_label(group)}_means")
+    spread = f"{_what(group)}: mean $\\pm$ standard deviation over {_trials(group)}"
+    if group.trials < FEWEST:
+        head, caption = ["figure", *map(latex, names)], f"{spread}. {_given(group)}."
+        return _table("l" + "r" * len(names), head, rows, caption, label)
+    level = f"{round(100 * LEVEL)} \\%"
+    head = ["figure", *(f"{latex(name)} & {level} CI" for name in names)]
+    caption = f"{spread}, and the {level} bootstrap confidence interval (BCa) of the mean. {_given(group)}."
+    return _table("l" + "rl" * len(names), head, rows, caption, label)
 
 
 def differences_table(group: Group, tests: int) -> str:
     """Effect, interval and p of every figure that has a better side, each other back end against the first.
+
+    Figures that are the same in all pairs are left out. Empty where none is left, as with one pair.
 
     Args:
         group: the runs.
@@ -68,8 +79,10 @@ def differences_table(group: Group, tests: int) -> str:
     rows = []
     for metric in group.shown:
         for other, d in group.differences(metric).items():
-            if metric.better:
+            if metric.better and d.varies:
                 rows.append([latex(metric.title), *([latex(other)] if len(others) > 1 else []), *_difference_cells(d)])
+    if not rows:
+        return ""
     head = ["figure", *(["back end"] if len(others) > 1 else []), "difference", f"{round(100 * LEVEL)} \\% CI"]
     head += ["$p$", "$p_\\mathrm{Holm}$", "pairs"]
     caption = (
@@ -102,27 +115,43 @@ def _figures(group: Group, folder: Path) -> Iterable[str]:
 
 
 def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str) -> str:
+    """A table; a wide one goes over both columns of a page that has two."""
+    kind, size = ("table*", "\\footnotesize") if len(columns) > _NARROW else ("table", "\\small")
     lines = [" & ".join(row) + " \\\\" for row in rows]
     return "\n    ".join(
         [
-            "\\begin{table}\n  \\centering\n  \\small\n  \\setlength{\\tabcolsep}{4pt}\n"
+            f"\\begin{{{kind}}}\n  \\centering\n  {size}\n  \\setlength{{\\tabcolsep}}{{4pt}}\n"
             f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n  \\begin{{tabular}}{{{columns}}}",
             "\\toprule",
             " & ".join(head) + " \\\\",
             "\\midrule",
             *lines,
-            "\\bottomrule\n  \\end{tabular}\n\\end{table}\n",
+            f"\\bottomrule\n  \\end{{tabular}}\n\\end{{{kind}}}\n",
         ]
     )
+
+
+def _value_cell(group: Group, backend: str, metric: Metric) -> str:
+    """The figure of the one trial."""
+    value = metric.scale * mean_figures(group.finite(backend, metric.key))[0]
+    return f"${value:.{decimals(value)}f}$" if np.isfinite(value) else "--"
+
+
+def _trials(group: Group) -> str:
+    """How many trials, and whether each back end completed all."""
+    most = max(group.failures(backend) for backend in group.runs)
+    return f"{group.trials} trials" if not most else f"the completed of {group.trials} trials"
 
 
 def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
     mean, sd, low, high = (metric.scale * x for x in mean_figures(group.finite(backend, metric.key)))
     if not np.isfinite(mean):
-        return "-- & --"
+        return "-- & --" if group.trials >= FEWEST else "--"
     digits = decimals(mean)
     shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
     spread = f"{shown[0]} $\\pm$ {shown[1]}" if np.isfinite(sd) else shown[0]
+    if group.trials < FEWEST:
+        return spread
     return f"{spread} & [{shown[2]}, {shown[3]}]" if np.isfinite(low) else f"{spread} & --"
 
 
@@ -138,8 +167,10 @@ def _difference_cells(d: Difference) -> list[str]:
 
 
 def _what(group: Group) -> str:
+    """The sequence, which may go on in the next line behind a sign, and the variant."""
     variant = "" if group.variant.name == "surf" else f", {latex(group.variant.name)}"
-    return f"\\texttt{{{latex(group.sequence)}}}{variant}"
+    name = re.sub(r"([:?/=_,-]|\\&|\\_)", r"\1\\allowbreak{}", latex(group.sequence))
+    return f"\\texttt{{{name}}}{variant}"
 
 
 def _given(group: Group) -> str:

@@ -13,11 +13,12 @@ import numpy as np
 
 from slam.compare import figures
 from slam.compare.measure import COMPLETED, Metric, number
-from slam.compare.plan import Plan
+from slam.compare.plan import REPLAY, Plan
 from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures
 from slam.compare.wording import (
+    REPLAYED,
     STRENGTH,
     WORDS,
     Line,
@@ -27,6 +28,7 @@ from slam.compare.wording import (
     failures,
     headline,
     honesty,
+    innovations,
     measurements,
     sentence,
     shown_interval,
@@ -128,9 +130,13 @@ def _conclusions(group: Group) -> Conclusions:
 
 def _honesty(group: Group) -> list[str]:
     """Whether each back end's covariances hold."""
-    keys = [metric.key for metric in group.metrics if metric.key.startswith("nees")]
-    values = {key: {b: mean_figures(group.finite(b, key))[0] for b in group.runs} for key in keys}
-    return honesty(values, group.trials)
+    means = {
+        metric.key: {b: mean_figures(group.finite(b, metric.key))[0] for b in group.runs} for metric in group.metrics
+    }
+    lines = honesty({key: values for key, values in means.items() if key.startswith("nees")}, group.trials)
+    if lines and group.mode == REPLAY:
+        lines.append(REPLAYED)
+    return lines + innovations(means.get("nis_per_dof", {}))
 
 
 def _name(group: Group) -> str:

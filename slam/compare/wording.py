@@ -34,7 +34,18 @@ STRENGTH = {
 _VERB = {Verdict.CERTAIN: "is", Verdict.LIKELY: "seems", Verdict.HINT: "seems", Verdict.SINGLE: "was"}
 
 #: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
+_TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
+
+_SMOOTHER, _ROUGHER = 0.5, 2.0  # NIS per degree of freedom beyond which a sentence says what it means
+
 _HONESTY = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof")
+
+
+#: Why covariances of a replay are smaller than those of a closed loop.
+REPLAYED = (
+    "In a replay the covariances are the back ends' own. Those of a closed loop also hold what is not known of the "
+    "rig's calibration, so they are larger."
+)
 
 
 @dataclass(frozen=True)
@@ -75,17 +86,26 @@ def headline(differences: Sequence[Difference], other: str) -> list[Line]:
     All that is certain, likely, or a hint is named, in both directions; of the rest the main figures.
     """
     lines = []
+    tested = [d for d in differences if direction(d) and _is_named(d)]
+    named = [d for d in tested if not is_trifle(d)]
     for verdict in STRENGTH:
         for way in ("better", "worse"):
-            own = [d for d in differences if d.verdict is verdict and direction(d) == way and _is_named(d)]
+            own = [d for d in named if d.verdict is verdict and direction(d) == way]
             if own:
                 lines.append(Line(f"{other}: {_listed(own)}", way, verdict))
+    if trifles := [_name(d.metric) for d in tested if is_trifle(d)]:
+        lines.append(Line(f"{other}: less than {100 * _TRIFLE:g} % apart: {', '.join(trifles)}", "", Verdict.EQUAL))
     rest = [d for d in differences if worth_saying(d)]
     for verdict in (Verdict.OPEN, Verdict.NONE):
         names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
         if names:
             lines.append(Line(f"{other}: {', '.join(names)}", "", verdict))
     return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
+
+
+def is_trifle(d: Difference) -> bool:
+    """Whether two means are so near that nobody would choose by them, however sure their difference is."""
+    return abs(d.other - d.reference) < _TRIFLE * max(abs(d.reference), abs(d.other))
 
 
 def sentence(d: Difference, reference: str, other: str) -> str:
@@ -113,7 +133,7 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
     """Whether the covariances hold, a sentence per back end: what its mean NEES is, and what is to be expected.
 
     Args:
-        values: mean over the runs by key of the figure and by back end; NaN where there is none.
+        values: mean NEES over the runs by key of the figure and by back end; NaN where there is none.
         runs: how many. The band holds even if all frames of a run are as good as one.
     """
     low, high = (bound / 6 for bound in chi_square_band(6, max(runs, 1)))
@@ -131,6 +151,24 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
             f"{backend}: {claim}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
             f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
         )
+    return lines
+
+
+def innovations(nis: dict[str, float]) -> list[str]:
+    """What a NIS far from one means, a sentence for the back ends that are on the same side.
+
+    Args:
+        nis: mean NIS per degree of freedom by back end; NaN where there is none.
+    """
+    lines = []
+    for below, meaning in (
+        (True, "better than assumed. Pixels are more exact than models.pixel_sigma, or motion is smoother"),
+        (False, "worse than assumed. Pixels are less exact than models.pixel_sigma, or matches are wrong"),
+    ):
+        own = [f"{b} {_digits(x)}" for b, x in nis.items() if (x < _SMOOTHER if below else x > _ROUGHER)]
+        if own:
+            text = f"NIS per degree of freedom: {', '.join(own)}, expected 1"
+            lines.append(f"{text}: predictions and measurements agree {meaning}.")
     return lines
 
 

@@ -16,12 +16,12 @@ from slam.files import read_object, read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.schema import STAGES
+from slam.run.style import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
-_COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f")
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
 
 
@@ -180,7 +180,7 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
         )  # fmt: skip
         axis.add_collection(ellipses)
         axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
-    draw_path(axis, run, run.online, "path", color=_COLOURS[0], lw=3, alpha=0.6)
+    draw_path(axis, run, run.online, "path", color=COLOURS[0], lw=3, alpha=0.6)
     draw_loops(axis, run)
     _draw_truth(axis, run.online, truth, (0, 2))
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
@@ -199,11 +199,11 @@ def draw_loops(axis: Axes, run: RunData) -> None:
     """The path that loops have corrected, from above, its keyframes, and the places where loops were found."""
     final = run.final.positions[:, [0, 2]]
     if len(run.loops):
-        axis.plot(*final.T, color=_COLOURS[2], lw=1.5, label="path, corrected by loops")
-        axis.plot(*final[run.keyframes].T, ".", ms=3, color=_COLOURS[2], label="keyframes")
-        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_COLOURS[1], label="loops closed")
+        axis.plot(*final.T, color=COLOURS[2], lw=1.5, label="path, corrected by loops")
+        axis.plot(*final[run.keyframes].T, ".", ms=3, color=COLOURS[2], label="keyframes")
+        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=COLOURS[1], label="loops closed")
     if len(run.refused):
-        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=_COLOURS[3], label="loops refused")
+        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=COLOURS[3], label="loops refused")
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
@@ -223,7 +223,7 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
             colour = _SEEN if run.seen_last[row] else _UNSEEN
             axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
         p = run.online.positions
-        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=_COLOURS[0], lw=1.5, label="path")
+        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=COLOURS[0], lw=1.5, label="path")
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
         axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
@@ -285,7 +285,7 @@ def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
     error = float(np.linalg.norm((align(true, own).apply_trajectory(true).positions - own.positions)[-1]))
     end, half = own.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
     inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
-    inset.plot(*online.positions[:, [0, 2]].T, color=_COLOURS[0], lw=3, alpha=0.6)
+    inset.plot(*online.positions[:, [0, 2]].T, color=COLOURS[0], lw=3, alpha=0.6)
     _draw_truth(inset, online, truth, (0, 2))
     inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
     inset.set(xticks=[], yticks=[])

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -25,6 +26,9 @@ from slam.object_data import MovingObject
 from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
+
+_NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
+_NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
 
 
 class RunFiles:
@@ -117,7 +121,12 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
     Raises:
         SlamError: it cannot be written.
     """
-    write_text(path, json.dumps(_finite(tree), indent=2) + "\n")
+    write_text(path, _rows_on_lines(json.dumps(_finite(tree), indent=2)) + "\n")
+
+
+def _rows_on_lines(text: str) -> str:
+    """JSON with each list of numbers on one line: a matrix has a line for each row."""
+    return _NUMBERS.sub(lambda found: "[" + ", ".join(found[0][1:-1].replace(",", " ").split()) + "]", text)
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
 from slam.run.figures import RunData, draw_map, draw_path, position_errors, well_known, widths
+from slam.run.style import COLOURS, DASHES, repeated, stage_colour, stage_name, stages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,23 +27,19 @@ if TYPE_CHECKING:
 #: The picture that a run leaves.
 PICTURE = "summary.png"
 
-_COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#2e7d32", "#c62828", "#5d4037", "#9e9d24")
-_STAGE_COLOURS = {
-    "read": "#bdbdbd", "extract": "#1565c0", "predict": "#90caf9", "associate": "#ef6c00",
-    "update": "#c62828", "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32",
-}  # fmt: skip
-_BANDS = ("-", "--", ":", "-.")  # lines around bands: of equal ones both are seen
-_LETTER = 0.55  # mean width of a letter in sizes of the font
+_LETTER = 0.6  # mean width of a letter in sizes of the font
 _TRUTH = "0.25"
 _AXES = ("right", "down", "forward")
 _MOST_MAPS = 3  # side by side in the summary
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
+_PAGE = 8.0  # [in] below which text is small, as in a paper
+_LEAST_HEIGHT = 6.5  # [in] of the summary, below which the legend of the stages takes the place of the panels
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
     "pdf.fonttype": 42,
 }  # fmt: skip
-_COLUMN_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
+_SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
 
 #: Widths that a picture may be given [mm].
 NARROWEST, WIDEST = 50.0, 1000.0
@@ -73,8 +70,11 @@ def read_runs(folders: Sequence[Path]) -> list[list[RunData]]:
     return list(found.values())
 
 
-def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> None:
-    """Draw runs of one sequence into a file.
+def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: float | None = None) -> str:
+    """Draw runs of one sequence into a file; returns a caption.
+
+    A picture for a screen has its caption inside, as titles. One for a paper, which is a PDF, an SVG, or any with a
+    width, has none inside but what tells its panels apart.
 
     Args:
         runs: of the same sequence.
@@ -95,8 +95,11 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     inches = None if width is None else width / 25.4
-    with rc_context(_STYLE | (_COLUMN_STYLE if _is_column(inches) else {})):
+    with rc_context(_STYLE | (_SMALL_STYLE if inches is not None and inches < _PAGE else {})):
         figure = KINDS[kind](runs, inches)
+        caption = _caption(figure, runs, kind)
+        if path.suffix.lower() != ".png" or width is not None:
+            _without_titles(figure, runs, kind)
         FigureCanvasAgg(figure)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,6 +107,23 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
             figure.savefig(path, dpi=110 if width is None else 300, metadata=metadata)
         except OSError as error:
             raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
+    return caption
+
+
+def _caption(figure: Figure, runs: Sequence[RunData], kind: str) -> str:
+    """The titles in one text."""
+    titles = [" ".join(axis.get_title().split()) for axis in figure.axes]
+    return ". ".join([_title(runs), *(title for title in titles if title)]) + "."
+
+
+def _without_titles(figure: Figure, runs: Sequence[RunData], kind: str) -> None:
+    """Take the titles away; maps side by side keep the names of their runs."""
+    figure.suptitle("")
+    for axis in figure.axes if kind != "summary" else []:
+        axis.set_title("")
+    if kind == "map" and len(runs) > 1:
+        for axis, run in zip(figure.axes, runs):
+            axis.set_title(run.name)
 
 
 def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
@@ -117,7 +137,7 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
         first, *others = (part.subplots() for part in parts_above)
     else:
         width = width or 5.0 * parts
-        figure = _figure(width, 8.2 * (width / (5.0 * parts)))
+        figure = _figure(width, max(8.2 * (width / (5.0 * parts)), _LEAST_HEIGHT))
         above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 3.6)))
         first, *others = above.subplots(1, parts)
         left, right = np.asarray(below.subfigures(1, 2))
@@ -181,7 +201,7 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     paths, truth = _in_one_world(runs)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, width, run, path in zip(_repeated(_COLOURS, len(runs)), widths(len(runs), 2.0), runs, paths):
+    for colour, width, run, path in zip(repeated(COLOURS, len(runs)), widths(len(runs), 2.0), runs, paths):
         draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
     _set_title(axis, "Path, online, from above (dot: start)")
@@ -212,8 +232,8 @@ def _map_panel(axis: Axes, run: RunData) -> None:
     draw_map(axis, run, run.truth)
     _widen(axis)
     known, every = len(well_known(run)), len(run.positions)
-    of = "" if known == every else f" of {known}"
-    _set_title(axis, f"Map of {run.name}: {every} landmarks, 2σ ellipses{of}")
+    shown = "2σ ellipses" if known == every else f"2σ ellipses of the {known} that are well known"
+    _set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
     axis.legend(fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
 
 
@@ -231,7 +251,7 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     series = [_errors_of(run) for run in runs]
     shown = [error if known else sigma for _, error, sigma in series]
     factor, unit = _unit(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
-    styles = zip(_repeated(_COLOURS, len(runs)), _repeated(_BANDS, len(runs)), widths(len(runs), 1.1))
+    styles = zip(repeated(COLOURS, len(runs)), repeated(DASHES, len(runs)), widths(len(runs), 1.1))
     for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
         untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
         for axis, e, s in zip(axes, factor * error.T, factor * sigma.T):
@@ -259,19 +279,25 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     """Median time per frame and stage of each run, but for its first frame, which may wait for compilers."""
     rows = np.arange(len(runs))[::-1]
     left = np.zeros(len(runs))
-    for stage in runs[0].milliseconds:
-        width = np.array([float(np.median(times[1:] if len(times) > 1 else times)) for times in
-                          (run.milliseconds[stage] for run in runs)])  # fmt: skip
-        axis.barh(rows, width, left=left, height=0.6, color=_STAGE_COLOURS.get(stage, "0.5"), label=stage)
+    for stage in stages(runs[0].milliseconds):
+        width = np.array([_median_of_later(run.milliseconds[stage]) for run in runs])
+        if width.any():
+            axis.barh(rows, width, left=left, height=0.6, color=stage_colour(stage), label=stage_name(stage))
         left += width
-    for row, total in zip(rows, left):
-        axis.text(total, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
+    for row, run, end in zip(rows, runs, left):
+        total = _median_of_later(np.sum(list(run.milliseconds.values()), axis=0))  # as the run's table says it
+        axis.text(end, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
     axis.set_yticks(rows, [run.name for run in runs])
     axis.set(xlim=(0, 1.25 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin))
-    _set_title(axis, "Median time of each stage")
-    axis.figure.legend(loc="outside lower center", ncols=int(min(5, _width(axis) / 1.1)), frameon=False)
+    _set_title(axis, "Median time of each stage, and of a whole frame")
+    axis.figure.legend(loc="outside lower center", ncols=int(min(5, _width(axis) / 1.5)), frameon=False)
+
+
+def _median_of_later(times: np.ndarray) -> float:
+    """The median of all frames but the first."""
+    return float(np.median(times[1:] if len(times) > 1 else times))
 
 
 def _errors_of(run: RunData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -328,10 +354,6 @@ def _wrapped(text: str, width: float) -> str:
     from matplotlib import rcParams
 
     return textwrap.fill(text, int(72 * width / (_LETTER * rcParams["axes.titlesize"])))
-
-
-def _repeated(styles: Sequence[str], count: int) -> list[str]:
-    return [styles[i % len(styles)] for i in range(count)]
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -14,7 +14,7 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import RunData, draw_map, position_errors, well_known
-from slam.run.plots import KINDS, _in_one_world, _stretch, read_runs
+from slam.run.plots import KINDS, _in_one_world, _stretch, plot, read_runs
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
@@ -41,7 +41,8 @@ def read_picture(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_figures_of_two_runs(runs, tmp_path, kind):
-    (file,) = plot_runs([runs / "a", runs / "b"], tmp_path / f"{kind}.png", kind)
+    ((file, caption),) = plot_runs([runs / "a", runs / "b"], tmp_path / f"{kind}.png", kind)
+    assert caption.startswith("aisle")
     picture = read_picture(file)
     assert min(picture.shape[:2]) > 200
     assert np.ptp(picture, axis=2).max() > 60  # there is colour in it
@@ -51,7 +52,7 @@ def test_figures_of_two_runs(runs, tmp_path, kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("width", [88, 180])
 def test_a_figure_is_as_wide_as_asked(runs, tmp_path, kind, width):
-    (file,) = plot_runs([runs / "a", runs / "b"], tmp_path / "a.png", kind, width)
+    ((file, _),) = plot_runs([runs / "a", runs / "b"], tmp_path / "a.png", kind, width)
     assert abs(read_picture(file).shape[1] - width / 25.4 * 300) <= 1
 
 
@@ -65,7 +66,7 @@ def test_formats_and_the_same_bytes_twice(runs, tmp_path, suffix, start):
 
 
 def test_runs_of_one_sequence_go_into_one_picture(runs):
-    files = plot_runs([runs / "a", runs / "desk", runs / "b"], None, "path")
+    files = [file for file, _ in plot_runs([runs / "a", runs / "desk", runs / "b"], None, "path")]
     assert files == [runs / "a" / "path.png", runs / "desk" / "path.png"]
     with pytest.raises(SlamError, match="runs of 2 sequences"):
         plot_runs([runs / "a", runs / "desk"], runs / "all.png", "path")
@@ -139,6 +140,18 @@ def test_ellipses_are_inside_of_the_map(runs):
 def test_a_pdf_is_named_after_its_sequence(runs, tmp_path):
     plot_runs([runs / "a"], tmp_path / "a.pdf", "path")
     assert b"/Title (aisle" in (tmp_path / "a.pdf").read_bytes()
+
+
+@pytest.mark.parametrize(("kind", "kept"), [("path", []), ("errors", []), ("time", []), ("map", ["ekf", "smoother"])])
+def test_a_figure_for_a_paper_has_its_titles_in_the_caption(runs, tmp_path, kind, kept):
+    own = read_runs([runs / "a", runs / "b"])[0]
+    caption = plot(own, tmp_path / "a.svg", kind)
+    assert caption == plot(own, tmp_path / "a.png", kind)
+    drawn = (tmp_path / "a.svg").read_text()
+    titles = [title.rstrip(".") for title in caption.split(". ")]
+    assert len(titles) > 1
+    assert not [title for title in titles if f"<!-- {title} -->" in drawn]
+    assert all(f"<!-- {name} -->" in drawn for name in kept)
 
 
 @pytest.mark.parametrize("across", [0, 1])

@@ -16,6 +16,7 @@ from slam.compare.paper import differences_table, latex, means_table, write_pape
 from slam.compare.report import conclusions, write_report
 from slam.compare.statistics import Verdict
 from slam.compare.tables import count_tests, groups, write_tables
+from slam.compare.wording import REPLAYED
 from tests.slam.compare.made_up import make, plan
 
 
@@ -98,6 +99,31 @@ def test_tables_for_latex(paper, three):
     assert "Holm's method over 7 tests" in differences_table(three[3][0], 7)
 
 
+@pytest.mark.parametrize(("trials", "columns"), [(1, "lrr"), (5, "lrr"), (6, "lrlrl")])
+def test_tables_hold_what_so_many_trials_can_say(tmp_path, trials, columns):
+    of = plan(trials)
+    group = groups(of, make(tmp_path, of))[0]
+    means, differences = means_table(group), differences_table(group, 7)
+    assert f"\\begin{{tabular}}{{{columns}}}" in means
+    assert ("\\begin{table*}" in means) == (len(columns) > 3)
+    assert means.count("\\begin{table") == means.count("\\end{table") == 1
+    assert ("one trial" in means, "standard deviation" in means) == (trials == 1, trials > 1)
+    assert ("interval" in means) == (trials > 5)
+    assert (differences == "") == (trials == 1)
+
+
+def test_long_names_of_sequences_go_on_in_the_next_line(tmp_path):
+    of = replace(plan(2), sequences=("synthetic:desk?frames=40&width=320",))
+    means = means_table(groups(of, make(tmp_path, of))[0])
+    assert "synthetic:\\allowbreak{}desk?\\allowbreak{}frames=\\allowbreak{}40\\&\\allowbreak{}width" in means
+
+
+def test_replays_say_why_their_covariances_are_smaller(three):
+    closed_loop, replay = conclusions(three[3])[:2]
+    assert REPLAYED not in closed_loop.honesty
+    assert REPLAYED in replay.honesty
+
+
 def test_latex_has_no_character_that_it_reads_otherwise():
     assert latex("a_b & 5 % #1 ~ ^ \\ {x} −3 × ≤") == (
         "a\\_b \\& 5 \\% \\#1 \\textasciitilde{} \\textasciicircum{} \\textbackslash{} \\{x\\} $-$3 $\\times$ $\\leq$"
@@ -164,8 +190,8 @@ def test_one_trial_says_that_it_proves_nothing(tmp_path):
     runs = make(tmp_path, of)
     every = groups(of, runs)
     found = conclusions(every)[0]
-    assert {line.verdict for line in found.headlines} <= {Verdict.SINGLE, Verdict.OPEN}
-    assert {line.badge for line in found.headlines} <= {"better: one trial", "worse: one trial", "open"}
+    assert {line.verdict for line in found.headlines} <= {Verdict.SINGLE, Verdict.OPEN, Verdict.EQUAL}
+    assert {line.badge for line in found.headlines} <= {"better: one trial", "worse: one trial", "open", "equal"}
     assert count_tests(every) > 0  # as many as more trials would have
     text = write_report(of, runs, tmp_path, "here").read_text()
     assert "One trial cannot tell a difference from chance" in text
@@ -197,3 +223,13 @@ def test_frames_of_all_runs_are_counted_once():
     assert task.completed == 22
     bar.frames(30)  # a worker died, and its frames were done twice
     assert task.completed == 30
+
+
+def test_the_rate_of_a_comparison_that_goes_on_is_that_of_its_own_frames(monkeypatch):
+    clock = iter([100.0, 101.0, 102.0])
+    monkeypatch.setattr(display.time, "monotonic", lambda: next(clock))
+    bar = display.SweepProgress([1000, 1000], quiet=True)
+    bar.kept(1000)
+    assert bar._bar.tasks[0].fields["rate"] == ""
+    bar.frames(30)
+    assert bar._bar.tasks[0].fields["rate"] == "30.0 Hz"

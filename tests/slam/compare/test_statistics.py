@@ -24,6 +24,7 @@ from slam.compare.wording import (
     caution,
     headline,
     honesty,
+    innovations,
     measurements,
     sentence,
     shown_p,
@@ -290,6 +291,27 @@ def test_a_headline_names_all_that_is_certain_in_both_directions_and_what_is_ope
     assert worse.startswith("smoother: RPE RMSE over 1 s ")
     assert "(+1" in worse
     assert rest == "smoother: landmark error median"
+
+
+def test_what_nobody_would_choose_by_is_no_headline_however_sure():
+    """97.4 % against 97.0 % in every trial is certain, and a trifle."""
+    reference = np.linspace(0.960, 0.966, 9)
+    lines = headline(adjusted([difference(PRECISION, reference, reference - 0.004)]), "smoother")
+    assert [(line.badge, line.text) for line in lines][:1] == [
+        ("equal", "smoother: less than 1 % apart: association precision")
+    ]
+    lines = headline(adjusted([difference(PRECISION, reference, reference - 0.04)]), "smoother")
+    assert lines[0].badge == "worse: certain"
+
+
+def test_a_nis_far_from_one_is_explained():
+    nan = float("nan")
+    low, high = innovations({"ekf": 0.22, "smoother": 1.0, "batch": 0.3, "mine": 7.0, "none": nan})
+    assert low.startswith("NIS per degree of freedom: ekf 0.22, batch 0.30, expected 1: predictions and measurements")
+    assert "better than assumed" in low
+    assert high.startswith("NIS per degree of freedom: mine 7.00, expected 1")
+    assert "worse than assumed" in high
+    assert innovations({"ekf": 1.0}) == []
 
 
 def test_a_headline_without_any_error_says_why():

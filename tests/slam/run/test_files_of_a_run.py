@@ -19,7 +19,7 @@ from slam.errors import SlamError
 from slam.files import RowFile, lock_folder, read_bytes, require_target, whole_file
 from slam.mapping.map_io import load_map
 from slam.run import runner
-from slam.run.outputs import RunFiles
+from slam.run.outputs import RunFiles, write_json
 from slam.run.recording import load_recording
 from slam.run.runner import RunOptions
 from tests.fuzz.runs import Scripted, _Frontend, disk_of, require_whole
@@ -33,6 +33,15 @@ def run(tmp_path, backend="ekf", error=None, at=0, **more):
 
 
 # --- single files ---
+
+
+def test_a_matrix_has_a_line_for_each_row(tmp_path):
+    tree = {"matrix": [[1.5, -2e-7], [None, 4]], "words": ["[\n1,\n2\n]", "b"], "empty": [], "one": [3]}
+    write_json(tmp_path / "a.json", tree)
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text) == tree
+    assert "    [1.5, -2e-07],\n    [null, 4]\n" in text
+    assert '"one": [3]' in text
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path):
