@@ -85,8 +85,8 @@ def create(role: str, name: str, rig: Any, **options: Any) -> Any:
     """
     what = role[:-1].replace("end", " end")
     made = resolve(role, name)
-    if "models" in options and options["models"] is None:
-        raise ConfigurationError(f"{what} {name!r}: models is None; give EstimatorModels, or leave it out")
+    if options.get("models", options) is None:  # as where a class hands on its own default
+        del options["models"]
     try:
         created = made(rig, **options)
     except SlamError:

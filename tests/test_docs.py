@@ -43,6 +43,13 @@ def pose_fit():
 
 
 @pytest.mark.slow
+def test_the_changed_filter_keeps_the_contract():
+    near_only = load_script("docs/examples/near_only.py").NearOnly
+    check_backend(near_only)
+    assert near_only(slam.open_sequence("synthetic:desk?frames=2").rig, least_disparity=3.0).least_disparity == 3.0
+
+
+@pytest.mark.slow
 def test_the_back_end_in_50_lines_is_one_and_follows_the_camera():
     lines = [line for line in (DOCS / "examples" / "pose_fit.py").read_text().splitlines() if line.strip()]
     assert len(lines) <= 50
@@ -137,7 +144,7 @@ def test_a_recording_as_the_guide_has_it_opens(tmp_path):
             cv2.imwrite(str(tmp_path / side / f"{k:06}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
     code = re.search(r"```python\n(import cv2\n\nfile = cv2.*?)```", (DOCS / "guide.md").read_text(), re.S).group(1)
     code = code.replace('"calibration.yaml"', repr(str(tmp_path / "calibration.yaml")))
-    exec(code, {"cv2": cv2, "M1": K, "D1": D, "M2": K, "D2": D, "R": np.eye(3), "T": np.array([-0.12, 0, 0])})
+    exec(code, {"cv2": cv2, "K1": K, "D1": D, "K2": K, "D2": D, "R": np.eye(3), "T": np.array([-0.12, 0, 0])})
     sequence = slam.open_sequence(f"{tmp_path}?fps=30")
     assert len(sequence) == 3
     assert sequence.rig.baseline == pytest.approx(0.12)

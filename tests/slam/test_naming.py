@@ -8,6 +8,8 @@ from slam import registry
 from slam.commands.compare import variants_of
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError, SlamError, UnknownNameError
+from slam.geometry.rig import StereoRig
+from slam.models import EstimatorModels
 from slam.naming import suggestion
 from slam.sequences import open_sequence
 
@@ -73,9 +75,9 @@ def test_a_back_end_by_its_module_in_the_working_folder(tmp_path, monkeypatch):
         registry.resolve("backends", "no_module_of_this_name:Mine")
 
 
-def test_models_may_be_left_out_but_are_never_none():
-    with pytest.raises(ConfigurationError, match="back end 'ekf': models is None; give EstimatorModels, or leave it"):
-        registry.create("backends", "ekf", "rig", models=None)
+def test_no_models_are_the_default_ones():
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
+    assert registry.create("backends", "ekf", rig, models=None).models == EstimatorModels()
 
 
 FOREIGN = """
