@@ -91,6 +91,11 @@ class KeptCalibration:
     rig: RigNumbers
     residual: float = 1.0
 
+    def __repr__(self) -> str:
+        r = self.rig
+        rig = f"{r.width:.0f}x{r.height:.0f}, focal length {r.focal:.1f} px, baseline {r.baseline:.4f} m"
+        return f"KeptCalibration({rig}; {self.posterior!r})"
+
     def require_fits(self, rig: StereoRig) -> None:
         """Raise if it is for another rig.
 

@@ -40,6 +40,11 @@ class RigPosterior:
         if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
             raise CalibrationError("calibration: mean and covariance must be finite")
 
+    def __repr__(self) -> str:
+        most = int(np.argmax(np.abs(self.mean) / self.sigma)) if len(self.names) else -1
+        text = f"; {self.names[most]} is {self.mean[most] / self.sigma[most]:+.1f} sigma" if most >= 0 else ""
+        return f"RigPosterior({len(self.names)} parameters{text})"
+
     @property
     def sigma(self) -> Array:
         """Standard deviations (n,)."""

@@ -39,7 +39,7 @@ def test_every_line_is_short_and_says_what_matters(sequence, system):
         for thing in (
             sequence, sequence.frame(0), sequence.rig, sequence.observations(0), system.estimate(), result,
             result.report, system.landmarks, system.trajectory(), system.snapshot(), prediction,
-            slam.Observations.empty(), system,
+            slam.Observations.empty(), system, system.calibration.kept(), system.calibration.kept().posterior,
         )
     }  # fmt: skip
     for name, text in shown.items():
