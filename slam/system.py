@@ -432,19 +432,24 @@ class StereoSlam:
 
         Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
         """
-        positions, state = self._positions(landmarks.ids), self._last.state
-        found = (
-            self._loop_closer.find(self.atlas, features, self.calibration.applied, index) if state.unmatched else None
+        positions, found = self._positions(landmarks.ids), None
+
+        def elsewhere() -> np.ndarray | None:
+            """Where the places of the atlas see the camera."""
+            nonlocal found
+            found = self._loop_closer.find(self.atlas, features, self.calibration.applied, index)
+            return None if found is None else found.T_odom_left
+
+        matches = self._localizer.localize(
+            prediction, landmarks, positions, features, self._last.state, index, elsewhere
         )
-        elsewhere = None if found is None else found.T_odom_left
-        matches = self._localizer.localize(prediction, landmarks, positions, features, state, index, elsewhere)
         if not matches.kidnapped:
             return landmarks, prediction, matches
         assert matches.T_world_left is not None
         if not self._relocalizer.can_restart(self.backend):
             return landmarks, prediction, LandmarkMatches.nothing()
         new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
-        if found is not None and matches.T_world_left is elsewhere:
+        if found is not None and matches.T_world_left is found.T_odom_left:
             landmarks = self._mapper.insert(new, landmarks, found.place)
             positions = new.positions(landmarks.ids)
         prediction, r = new.predict(features.stamp), self._relocalizer

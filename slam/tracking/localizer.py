@@ -5,6 +5,7 @@ The same for every back end: it gives predictions and positions, and gets matche
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,23 +91,26 @@ class Localizer:
         features: StereoFeatures,
         state: TrackingState,
         seed: int,
-        elsewhere: Array | None = None,
+        elsewhere: Callable[[], Array | None] = lambda: None,
     ) -> LandmarkMatches:
         """`match`, but poses farther from the prediction than it allows are not believed before several frames agree.
 
         None match meanwhile; then the matches have no landmarks but the pose, and are marked as `kidnapped`. So it is
-        with the pose `elsewhere` (4, 4), from places that the landmarks do not show, where nothing matches.
+        with a pose from the places of the atlas, which is asked for where nothing matches; but where the prediction
+        allows it and enough landmarks are found around it, it is believed at once.
         """
         doubtful = state.unmatched > 0
         matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
-        T, c = matches.T_world_left, self.config
-        if T is None and elsewhere is not None:
-            T = elsewhere
-        elif T is None or jump(prediction, T) <= (c.lost_jump if doubtful else c.max_jump):
+        T, farthest = matches.T_world_left, self.config.lost_jump if doubtful else self.config.max_jump
+        if T is None:
+            T = elsewhere()
+            if T is not None and jump(prediction, T) <= farthest:
+                matches = self.match_around(T, prediction, landmarks, positions, features, seed)
+        if T is None or (len(matches) and jump(prediction, T) <= farthest):
             self._hypotheses = PoseHypotheses()
             return matches
         self._hypotheses = self._hypotheses.after(T, features.stamp, self._models)
-        if self._hypotheses.count < c.kidnapped_after:
+        if self._hypotheses.count < self.config.kidnapped_after:
             return LandmarkMatches.nothing()
         self._hypotheses = PoseHypotheses()
         return replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
@@ -183,6 +187,23 @@ class Localizer:
             matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
             if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):
                 return LandmarkMatches.nothing()
+        return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
+
+    def match_around(
+        self,
+        T_world_left: Array,
+        prediction: Prediction,
+        landmarks: LandmarkRows,
+        positions: Array,
+        features: StereoFeatures,
+        seed: int,
+    ) -> LandmarkMatches:
+        """Landmarks that agree on a pose near a known one (4, 4), looked for in small windows; nothing where few do."""
+        expected = self._expected(T_world_left, prediction, landmarks, positions)
+        matches = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
+        consensus = self._consensus(matches, positions, features, T_world_left, seed)
+        if consensus.inliers.sum() < self.config.minimum_consistent:
+            return LandmarkMatches.nothing()
         return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
 
     def similar_view(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:

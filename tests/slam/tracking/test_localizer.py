@@ -1,0 +1,78 @@
+"""A place of the atlas that shows where the camera is, while the map alone does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.data import Prediction, StereoFeatures
+from slam.geometry import se3
+from slam.landmarks import LandmarkRows
+from slam.models import EstimatorModels
+from slam.tracking.association import AssociationConfig
+from slam.tracking.localizer import Localizer, jump
+from slam.tracking.state import TrackingState
+from tests.slam.scene import RIG, Cloud
+
+T_TRUE = se3.exp(np.array([0.02, 0.3, -0.01, 0.2, 0.05, 0.4]))
+
+
+def scene(frame: int = 0) -> tuple[LandmarkRows, np.ndarray, StereoFeatures]:
+    """Landmarks of which fifteen each look alike, their positions, and the features of a later frame."""
+    cloud = Cloud(150)
+    kind = np.arange(150) % 10
+    cloud.descriptors, cloud.laplacian = cloud.descriptors[kind], cloud.laplacian[kind]
+    start, ids = cloud.features(np.eye(4), 0.0)
+    landmarks = LandmarkRows.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
+    return landmarks, cloud.points[ids], cloud.features(T_TRUE, 1.0 + frame, 0.2)[0]
+
+
+def prediction(positions: np.ndarray, deviation: float, window: float) -> Prediction:
+    """The camera has hardly moved, so it seems; where landmarks are is known to within a window [px]."""
+    left, right = RIG.project(positions)
+    view = np.flatnonzero(RIG.left.in_image(left))
+    innovation = np.tile(window**2 * np.eye(2), (len(view), 1, 1))
+    return Prediction(1.0, np.eye(4), deviation**2 * np.eye(6), view, left[view], right[view], innovation)
+
+
+def localizer() -> Localizer:
+    return Localizer(RIG, AssociationConfig(), EstimatorModels(pixel_sigma=0.5))
+
+
+def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_it():
+    landmarks, positions, features = scene()
+    expected = prediction(positions, 0.2, 400.0)
+    assert jump(expected, T_TRUE) < AssociationConfig().max_jump
+    alone = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0)
+    assert not len(alone)
+    found = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE)
+    assert len(found) > 30
+    assert not found.kidnapped
+    assert np.abs(se3.log(se3.inverse(T_TRUE) @ found.T_world_left)).max() < 0.01
+
+
+@pytest.mark.parametrize("far", [True, False])
+def test_other_places_wait_for_several_frames(far):
+    """Far beyond what the prediction allows; or allowed, where no landmark is found."""
+    shift = se3.exp(np.array([0, 0, 0, 1.0, 0.8, 0])) if not far else np.eye(4)
+    own = localizer()
+    for frame in range(AssociationConfig().kidnapped_after):
+        landmarks, positions, features = scene(frame)
+        expected = prediction(positions, 0.2 if not far else 0.005, 400.0)
+        assert (jump(expected, T_TRUE @ shift) > AssociationConfig().max_jump) == far
+        found = own.localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE @ shift)
+        assert not len(found)
+        assert found.kidnapped == (frame == AssociationConfig().kidnapped_after - 1)
+
+
+def test_places_are_not_asked_for_where_landmarks_are_found():
+    cloud = Cloud(150)
+    features, ids = cloud.features(np.eye(4), 0.0)
+    landmarks = LandmarkRows.empty(32).with_new(0, np.arange(len(ids)), features, np.arange(len(ids)))
+
+    def never() -> np.ndarray:
+        raise AssertionError
+
+    expected = prediction(cloud.points[ids], 0.01, 5.0)
+    found = localizer().localize(expected, landmarks, cloud.points[ids], features, TrackingState(), 0, never)
+    assert len(found) > 50
