@@ -2,12 +2,13 @@
 
     SLAM_DATA=/path/to/data python experiments/perturbations.py [--quick] [--trials N] [--frames N] [--out DIR]
 
-As single figures of SLAM say little, each drive is run several times, with another first frame, pixel noise of half a
-grey level, and up to 20 % more or fewer features; both back ends get the same features. Two of the drives are run with
-spoilt images as well: unequal exposure, noise, flicker, half the frame rate, a vertical error of the right camera.
-Prints two Markdown tables: medians and quartiles of the online ATE of the first frames of a drive, and frames without a
-measured pose, all trials together. The rows are written as they come. A trial of everything takes some four minutes of
-processor time, of which half is the front end's.
+As single figures of SLAM say little, each drive is run several times, with another first frame, pixel noise of half
+a grey level, and up to 20 % more or fewer features; both back ends get the same features. The drives are also run
+in a mirror and backwards, which are drives that nobody has chosen a number on. Two of them are run with spoilt
+images: unequal exposure, noise, flicker, half the frame rate, a vertical error of the right camera. Prints Markdown
+tables: medians and quartiles of the online ATE of the first frames of a drive, and frames without a measured pose,
+all trials together. The rows are written as they come. A trial of everything takes some six minutes of processor
+time, of which half is the front end's.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.evaluation.summary import evaluate
+from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
@@ -114,6 +116,56 @@ FAULTS = (
 
 
 @dataclass(frozen=True)
+class Drive:
+    """What a drive is for a run.
+
+    Attributes:
+        kind: of motion.
+        rig: the cameras.
+        ground_truth: true path of the left one; None where it is not known.
+        frames: from a number up to, but without, another.
+    """
+
+    kind: str
+    rig: StereoRig
+    ground_truth: Trajectory | None
+    frames: Callable[[int, int], Iterator[StereoFrame]]
+
+
+def mirrored(drive: Sequence) -> Drive:
+    """A rectified drive in a mirror: the right camera is the left one, and what was right is left."""
+    rig, truth = drive.rig, drive.ground_truth
+    u0 = rig.width - 1 - rig.right.u0
+    mirror, right = np.diag([-1.0, 1.0, 1.0, 1.0]), np.eye(4)
+    right[0, 3] = rig.baseline
+
+    def frames(start: int, stop: int) -> Iterator[StereoFrame]:
+        for frame in drive.frames(start, stop):
+            if frame.right is not None:
+                yield replace(frame, left=frame.right[:, ::-1], right=frame.left[:, ::-1])
+
+    return Drive(
+        drive.kind,
+        StereoRig.rectified_pair(rig.left.fu, u0, rig.left.v0, rig.baseline, rig.width, rig.height),
+        None if truth is None else replace(truth, poses=mirror @ truth.poses @ right @ mirror),
+        frames,
+    )
+
+
+def backwards(drive: Sequence, last: int) -> Drive:
+    """A drive in reverse gear, from the frame before `last`, or its own last one, to the first."""
+    end, truth = min(last, len(drive)), drive.ground_truth
+
+    def frames(start: int, stop: int) -> Iterator[StereoFrame]:
+        for index in range(start, min(stop, end)):
+            (frame,) = drive.frames(end - 1 - index, end - index)
+            yield replace(frame, index=index, stamp=-frame.stamp)
+
+    turned = None if truth is None else replace(truth, stamps=-truth.stamps[::-1], poses=truth.poses[::-1])
+    return Drive(drive.kind, drive.rig, turned, frames)
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Of one run.
 
@@ -128,7 +180,7 @@ class Outcome:
     lost: int
 
 
-def frames_of(sequence: Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
+def frames_of(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -> Iterator[StereoFrame]:
     """The frames of one trial; no frame depends on which others are taken."""
     first = np.random.default_rng(trial).integers(_FIRST)
     for frame in sequence.frames(int(first), last):
@@ -140,7 +192,7 @@ def frames_of(sequence: Sequence, fault: Fault, last: int, trial: int) -> Iterat
         yield replace(frame, left=left, right=right)
 
 
-def extracted(sequence: Sequence, fault: Fault, last: int, trial: int) -> list[StereoFeatures]:
+def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -> list[StereoFeatures]:
     """Features of one trial, for all back ends."""
     options = SystemConfig.for_kind(sequence.kind).frontend
     plain = create("surf", sequence.rig, **options)
@@ -149,7 +201,7 @@ def extracted(sequence: Sequence, fault: Fault, last: int, trial: int) -> list[S
     return [frontend.extract(frame) for frame in frames_of(sequence, fault, last, trial)]
 
 
-def run(sequence: Sequence, features: list[StereoFeatures], backend: str) -> Outcome:
+def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str) -> Outcome:
     """One back end on one trial."""
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, "surf", backend))
     results = [system.process_features(one) for one in features]
@@ -159,7 +211,7 @@ def run(sequence: Sequence, features: list[StereoFeatures], backend: str) -> Out
     return Outcome(float("nan") if ate is None else float(ate), len(results), len(results) - len(measured))
 
 
-def figures(fault: Fault, sequence: Sequence, last: int, trials: int) -> list[object]:
+def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) -> list[object]:
     """The figures of a row, in the order of `FIGURES`."""
     outcomes: dict[str, list[Outcome]] = {backend: [] for backend in BACKENDS}
     for trial in range(trials):
@@ -181,12 +233,19 @@ def quartiles(values: list[float]) -> str:
     return f"{middle:.3f}{missing}" if len(values) == 1 else f"{middle:.3f} ({low:.3f}–{high:.3f}){missing}"
 
 
-def table(faults: tuple[Fault, ...], places: dict[str, Path], last: int, trials: int, out: Path) -> str:
+def table(
+    faults: tuple[Fault, ...],
+    places: dict[str, Path],
+    last: int,
+    trials: int,
+    out: Path,
+    opened: Callable[[Path], Drive | Sequence] = open_sequence,
+) -> str:
     """Run all faults on all drives; the table, which is written to `out` row by row."""
     header, rows = ("images", "drive", *FIGURES), []
     for fault in faults:
         for name, folder in places.items():
-            rows.append([fault.name, name, *figures(fault, open_sequence(folder), last, trials)])
+            rows.append([fault.name, name, *figures(fault, opened(folder), last, trials)])
             print(rows[-1], file=sys.stderr, flush=True)
             write_json(out, header, rows)
     return markdown(header, rows, 2)
@@ -207,8 +266,14 @@ def main() -> int:
         found = dict(list(found.items())[:1])
     print(f"Medians and quartiles of {trials} runs of the first {frames} frames, the images as they are:\n")
     print(table((NONE,), found, frames, trials, arguments.out / "drives.json"))
+    for way, opened in (
+        ("in a mirror", lambda folder: mirrored(open_sequence(folder))),
+        ("backwards", lambda folder: backwards(open_sequence(folder), frames)),
+    ):
+        print(f"\nThe same {way}:\n")
+        print(table((NONE,), found, frames, trials, arguments.out / f"{way.replace(' ', '_')}.json", opened))
     spoilt_drives = {name: folder for name, folder in found.items() if name in SPOILT}
-    print("\nThe same with spoilt images:\n")
+    print("\nThe drives as they are, with spoilt images:\n")
     print(table(faults, spoilt_drives, frames, trials, arguments.out / "spoilt.json"))
     return 0
 
