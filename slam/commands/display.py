@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -101,14 +102,14 @@ class SweepProgress:
             BarColumn(bar_width=10),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=Console(stderr=True),
             disable=quiet,
         )
         self._runs, self._ended, self._ended_frames, self._counted, self._before = len(frames), 0, 0, 0, 0
         self._round = 0  # frames that were counted in scheduler calls that are over
         self._began = time.monotonic()
-        self._task = self._bar.add_task("", total=sum(frames), runs=f"0/{self._runs}", rate="")
+        self._task = self._bar.add_task("", total=sum(frames), runs=f"0/{self._runs}", rate="", left="")
 
     def __enter__(self) -> SweepProgress:
         self._bar.start()
@@ -142,9 +143,13 @@ class SweepProgress:
         done = max(self._ended_frames, self._before + self._round + self._counted)
         task = self._bar.tasks[0]
         own = done - self._before  # what was kept took no time now
-        rate = f"{own / (time.monotonic() - self._began):.1f} Hz" if own > 0 else ""
+        total = task.total or 0
+        rate = left = ""
+        if own > 0:
+            speed = own / (time.monotonic() - self._began)
+            rate, left = f"{speed:.1f} Hz", str(timedelta(seconds=round(max(total - done, 0) / speed)))
         runs = f"{self._ended}/{self._runs}"
-        self._bar.update(self._task, completed=min(done, task.total or 0), runs=runs, rate=rate)
+        self._bar.update(self._task, completed=min(done, total), runs=runs, rate=rate, left=left)
 
 
 #: Colours of badges, by direction.

@@ -22,13 +22,14 @@ from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import widths
-from slam.run.style import COLOURS, DASHES, repeated, stage_colour, stage_name, stages
+from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_MOST_TICKS = 15
 _WIDTH = 5.2  # [inch] about that of a phone: text stays readable where the picture fills the screen
 
 
@@ -58,15 +59,15 @@ def pictures(group: Group) -> list[Picture]:
     known = {metric.key: metric for metric in group.metrics}
     main = known.get("ate_online_m") or known.get("gps_m")
     found = [Picture("paths", "Paths from above", f"Paths from above, seed {seed}.", partial(draw_paths, group))]
-    if main is not None:
+    if main is not None and group.trials > 1:
         text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
         found.insert(0, Picture("trials", main.label, text, partial(draw_pairs, group, main)))
     if "nees_per_dof" in known:
         text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims (shaded)."
         found.append(Picture("errors", "Error over time", text, partial(draw_errors, group)))
         text = (
-            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and an honest estimator is in "
-            "the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
+            "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
+            "estimator is in the shaded band 95 % of the time. Above it, errors are larger than the covariances claim."
         )
         found.append(Picture("nees", "NEES over time", text, partial(draw_nees, group)))
     text = "Time per frame by stage, median of the trials, one thread; it depends on the machine."
@@ -75,7 +76,7 @@ def pictures(group: Group) -> list[Picture]:
 
 def colours(group: Group) -> dict[str, str]:
     """A colour per back end."""
-    return {backend: COLOURS[i % len(COLOURS)] for i, backend in enumerate(group.runs)}
+    return dict(zip(group.runs, backend_colours(list(group.runs))))
 
 
 def example(group: Group) -> dict[str, Run]:
@@ -113,18 +114,20 @@ def paths(run: Run) -> tuple[Trajectory, Trajectory | None]:
 
 
 def draw_pairs(group: Group, metric: Metric) -> Figure:
-    """Each trial's value by back end, pairs joined by a line: whether the differences are of one sign."""
+    """Each trial's values, those of the back ends side by side and joined: whether the differences are of one sign."""
     figure, axis = _axes(2.6)
-    names = list(group.runs)
-    values = np.array([metric.scale * group.values(name, metric.key) for name in names])
-    axis.plot(range(len(names)), values, color="0.7", lw=1, zorder=1)
-    for i, colour in enumerate(colours(group).values()):
-        axis.plot(np.full(values.shape[1], i), values[i], "o", color=colour, ms=5, alpha=0.8)
-    axis.set_xticks(range(len(names)), names)
-    axis.set_xlim(-0.5, len(names) - 0.5)
-    axis.set_ylabel(metric.title)
+    values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
+    backends, trials = values.shape
+    x = np.arange(1, trials + 1) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
+    axis.plot(x, values, color="0.7", lw=1, zorder=1)
+    for at, value, (name, colour) in zip(x, values, colours(group).items()):
+        axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
+    axis.set_xlim(0.5, trials + 0.5)
+    axis.set_xticks(range(1, trials + 1, -(-trials // _MOST_TICKS)))
+    axis.set(xlabel="trial", ylabel=metric.title)
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
-    axis.set_ylim(0 if low < 0.5 * high else low - 0.2 * (high - low), high + 0.1 * (high - min(low, 0.5 * high)))
+    axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
+    _legend_above(axis)
     return figure
 
 
@@ -156,7 +159,7 @@ def draw_errors(group: Group) -> Figure:
             band = 300 * s[f"sd_{c}"]
             axis.fill_between(t, -band, band, color=colour, alpha=0.13, lw=0)
             for side in (-1, 1):  # an outline each: where bands lie over each other their colours mix
-                axis.plot(t, side * band, color=colour, alpha=0.7, lw=0.6, ls=dashes)
+                axis.plot(t, side * band, color=colour, alpha=0.7, lw=0.6 * width, ls=dashes)
             axis.plot(t, 100 * s[f"error_{c}"], color=colour, lw=width, label=name)
     for axis, label in zip(axes, ("right", "down", "forward")):
         axis.axhline(0, color="0.6", lw=0.5)
@@ -183,14 +186,16 @@ def draw_nees(group: Group) -> Figure:
         axis.plot(t, nees.mean(axis=0).filled(np.nan) / 6, color=colours(group)[name], lw=1.2, label=name)
     axis.axhline(1, color="0.3", lw=0.8, ls="--", label="expected")
     low, high = chi_square_band(6, fewest)
-    axis.axhspan(low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % of honest means of {fewest}")
+    axis.axhspan(
+        low / 6, high / 6, color="0.6", alpha=0.3, lw=0, label=f"95 % band if consistent, mean of {_count(fewest)}"
+    )
     axis.set_yscale("log")
     bottom, top = axis.get_ylim()
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top > 10 * bottom else (0.6, 0.8, 1, 1.5, 2, 3, 4)))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter("")
     axis.set(xlabel="time [s]", ylabel="NEES / 6")
-    _legend_above(axis, 3)
+    _legend_above(axis, 2)
     return figure
 
 
@@ -265,6 +270,10 @@ _STYLE: Mapping[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+
+
+def _count(trials: int) -> str:
+    return "1 trial" if trials == 1 else f"{trials} trials"
 
 
 def _legend_above(axis: Any, columns: int = 4) -> None:

@@ -21,7 +21,10 @@ TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
 
 _HEAD = "% Written by slam compare. Needs: \\usepackage{{{}}}\n"
 
-_NARROW = 3  # columns that fit into one of a page's two columns
+_COLUMN = 237.0  # [pt] of a page that has two, in usual classes
+_TEXT = {"\\small": 4.3, "\\footnotesize": 3.95}  # [pt] mean width of a letter, measured
+_GAP = 8.0  # [pt] between columns
+_INTERVALS = 2  # back ends whose intervals a page has room for
 
 #: What LaTeX reads otherwise, and what older engines lack.
 _LATEX = str.maketrans(
@@ -35,21 +38,24 @@ _LATEX = str.maketrans(
 
 
 def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
-    """Write ``tables.tex`` (package booktabs), ``figures.tex`` (graphicx) and the pictures as ``figures/*.pdf``.
+    """Write ``tables.tex`` (booktabs, graphicx), ``figures.tex`` (graphicx) and the pictures as ``figures/*.pdf``.
 
     Every caption says which measurements the back ends were given. Only ``figures/*_time.pdf`` depends on the machine.
     """
     every = groups(plan, runs)
     tests = count_tests(every)
     tables = [table for group in every for table in (means_table(group), differences_table(group, tests)) if table]
-    write_text(out / TABLES, _HEAD.format("booktabs") + "\n" + "\n".join(tables))
+    write_text(out / TABLES, _HEAD.format("booktabs,graphicx") + "\n" + "\n".join(tables))
     (out / FOLDER).mkdir(exist_ok=True)
     shown = [text for group in every for text in _figures(group, out / FOLDER)]
     write_text(out / FIGURES, _HEAD.format("graphicx") + "\n" + "\n".join(shown))
 
 
 def means_table(group: Group) -> str:
-    """Mean, standard deviation and confidence interval of every figure of each back end; of one trial its figures."""
+    """Mean, standard deviation and confidence interval of every figure of each back end; of one trial its figures.
+
+    There are no intervals of fewer than `FEWEST` trials, nor of more than two back ends, for which a page has no room.
+    """
     names, label = list(group.runs), f"tab:{_label(group)}_means"
     if group.trials == 1:
         rows = [[latex(m.title), *(_value_cell(group, name, m) for name in names)] for m in group.shown]
@@ -57,7 +63,7 @@ def means_table(group: Group) -> str:
         return _table("l" + "r" * len(names), ["figure", *map(latex, names)], rows, caption, label)
     rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.shown]
     spread = f"{_what(group)}: mean $\\pm$ standard deviation over {_trials(group)}"
-    if group.trials < FEWEST:
+    if not _has_intervals(group):
         head, caption = ["figure", *map(latex, names)], f"{spread}. {_given(group)}."
         return _table("l" + "r" * len(names), head, rows, caption, label)
     level = f"{round(100 * LEVEL)} \\%"
@@ -115,26 +121,43 @@ def _figures(group: Group, folder: Path) -> Iterable[str]:
 
 
 def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str) -> str:
-    """A table; a wide one goes over both columns of a page that has two."""
-    kind, size = ("table*", "\\footnotesize") if len(columns) > _NARROW else ("table", "\\small")
+    """A table as large as its column has room for; a wide one goes over both columns of a page that has two.
+
+    Where even a page is narrower, the table is made smaller.
+    """
+    cells = [" & ".join(row).split(" & ") for row in (head, *rows)]
+    letters = sum(max(map(_letters, column)) for column in zip(*cells))
+    fits = [size for size, letter in _TEXT.items() if letter * letters + _GAP * len(columns) < _COLUMN]
+    kind, size = ("table", fits[0]) if fits else ("table*", "\\footnotesize")
     lines = [" & ".join(row) + " \\\\" for row in rows]
     return "\n    ".join(
         [
             f"\\begin{{{kind}}}\n  \\centering\n  {size}\n  \\setlength{{\\tabcolsep}}{{4pt}}\n"
-            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n  \\begin{{tabular}}{{{columns}}}",
+            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n"
+            f"  \\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n"
+            f"  \\begin{{tabular}}{{{columns}}}",
             "\\toprule",
             " & ".join(head) + " \\\\",
             "\\midrule",
             *lines,
-            f"\\bottomrule\n  \\end{{tabular}}\n\\end{{{kind}}}\n",
+            f"\\bottomrule\n  \\end{{tabular}}}}\n\\end{{{kind}}}\n",
         ]
     )
+
+
+def _letters(cell: str) -> int:
+    """How many letters wide a cell is, about."""
+    return len(re.sub(r"\\[a-z]+(\{\})?|[\\${}]", lambda found: "" if found[0] in "\\${}" else "+", cell))
 
 
 def _value_cell(group: Group, backend: str, metric: Metric) -> str:
     """The figure of the one trial."""
     value = metric.scale * mean_figures(group.finite(backend, metric.key))[0]
     return f"${value:.{decimals(value)}f}$" if np.isfinite(value) else "--"
+
+
+def _has_intervals(group: Group) -> bool:
+    return group.trials >= FEWEST and len(group.runs) <= _INTERVALS
 
 
 def _trials(group: Group) -> str:
@@ -146,11 +169,11 @@ def _trials(group: Group) -> str:
 def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
     mean, sd, low, high = (metric.scale * x for x in mean_figures(group.finite(backend, metric.key)))
     if not np.isfinite(mean):
-        return "-- & --" if group.trials >= FEWEST else "--"
+        return "-- & --" if _has_intervals(group) else "--"
     digits = decimals(mean)
     shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
     spread = f"{shown[0]} $\\pm$ {shown[1]}" if np.isfinite(sd) else shown[0]
-    if group.trials < FEWEST:
+    if not _has_intervals(group):
         return spread
     return f"{spread} & [{shown[2]}, {shown[3]}]" if np.isfinite(low) else f"{spread} & --"
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from slam.compare import figures
 from slam.compare.measure import COMPLETED, Metric, number
-from slam.compare.plan import REPLAY, Plan
+from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan
 from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures
 from slam.compare.wording import (
-    REPLAYED,
     STRENGTH,
     WORDS,
     Line,
@@ -30,6 +29,7 @@ from slam.compare.wording import (
     honesty,
     innovations,
     measurements,
+    replayed,
     sentence,
     shown_interval,
     shown_mean,
@@ -38,6 +38,7 @@ from slam.compare.wording import (
     worth_saying,
 )
 from slam.files import read_object, write_text
+from slam.run.style import stage_name, stages
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
@@ -107,7 +108,7 @@ class Conclusions:
 
 def conclusions(every: Sequence[Group]) -> list[Conclusions]:
     """What can be said, group by group."""
-    return [_conclusions(group) for group in every]
+    return [_conclusions(group, every) for group in every]
 
 
 def most_trials(every: Sequence[Group]) -> int:
@@ -115,7 +116,7 @@ def most_trials(every: Sequence[Group]) -> int:
     return max(group.trials for group in every)
 
 
-def _conclusions(group: Group) -> Conclusions:
+def _conclusions(group: Group, every: Sequence[Group]) -> Conclusions:
     first, *others = group.runs
     compared = [group.differences(metric) for metric in group.metrics]
     headlines: list[Line] = []
@@ -125,18 +126,27 @@ def _conclusions(group: Group) -> Conclusions:
         headlines += headline(own, other)
         sentences += [sentence(d, first, other) for d in own if worth_saying(d)]
     failed = failures({b: group.failures(b) for b in group.runs}, group.trials)
-    return Conclusions(_name(group), failed, headlines, sentences, _honesty(group))
+    return Conclusions(_name(group), failed, headlines, sentences, _honesty(group, every))
 
 
-def _honesty(group: Group) -> list[str]:
-    """Whether each back end's covariances hold."""
+def _honesty(group: Group, every: Sequence[Group]) -> list[str]:
+    """Whether each back end's covariances hold, and what the figures that say so mean."""
     means = {
         metric.key: {b: mean_figures(group.finite(b, metric.key))[0] for b in group.runs} for metric in group.metrics
     }
     lines = honesty({key: values for key, values in means.items() if key.startswith("nees")}, group.trials)
-    if lines and group.mode == REPLAY:
-        lines.append(REPLAYED)
-    return lines + innovations(means.get("nis_per_dof", {}))
+    return lines + _why_replays_differ(group, every) + innovations(means.get("nis_per_dof", {}))
+
+
+def _why_replays_differ(group: Group, every: Sequence[Group]) -> list[str]:
+    """A sentence where a replay's covariances are smaller than those of the closed loop that it replays."""
+    own = (group.sequence, group.variant, CLOSED_LOOP)
+    before = next((other for other in every if (other.sequence, other.variant, other.mode) == own), None)
+    if group.mode != REPLAY or before is None:
+        return []
+    first = next(iter(group.runs))
+    nees = [{m.key: mean_figures(g.finite(first, m.key))[0] for m in g.metrics} for g in (before, group)]
+    return [text for text in [replayed(first, *nees)] if text]
 
 
 def _name(group: Group) -> str:
@@ -154,7 +164,7 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
         sections.append(
             {
                 "title": f"{first.sequence}{variant}",
-                "tables": [_table(group) for group in own],
+                "tables": [_table(group, own) for group in own],
                 "pictures": _pictures(first),
                 "given": measurements(first.mode, plan.backends[0]),
                 "map": figures.map_data(first) if figures.example(first) else None,
@@ -163,7 +173,7 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
     return sections
 
 
-def _table(group: Group) -> dict[str, Any]:
+def _table(group: Group, every: Sequence[Group]) -> dict[str, Any]:
     first = next(iter(group.runs))
     reasons = {
         f"{b}, seed {r.trial.seed}: {r.outcome.removeprefix('failed: ')}"
@@ -174,7 +184,7 @@ def _table(group: Group) -> dict[str, Any]:
     return {
         "title": f"{measurements(group.mode, first)}",
         "rows": [_row(group, metric, group.differences(metric)) for metric in group.shown],
-        "honesty": _honesty(group),
+        "honesty": _honesty(group, every),
         "sentences": [sentence(d, first, b) for m in group.shown if m.better for b, d in group.differences(m).items()],
         "reasons": sorted(reasons),
     }
@@ -215,18 +225,18 @@ def _pictures(group: Group) -> list[dict[str, str]]:
 
 
 def _times(every: Sequence[Group]) -> dict[str, Any]:
-    """Stages, and a row of medians per group and back end."""
+    """What the stages do, and a row of medians per group and back end."""
     runs = [run for group in every for rs in group.runs.values() for run in rs]
-    stages = [*dict.fromkeys(stage for run in runs for stage in run.milliseconds if stage != "total"), "total"]
+    known = [*stages(stage for run in runs for stage in run.milliseconds), "total"]
     rows = []
     for group in every:
         for backend, own in group.runs.items():
             cells = []
-            for stage in stages:
+            for stage in known:
                 values = [run.milliseconds[stage] for run in own if stage in run.milliseconds]
                 cells.append(f"{np.median(values):.2f}" if values else "–")
             rows.append((group.sequence, group.variant.name, group.mode, backend, *cells))
-    return {"stages": stages, "times": rows}
+    return {"stages": [*map(stage_name, known[:-1]), "whole frame"], "times": rows}
 
 
 def _run_keys(runs: Sequence[Run]) -> list[str]:

@@ -33,17 +33,17 @@ STRENGTH = {
 }
 _VERB = {Verdict.CERTAIN: "is", Verdict.LIKELY: "seems", Verdict.HINT: "seems", Verdict.SINGLE: "was"}
 
-#: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
+_MISSING = 0.5  # of what the smaller of two shares lacks: with a larger difference, nearly all is not as good as all
 
 _SMOOTHER, _ROUGHER = 0.5, 2.0  # NIS per degree of freedom beyond which a sentence says what it means
 
+#: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
 _HONESTY = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof")
 
 
-#: Why covariances of a replay are smaller than those of a closed loop.
-REPLAYED = (
-    "In a replay the covariances are the back ends' own. Those of a closed loop also hold what is not known of the "
+_REPLAYED = (
+    "in a replay the covariances are the back ends' own; those of a closed loop also hold what is not known of the "
     "rig's calibration, so they are larger."
 )
 
@@ -104,8 +104,14 @@ def headline(differences: Sequence[Difference], other: str) -> list[Line]:
 
 
 def is_trifle(d: Difference) -> bool:
-    """Whether two means are so near that nobody would choose by them, however sure their difference is."""
-    return abs(d.other - d.reference) < _TRIFLE * max(abs(d.reference), abs(d.other))
+    """Whether two means are so near that nobody would choose by them, however sure their difference is.
+
+    Of shares, such as that of tracked frames, what they lack has to be nearly the same, too: 99.2 % is not all.
+    """
+    apart, larger = abs(d.other - d.reference), max(abs(d.reference), abs(d.other))
+    if d.metric.better == "higher" and d.metric.unit == "%" and _shown(d, d.reference) != _shown(d, d.other):
+        return bool(apart < _TRIFLE * larger and apart < _MISSING * (1 - min(d.reference, d.other)))
+    return bool(apart < _TRIFLE * larger or _shown(d, d.reference) == _shown(d, d.other))
 
 
 def sentence(d: Difference, reference: str, other: str) -> str:
@@ -152,6 +158,23 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
             f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
         )
     return lines
+
+
+def replayed(backend: str, closed: dict[str, float], replay: dict[str, float]) -> str:
+    """Why the covariances of a replay are smaller than those of the closed loop; empty where they are not.
+
+    Args:
+        backend: the one whose closed loop is replayed, so that the measurements of both are the same.
+        closed: its mean NEES there, by key of the figure; NaN where there is none.
+        replay: that of the replay.
+    """
+    for key in _HONESTY:
+        before, now = closed.get(key, np.nan), replay.get(key, np.nan)
+        if np.isfinite(before + now):
+            if now - before < _TRIFLE * now:
+                return ""
+            return f"NEES / 6 of {backend} is {_digits(now)}, and {_digits(before)} in its closed loop: {_REPLAYED}"
+    return ""
 
 
 def innovations(nis: dict[str, float]) -> list[str]:
@@ -314,8 +337,12 @@ def _brief(d: Difference) -> str:
     share = ""
     if d.metric.better == "lower" and d.reference > 0:
         share = f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    values = [shown_spread(d.metric, value, np.nan)[0] for value in (d.reference, d.other)]
-    return f"{_name(d.metric)} {' → '.join(values)}{unit}{share}"
+    return f"{_name(d.metric)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{share}"
+
+
+def _shown(d: Difference, value: float) -> str:
+    """One of its two means as headlines print it."""
+    return shown_spread(d.metric, value, np.nan)[0]
 
 
 def _less(d: Difference) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +17,13 @@ from slam.files import read_object, read_text
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.run.schema import STAGES
-from slam.run.style import COLOURS
+from slam.run.style import backend_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
+_CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
 
 
@@ -155,16 +157,16 @@ def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
 def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
     """Top view (right, forward) of each run: landmarks red if seen in the last frame, else green (paper A, Fig. 6)."""
     figure, axes = _figure(len(runs), (6.4, 6.0))
-    for axis, run in zip(axes, runs):
-        draw_map(axis, run, truth)
+    for axis, run, colour in zip(axes, runs, backend_colours([run.backend for run in runs])):
+        draw_map(axis, run, truth, colour)
         axis.set(title=run.name)
-        _draw_end(axis, run.online, truth)
-    axes[-1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
+        _draw_end(axis, run.online, truth, colour)
+    axes[-1].legend(*_named_once(axes), loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
     _save(figure, path)
 
 
-def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
-    """The map from above, the path, and the 2σ ellipses of the landmarks that are well known."""
+def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) -> None:
+    """The map from above, the path in a colour, and the 2σ ellipses of the landmarks that are well known."""
     from matplotlib.collections import EllipseCollection
 
     plane = run.covariances[:, [0, 2]][:, :, [0, 2]]
@@ -172,15 +174,15 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
     width = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     known = np.isin(np.arange(len(run.positions)), well_known(run))  # the others would cover these
-    for rows, colour, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
+    for rows, shade, label in ((~run.seen_last, _UNSEEN, "not seen now"), (run.seen_last, _SEEN, "seen now")):
         sure = rows & known
         ellipses = EllipseCollection(
             width[sure, 1], width[sure, 0], angle[sure], units="xy", offsets=run.positions[sure][:, [0, 2]],
-            offset_transform=axis.transData, facecolors="none", edgecolors=colour, linewidths=0.8,
+            offset_transform=axis.transData, facecolors="none", edgecolors=shade, linewidths=0.8,
         )  # fmt: skip
         axis.add_collection(ellipses)
-        axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=colour, label=f"landmarks {label}")
-    draw_path(axis, run, run.online, "path", color=COLOURS[0], lw=3, alpha=0.6)
+        axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=shade, label=f"landmarks {label}")
+    draw_path(axis, run, run.online, f"path of {run.name}", color=colour, lw=3, alpha=0.6)
     draw_loops(axis, run)
     _draw_truth(axis, run.online, truth, (0, 2))
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
@@ -199,11 +201,11 @@ def draw_loops(axis: Axes, run: RunData) -> None:
     """The path that loops have corrected, from above, its keyframes, and the places where loops were found."""
     final = run.final.positions[:, [0, 2]]
     if len(run.loops):
-        axis.plot(*final.T, color=COLOURS[2], lw=1.5, label="path, corrected by loops")
-        axis.plot(*final[run.keyframes].T, ".", ms=3, color=COLOURS[2], label="keyframes")
-        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=COLOURS[1], label="loops closed")
+        axis.plot(*final.T, color=_CORRECTED, lw=1.5, label="path, corrected by loops")
+        axis.plot(*final[run.keyframes].T, ".", ms=3, color=_CORRECTED, label="keyframes")
+        axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_CLOSED, label="loops closed")
     if len(run.refused):
-        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=COLOURS[3], label="loops refused")
+        axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=_REFUSED, label="loops refused")
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
@@ -223,7 +225,9 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
             colour = _SEEN if run.seen_last[row] else _UNSEEN
             axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
         p = run.online.positions
-        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=COLOURS[0], lw=1.5, label="path")
+        axis.plot(
+            p[:, 0], p[:, 2], -p[:, 1], color=backend_colours([run.backend])[0], lw=1.5, label=f"path of {run.name}"
+        )
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
         axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
@@ -233,10 +237,16 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     _, low, _, high = _ink(figure)
     for axis, run in zip(figure.axes, runs):
         figure.text(axis.get_position().x0 + axis.get_position().width / 2, high, run.name, ha="center", va="bottom")
-    shown = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*shown, loc="upper center", bbox_to_anchor=(0.5, low), ncols=3, fontsize=8, frameon=False)
+    shown = _named_once(figure.axes)
+    figure.legend(*shown, loc="upper center", bbox_to_anchor=(0.5, low), ncols=4, fontsize=8, frameon=False)
     corners = np.reshape(_ink(figure), (2, 2)) * figure.get_size_inches()
     _save(figure, path, bbox_inches=Bbox(corners).padded(0.1))
+
+
+def _named_once(axes: Sequence[Any]) -> tuple[list[Any], list[str]]:
+    """What a legend for several panels has: handles and labels, each label once."""
+    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels())}
+    return list(found.values()), list(found)
 
 
 def _ink(figure: Any) -> tuple[float, float, float, float]:
@@ -276,7 +286,7 @@ def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, compon
     axis.plot(*aligned.positions[:, list(components)].T, "--", color=_TRUTH, lw=1.2, label="true path")
 
 
-def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
+def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None, colour: str) -> None:
     """The end of the path in an inset, large enough to tell it from the true path."""
     if truth is None or len(online) < 3:
         return
@@ -285,7 +295,7 @@ def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None) -> None:
     error = float(np.linalg.norm((align(true, own).apply_trajectory(true).positions - own.positions)[-1]))
     end, half = own.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
     inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
-    inset.plot(*online.positions[:, [0, 2]].T, color=COLOURS[0], lw=3, alpha=0.6)
+    inset.plot(*online.positions[:, [0, 2]].T, color=colour, lw=3, alpha=0.6)
     _draw_truth(inset, online, truth, (0, 2))
     inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
     inset.set(xticks=[], yticks=[])

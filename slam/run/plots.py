@@ -18,9 +18,10 @@ from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
 from slam.run.figures import RunData, draw_map, draw_path, position_errors, well_known, widths
-from slam.run.style import COLOURS, DASHES, repeated, stage_colour, stage_name, stages
+from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -33,7 +34,8 @@ _AXES = ("right", "down", "forward")
 _MOST_MAPS = 3  # side by side in the summary
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _PAGE = 8.0  # [in] below which text is small, as in a paper
-_LEAST_HEIGHT = 6.5  # [in] of the summary, below which the legend of the stages takes the place of the panels
+_LEAST_HEIGHT = 7.8  # [in] of the summary, below which legends take the place of the panels
+_HANDLE = 4.8  # width of what stands beside a label of a legend, in sizes of the font
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
@@ -142,8 +144,8 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
         first, *others = above.subplots(1, parts)
         left, right = np.asarray(below.subfigures(1, 2))
     _path_panel(first, runs)
-    for axis, run in zip(others, maps):
-        _map_panel(axis, run)
+    for axis, run, colour in zip(others, maps, _colours(runs)):
+        _map_panel(axis, run, colour)
     _error_panels(left.subplots(3, 1, sharex=True), runs)
     _time_panel(right.subplots(), runs)
     figure.suptitle(_wrapped(_title(runs), figure.get_figwidth()))
@@ -160,8 +162,8 @@ def _map(runs: Sequence[RunData], width: float | None) -> Figure:
     rows, columns = (len(runs), 1) if _is_column(width) else (1, len(runs))
     width = width or 5.0 * columns
     figure = _figure(width, 0.96 * width / columns * rows)
-    for axis, run in zip(figure.subplots(rows, columns, squeeze=False).ravel(), runs):
-        _map_panel(axis, run)
+    for axis, run, colour in zip(figure.subplots(rows, columns, squeeze=False).ravel(), runs, _colours(runs)):
+        _map_panel(axis, run, colour)
     return figure
 
 
@@ -201,12 +203,13 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     paths, truth = _in_one_world(runs)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, width, run, path in zip(repeated(COLOURS, len(runs)), widths(len(runs), 2.0), runs, paths):
+    for colour, width, run, path in zip(_colours(runs), widths(len(runs), 2.0), runs, paths):
         draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
     _set_title(axis, "Path, online, from above (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
-    if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in paths])):
+    shown = paths if truth is None else [*paths, truth]
+    if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
         axis.set_aspect("equal", adjustable="datalim")
     axis.legend(frameon=False)
     axis.grid(color="0.9", lw=0.5)
@@ -227,9 +230,13 @@ def _stretch(axis: Axes, points: np.ndarray) -> bool:
     return True
 
 
-def _map_panel(axis: Axes, run: RunData) -> None:
+def _colours(runs: Sequence[RunData]) -> list[str]:
+    return backend_colours([run.backend for run in runs])
+
+
+def _map_panel(axis: Axes, run: RunData, colour: str) -> None:
     """The map from above with ellipses."""
-    draw_map(axis, run, run.truth)
+    draw_map(axis, run, run.truth, colour)
     _widen(axis)
     known, every = len(well_known(run)), len(run.positions)
     shown = "2σ ellipses" if known == every else f"2σ ellipses of the {known} that are well known"
@@ -251,7 +258,7 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     series = [_errors_of(run) for run in runs]
     shown = [error if known else sigma for _, error, sigma in series]
     factor, unit = _unit(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
-    styles = zip(repeated(COLOURS, len(runs)), repeated(DASHES, len(runs)), widths(len(runs), 1.1))
+    styles = zip(_colours(runs), repeated(DASHES, len(runs)), widths(len(runs), 1.1))
     for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
         untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
         for axis, e, s in zip(axes, factor * error.T, factor * sigma.T):
@@ -272,7 +279,9 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     errors = f"Error of the online position{turned}; band: ±3σ as claimed"
     _set_title(axes[0], errors if known else "No true path is known, so no errors: claimed σ of the online position")
     axes[-1].set_xlabel("time [s]")
-    axes[0].legend(framealpha=0.8, edgecolor="none", ncols=4)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if len(handles) > 1:  # a line alone is that of the one run
+        _legend_below(axes[0], handles, labels)
 
 
 def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
@@ -292,7 +301,7 @@ def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin))
     _set_title(axis, "Median time of each stage, and of a whole frame")
-    axis.figure.legend(loc="outside lower center", ncols=int(min(5, _width(axis) / 1.5)), frameon=False)
+    _legend_below(axis, *axis.get_legend_handles_labels())
 
 
 def _median_of_later(times: np.ndarray) -> float:
@@ -347,6 +356,19 @@ def _width(axis: Axes) -> float:
     """Width of a panel with what stands beside it [in]."""
     figure, grid = axis.figure, axis.get_gridspec()
     return float(figure.bbox.width / figure.dpi) / (1 if grid is None else grid.ncols)
+
+
+def _legend_below(axis: Axes, handles: Sequence[Artist], labels: Sequence[str]) -> None:
+    """A legend below a panel in as many columns as there is room for, all of it inside the picture."""
+    from matplotlib import rcParams
+
+    room = 72 * _width(axis) / rcParams["legend.fontsize"]
+    widths_of = (
+        (n, sum(_HANDLE + _LETTER * max(map(len, column)) for column in np.array_split(labels, n)))
+        for n in range(1, len(labels) + 1)
+    )
+    columns = max((n for n, wide in widths_of if wide < room), default=1)
+    axis.figure.legend(handles, labels, loc="outside lower center", ncols=min(5, columns), frameon=False)
 
 
 def _wrapped(text: str, width: float) -> str:

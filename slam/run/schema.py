@@ -8,8 +8,19 @@ from typing import Any
 from slam.config import SystemConfig
 from slam.run.settings_reference import descriptions
 
-#: Stages of a step, in their order: columns ``ms_…`` of frames.csv.
-STAGES = ("read", "extract", "predict", "associate", "update", "estimate", "objects", "manage", "atlas")
+#: Stages of a step, in their order, and what each does: columns ``ms_…`` of frames.csv.
+STAGE_NAMES = {
+    "read": "reading images",
+    "extract": "features",
+    "predict": "prediction",
+    "associate": "data association",
+    "update": "update",
+    "estimate": "estimate and covariances",
+    "objects": "moving objects",
+    "manage": "map management",
+    "atlas": "places and loops",
+}
+STAGES = tuple(STAGE_NAMES)
 
 #: Frames of coordinates.
 FRAMES = {
@@ -69,7 +80,9 @@ FRAME_TABLE = (
     ),
     Columns(("sd_x", "sd_y", "sd_z"), "m", "standard deviations of the position, along the axes of the world"),
     Columns(("sd_rotation",), "rad", "standard deviation of the orientation, all three axes together"),
-    Columns(tuple(f"ms_{stage}" for stage in STAGES), "ms", "wall time of each stage"),
+    Columns(
+        tuple(f"ms_{stage}" for stage in STAGES), "ms", f"wall time of each stage: {', '.join(STAGE_NAMES.values())}"
+    ),
 )
 
 LANDMARK_TABLE = (
@@ -154,12 +167,14 @@ def _columns(name: str) -> dict[str, Any]:
 
 
 def _described(name: str, columns: Columns) -> dict[str, str]:
-    """Unit and meaning of one column; of a covariance of a body's pose, its very components."""
+    """Unit and meaning of one column: its very components, where it is of a covariance, and its very stage."""
     if name[0] == "c" and name[1:].isdigit():
         row, column = (int(digit) for digit in name[1:])
         unit = ("rad²", "rad·m", "m²")[(row > 2) + (column > 2)]
         text = f"covariance of {TWIST[row]} and {TWIST[column]} of the pose, r rotation and t translation, body axes"
         return {"unit": unit, "meaning": text}
+    if name.removeprefix("ms_") in STAGE_NAMES:
+        return {"unit": columns.unit, "meaning": f"wall time of a stage: {STAGE_NAMES[name.removeprefix('ms_')]}"}
     return {"unit": columns.unit, "meaning": columns.text}
 
 

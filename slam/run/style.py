@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import cycle
 
-from slam.run.schema import STAGES
+from slam.run.schema import STAGE_NAMES, STAGES
 
-#: Of back ends, in the order in which they are drawn.
-COLOURS = ("#1565c0", "#ef6c00", "#6a1b9a", "#00838f", "#2e7d32", "#c62828", "#5d4037", "#9e9d24")
+_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a"}
+_OTHERS = ("#00838f", "#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 
 #: Of lines around bands: where bands of two back ends are equal, both are seen.
 DASHES = ("-", "--", ":", "-.")
 
 _STAGES = {
-    "read": ("reading images", "#bdbdbd"),
-    "extract": ("features", "#1565c0"),
-    "predict": ("prediction", "#90caf9"),
-    "associate": ("data association", "#ef6c00"),
-    "update": ("update", "#c62828"),
-    "estimate": ("estimate and covariances", "#f48fb1"),
-    "objects": ("moving objects", "#6a1b9a"),
-    "manage": ("map management", "#2e7d32"),
-    "atlas": ("places and loops", "#00838f"),
-}
+    "read": "#bdbdbd", "extract": "#1565c0", "predict": "#90caf9", "associate": "#ef6c00", "update": "#c62828",
+    "estimate": "#f48fb1", "objects": "#6a1b9a", "manage": "#2e7d32", "atlas": "#00838f",
+}  # fmt: skip
+
+
+def backend_colours(backends: Sequence[str]) -> list[str]:
+    """A colour for each of the runs in a picture, by the names of their back ends.
+
+    A built-in back end has the same colour in all pictures, in whatever order. Others, and further runs of the same
+    back end, have the next colour that is left.
+    """
+    left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in backends)])
+    own = dict(_BACKENDS)
+    return [own.pop(name) if name in own else next(left) for name in backends]
 
 
 def stages(known: Iterable[str]) -> list[str]:
@@ -33,12 +38,12 @@ def stages(known: Iterable[str]) -> list[str]:
 
 def stage_name(stage: str) -> str:
     """What a stage does, for a legend."""
-    return _STAGES[stage][0]
+    return STAGE_NAMES[stage]
 
 
 def stage_colour(stage: str) -> str:
     """The colour of a stage."""
-    return _STAGES[stage][1]
+    return _STAGES[stage]
 
 
 def repeated(styles: tuple[str, ...], count: int) -> list[str]:

@@ -14,8 +14,9 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
 from slam.run.figures import RunData, draw_map, position_errors, well_known
-from slam.run.plots import KINDS, _in_one_world, _stretch, plot, read_runs
+from slam.run.plots import _SMALL_STYLE, _STYLE, KINDS, _in_one_world, _path_panel, _stretch, plot, read_runs
 from slam.run.runner import RunOptions, run
+from slam.run.style import backend_colours
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=8&width=160&height=120"
@@ -117,7 +118,7 @@ def test_frames_that_were_not_tracked_are_told_from_others(runs, tmp_path):
     data = RunData.read(tmp_path / "a", "a")
     assert data.measured.tolist() == [True, False, False, False, True, True, True, True]
     axis = Figure().subplots()
-    draw_map(axis, data, None)
+    draw_map(axis, data, None, "0.5")
     solid, dotted = (line.get_xdata() for line in axis.lines if str(line.get_label()).startswith("path"))
     assert np.isnan(solid).tolist() == (~data.measured).tolist()
     np.testing.assert_array_equal(dotted, data.online.positions[:, 0])
@@ -133,7 +134,7 @@ def test_ellipses_are_inside_of_the_map(runs):
     data.covariances[right] = np.diag([0.19**2, 1e-6, 1e-6])
     assert right in well_known(data)
     axis = Figure().subplots()
-    draw_map(axis, data, None)
+    draw_map(axis, data, None, "0.5")
     assert axis.get_xlim()[1] > data.positions[right, 0] + 2 * np.sqrt(data.covariances[right, 0, 0])
 
 
@@ -167,6 +168,62 @@ def test_a_straight_path_has_a_scale_of_its_own_across(across):
     assert (axis.get_xlabel, axis.get_ylabel)[across]().endswith("a scale of its own")
     points[:, across] = 3 * np.sin(np.arange(30))
     assert not _stretch(axis, points)
+
+
+def test_the_whole_true_path_is_in_the_picture(runs):
+    """It is also where it leaves a path that is nearly a line, which has a scale of its own across."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    data = read_runs([runs / "a"])[0][0]
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 2, 3] = 10 * np.arange(8)
+    true = poses.copy()
+    true[:, 0, 3] = (2, 0, 0, 0, 0, 0, 0, 0)
+    stamps = data.online.stamps
+    data = replace(data, online=Trajectory(stamps, poses), truth=Trajectory(stamps, true))
+    axis = Figure().subplots()
+    with rc_context(_STYLE):
+        _path_panel(axis, [data])
+    (drawn,) = (line for line in axis.lines if line.get_label() == "true path")
+    low, high = axis.get_xlim()
+    assert low < np.min(drawn.get_xdata())
+    assert np.max(drawn.get_xdata()) < high
+
+
+@pytest.mark.parametrize(("kind", "width"), [("time", None), ("time", 88), ("errors", 88), ("summary", None)])
+def test_legends_below_panels_are_inside_of_the_picture(runs, kind, width):
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    own = read_runs([runs / "a", runs / "b"])[0]
+    with rc_context(_STYLE | ({} if width is None else _SMALL_STYLE)):
+        figure = KINDS[kind](own, None if width is None else width / 25.4)
+        FigureCanvasAgg(figure).draw()
+        legends = [one for part in (figure, *_parts(figure)) for one in part.legends]
+        assert legends
+        for legend in legends:
+            box = legend.get_window_extent()
+            assert figure.bbox.x0 <= box.x0
+            assert box.x1 <= figure.bbox.x1
+            assert figure.bbox.y0 <= box.y0
+
+
+def _parts(figure):
+    return [part for sub in figure.subfigs for part in (sub, *_parts(sub))]
+
+
+def test_a_back_end_has_its_colour_in_all_panels_of_a_run(runs):
+    from matplotlib import rc_context
+    from matplotlib.colors import to_hex
+
+    own = read_runs([runs / "b"])[0]
+    for kind in ("path", "map", "errors"):
+        with rc_context(_STYLE):
+            figure = KINDS[kind](own, None)
+        lines = [line for axis in figure.axes for line in axis.lines]
+        drawn = {to_hex(line.get_color()) for line in lines if "smoother" in str(line.get_label())}
+        assert drawn == set(backend_colours(["smoother"]))
 
 
 def test_ellipses_of_landmarks_that_are_hardly_known_are_left_out(runs):

@@ -8,15 +8,19 @@ import sys
 from dataclasses import replace
 from html import escape
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from slam.commands import display
-from slam.compare.paper import differences_table, latex, means_table, write_paper
+from slam.compare.figures import colours, draw_errors, draw_nees, draw_pairs, pictures
+from slam.compare.measure import BY_KEY
+from slam.compare.paper import _letters, _table, differences_table, latex, means_table, write_paper
 from slam.compare.report import conclusions, write_report
 from slam.compare.statistics import Verdict
 from slam.compare.tables import count_tests, groups, write_tables
-from slam.compare.wording import REPLAYED
+from slam.compare.wording import replayed
+from slam.run.style import backend_colours
 from tests.slam.compare.made_up import make, plan
 
 
@@ -85,7 +89,7 @@ def test_p_is_adjusted_over_all_groups_of_the_report(three):
 
 def test_tables_for_latex(paper, three):
     tables = (paper / "tables.tex").read_text()
-    assert tables.startswith("% Written by slam compare. Needs: \\usepackage{booktabs}\n")
+    assert tables.startswith("% Written by slam compare. Needs: \\usepackage{booktabs,graphicx}\n")
     captions = re.findall(r"\\caption\{(.*)\}\n", tables)
     assert len(captions) == 4
     assert sum("Closed loop: each back end steers" in caption for caption in captions) == 2
@@ -99,13 +103,13 @@ def test_tables_for_latex(paper, three):
     assert "Holm's method over 7 tests" in differences_table(three[3][0], 7)
 
 
-@pytest.mark.parametrize(("trials", "columns"), [(1, "lrr"), (5, "lrr"), (6, "lrlrl")])
-def test_tables_hold_what_so_many_trials_can_say(tmp_path, trials, columns):
+@pytest.mark.parametrize(("trials", "columns", "kind"), [(1, "lrr", ""), (5, "lrr", "*"), (6, "lrlrl", "*")])
+def test_tables_hold_what_so_many_trials_can_say(tmp_path, trials, columns, kind):
     of = plan(trials)
     group = groups(of, make(tmp_path, of))[0]
     means, differences = means_table(group), differences_table(group, 7)
     assert f"\\begin{{tabular}}{{{columns}}}" in means
-    assert ("\\begin{table*}" in means) == (len(columns) > 3)
+    assert f"\\begin{{table{kind}}}" in means
     assert means.count("\\begin{table") == means.count("\\end{table") == 1
     assert ("one trial" in means, "standard deviation" in means) == (trials == 1, trials > 1)
     assert ("interval" in means) == (trials > 5)
@@ -118,10 +122,91 @@ def test_long_names_of_sequences_go_on_in_the_next_line(tmp_path):
     assert "synthetic:\\allowbreak{}desk?\\allowbreak{}frames=\\allowbreak{}40\\&\\allowbreak{}width" in means
 
 
-def test_replays_say_why_their_covariances_are_smaller(three):
-    closed_loop, replay = conclusions(three[3])[:2]
-    assert REPLAYED not in closed_loop.honesty
-    assert REPLAYED in replay.honesty
+def test_tables_of_more_than_two_back_ends_have_no_intervals_of_means(paper, three):
+    means, differences = means_table(three[3][0]), differences_table(three[3][0], 7)
+    assert "\\begin{tabular}{lrrr}" in means
+    assert "confidence interval" not in means
+    assert "confidence interval" in differences
+
+
+def test_a_table_is_as_large_as_there_is_room_for(tmp_path):
+    """Sizes of letters as LaTeX sets them: a table of 53 letters in three columns is 229 pt wide in footnotesize."""
+    made = {n: _table("lrr", ["a" * (n - 2), "b", "c"], [["a", "1", "$2$"]], "", "") for n in (40, 53, 60)}
+    found = {
+        n: (re.findall(r"begin.(table\*?)", text)[0], re.findall(r"\\(\w+)\n", text)[1]) for n, text in made.items()
+    }
+    assert found == {40: ("table", "small"), 53: ("table", "footnotesize"), 60: ("table*", "footnotesize")}
+    assert all("\\ifdim\\width>\\linewidth" in text for text in made.values())  # in other classes
+
+
+@pytest.mark.parametrize(
+    ("cell", "letters"), [("$100$", 3), ("$0.22$ $\\pm$ $0.01$", 11), ("body\\_1 5 \\%", 10), ("$p_\\mathrm{Holm}$", 7)]
+)
+def test_letters_of_a_cell_are_those_that_are_seen(cell, letters):
+    assert _letters(cell) == letters
+
+
+def test_replays_say_why_their_covariances_are_smaller(tmp_path):
+    of = plan(6)
+    runs = [
+        replace(run, metrics=run.metrics | {"nees_10m_per_dof": {"replay": 1.5}.get(run.trial.mode, 0.5)})
+        for run in make(tmp_path, of)
+    ]
+    closed_loop, replay = conclusions(groups(of, runs))
+    assert not [line for line in closed_loop.honesty if "its closed loop" in line]
+    (why,) = (line for line in replay.honesty if "its closed loop" in line)
+    assert why.startswith("NEES / 6 of ekf is 1.50, and 0.50 in its closed loop: in a replay the covariances are")
+    assert (
+        "NEES / 6 of ekf is 1.50, and 0.50 in its closed loop" in write_report(of, runs, tmp_path, "here").read_text()
+    )
+
+
+def test_replays_whose_covariances_are_as_large_need_no_reason():
+    assert replayed("ekf", {"nees_10m_per_dof": 1.0}, {"nees_10m_per_dof": 1.005}) == ""
+    assert replayed("ekf", {"nees_10m_per_dof": float("nan")}, {"nees_10m_per_dof": 1.0}) == ""
+    assert "0.22 in its closed loop" in replayed("ekf", {"nees_per_dof": 0.22}, {"nees_per_dof": 0.3})
+
+
+def test_the_report_says_what_stages_do(text):
+    assert "<th>features</th><th>update</th><th>whole frame</th>" in text
+
+
+def test_trials_are_counted_from_one(three):
+    group = three[3][0]
+    (axis,) = draw_pairs(group, BY_KEY["ate_online_m"]).axes
+    assert axis.get_xticks().tolist() == list(range(1, 13))
+    assert axis.get_xlabel() == "trial"
+    low, high = axis.get_ylim()
+    points = [line for line in axis.lines if line.get_label() in group.runs]
+    assert [line.get_color() for line in points] == backend_colours(list(group.runs))
+    for line, backend in zip(points, group.runs):
+        values = line.get_ydata()
+        assert np.round(line.get_xdata()).tolist() == list(range(1, 13))
+        np.testing.assert_array_equal(values, 1e3 * group.values(backend, "ate_online_m"))
+        assert low < np.nanmin(values) <= np.nanmax(values) < high
+    assert high - low > 0.1 * high  # equal values are not blown up
+
+
+def test_of_one_trial_there_is_no_figure_of_trials(tmp_path):
+    of = plan(1)
+    assert "trials" not in {picture.name for picture in pictures(groups(of, make(tmp_path, of))[0])}
+
+
+def test_bands_have_the_colour_and_an_outline_of_their_back_end(three):
+    from matplotlib.colors import to_hex
+
+    group = three[3][0]
+    for axis in draw_errors(group).axes:
+        fills = [band for band in axis.collections if band.get_alpha() and band.get_alpha() < 0.2]
+        assert [to_hex(band.get_facecolor()[0]) for band in fills] == list(colours(group).values())
+        for colour in colours(group).values():
+            outline = [line for line in axis.lines if line.get_color() == colour and not line.get_label().isalpha()]
+            assert len(outline) == 2
+
+
+def test_the_band_of_the_nees_says_of_what_it_is(three):
+    (axis,) = draw_nees(three[3][0]).axes
+    assert "95 % band if consistent, mean of 11 trials" in axis.get_legend_handles_labels()[1]
 
 
 def test_latex_has_no_character_that_it_reads_otherwise():
@@ -230,6 +315,7 @@ def test_the_rate_of_a_comparison_that_goes_on_is_that_of_its_own_frames(monkeyp
     monkeypatch.setattr(display.time, "monotonic", lambda: next(clock))
     bar = display.SweepProgress([1000, 1000], quiet=True)
     bar.kept(1000)
-    assert bar._bar.tasks[0].fields["rate"] == ""
-    bar.frames(30)
-    assert bar._bar.tasks[0].fields["rate"] == "30.0 Hz"
+    fields = bar._bar.tasks[0].fields
+    assert (fields["rate"], fields["left"]) == ("", "")
+    bar.frames(40)
+    assert (fields["rate"], fields["left"]) == ("40.0 Hz", "0:00:24")

@@ -25,6 +25,7 @@ from slam.compare.wording import (
     headline,
     honesty,
     innovations,
+    is_trifle,
     measurements,
     sentence,
     shown_p,
@@ -32,6 +33,7 @@ from slam.compare.wording import (
 )
 
 ATE, NEES, PRECISION = BY_KEY["ate_online_m"], BY_KEY["nees_per_dof"], BY_KEY["association_precision"]
+TRACKED = BY_KEY["tracked"]
 
 
 def pairs(n, shift=-0.01, seed=0):
@@ -302,6 +304,22 @@ def test_what_nobody_would_choose_by_is_no_headline_however_sure():
     ]
     lines = headline(adjusted([difference(PRECISION, reference, reference - 0.04)]), "smoother")
     assert lines[0].badge == "worse: certain"
+
+
+def test_nearly_all_is_not_as_good_as_all():
+    """Where 99.2 % of the frames are tracked, eight in a thousand are lost: no trifle, though it is less than 1 %."""
+    ones = np.ones(9)
+    lines = headline(adjusted([difference(TRACKED, ones, ones - 0.008)]), "smoother")
+    assert (lines[0].badge, lines[0].text) == ("worse: certain", "smoother: frames tracked 100 → 99.2 %")
+    assert not is_trifle(difference(PRECISION, 0.999 * ones, 0.99 * ones))
+    assert is_trifle(difference(PRECISION, 0.974 * ones, 0.972 * ones))
+
+
+def test_what_prints_as_the_same_is_no_headline():
+    values = np.linspace(1.0, 2.0, 9)
+    assert is_trifle(difference(PRECISION, 0.99996 * np.ones(9), 0.99999 * np.ones(9)))  # 100 % both
+    assert is_trifle(difference(BY_KEY["rpe_1s_deg"], 1e-7 * values, 3e-7 * values))  # six decimals at most
+    assert not is_trifle(difference(BY_KEY["rpe_1s_deg"], values, 1.02 * values))
 
 
 def test_a_nis_far_from_one_is_explained():
