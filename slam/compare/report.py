@@ -227,7 +227,7 @@ def _pictures(group: Group) -> list[dict[str, str]]:
 def _times(every: Sequence[Group]) -> dict[str, Any]:
     """What the stages do, and a row of medians per group and back end."""
     runs = [run for group in every for rs in group.runs.values() for run in rs]
-    known = [*stages(stage for run in runs for stage in run.milliseconds), "total"]
+    known = ["total", *stages(stage for run in runs for stage in run.milliseconds)]
     rows = []
     for group in every:
         for backend, own in group.runs.items():
@@ -236,7 +236,7 @@ def _times(every: Sequence[Group]) -> dict[str, Any]:
                 values = [run.milliseconds[stage] for run in own if stage in run.milliseconds]
                 cells.append(f"{np.median(values):.2f}" if values else "–")
             rows.append((group.sequence, group.variant.name, group.mode, backend, *cells))
-    return {"stages": [*map(stage_name, known[:-1]), "whole frame"], "times": rows}
+    return {"stages": ["whole frame", *map(stage_name, known[1:])], "times": rows}
 
 
 def _run_keys(runs: Sequence[Run]) -> list[str]:
