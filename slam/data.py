@@ -239,11 +239,17 @@ class Prediction:
 
 
 class UpdateStatus(StrEnum):
-    """How an update ended."""
+    """How an update ended.
 
-    OK = "ok"  #: measurements were used
-    EMPTY = "empty"  #: nothing was measured (or nothing passed the gate): the prediction stands
-    FAILED = "failed"  #: the estimator could not solve; the prediction stands; the reason is in the report
+    Attributes:
+        OK: measurements were used.
+        EMPTY: nothing was measured (or nothing passed the gate): the prediction stands.
+        FAILED: the estimator could not solve; the prediction stands; the reason is in the report.
+    """
+
+    OK = "ok"
+    EMPTY = "empty"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True)
@@ -315,13 +321,21 @@ class Estimate:
 
 
 class FrameStatus(StrEnum):
-    """How a frame ended."""
+    """How a frame ended.
 
-    STARTED = "started"  #: first frame, or the first one with anything to see: the map begins
-    TRACKED = "tracked"  #: the pose was measured against the map
-    LOST = "lost"  #: no match for several frames: the pose is predicted only, and may be far off
-    PREDICTED = "predicted"  #: nothing (or too little) to see: the pose is the motion model's
-    FAILED = "failed"  #: the back end could not solve; the pose is the motion model's
+    Attributes:
+        STARTED: first frame, or the first one with anything to see: the map begins.
+        TRACKED: the pose was measured against the map.
+        LOST: no match for several frames: the pose is predicted only, and may be far off.
+        PREDICTED: nothing (or too little) to see: the pose is the motion model's.
+        FAILED: the back end could not solve; the pose is the motion model's.
+    """
+
+    STARTED = "started"
+    TRACKED = "tracked"
+    LOST = "lost"
+    PREDICTED = "predicted"
+    FAILED = "failed"
 
     @property
     def measured(self) -> bool:

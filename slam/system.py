@@ -181,7 +181,7 @@ class StereoSlam:
                 only the times differ.
 
         Raises:
-            As `process`, at the frame whose step fails.
+            SlamError: as `process`, at the frame whose step fails.
         """
         if not isinstance(frames, Iterable):
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")

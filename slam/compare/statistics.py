@@ -37,16 +37,27 @@ _EXACT = 16  # pairs up to which all 2ᴺ patterns of signs are tried; for more 
 
 
 class Verdict(StrEnum):
-    """What may be concluded of a difference, by `ALPHA`, `HINT_ALPHA` and `LEVEL`."""
+    """What may be concluded of a difference, by `ALPHA`, `HINT_ALPHA` and `LEVEL`.
 
-    CERTAIN = "certain"  #: the interval leaves out zero, and the Holm-adjusted p is at most `ALPHA`
-    LIKELY = "likely"  #: the interval leaves out zero, and p is at most `ALPHA`, the adjusted one is not
-    HINT = "hint"  #: the interval leaves out zero or there is none; p is above `ALPHA` and at most `HINT_ALPHA`
-    OPEN = "open"  #: the interval holds zero, or p is above `HINT_ALPHA`
-    EQUAL = "equal"  #: every pair is the same to the last digit
-    SINGLE = "single"  #: one pair: a difference without any spread to judge it by
-    NONE = "none"  #: no pair
-    UNTESTED = "untested"  #: a figure of which neither more nor less is better
+    Attributes:
+        CERTAIN: the interval leaves out zero, and the Holm-adjusted p is at most `ALPHA`.
+        LIKELY: the interval leaves out zero, and p is at most `ALPHA`, the adjusted one is not.
+        HINT: the interval leaves out zero or there is none; p is above `ALPHA` and at most `HINT_ALPHA`.
+        OPEN: the interval holds zero, or p is above `HINT_ALPHA`.
+        EQUAL: every pair is the same to the last digit.
+        SINGLE: one pair: a difference without any spread to judge it by.
+        NONE: no pair.
+        UNTESTED: a figure of which neither more nor less is better.
+    """
+
+    CERTAIN = "certain"
+    LIKELY = "likely"
+    HINT = "hint"
+    OPEN = "open"
+    EQUAL = "equal"
+    SINGLE = "single"
+    NONE = "none"
+    UNTESTED = "untested"
 
 
 @dataclass(frozen=True)

@@ -255,7 +255,8 @@ def open_camera(text: str, options: Mapping[str, str]) -> CameraSequence:
         options: those of `OPTIONS` that are given.
 
     Raises:
-        As `CameraSequence`; ConfigurationError also where no camera is named, or more than two.
+        SequenceError, CalibrationError: as `CameraSequence`.
+        ConfigurationError: an option has an impossible value; no camera is named, or more than two.
     """
     if "left" in options or "right" in options:
         if text or not ("left" in options and "right" in options):

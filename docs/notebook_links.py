@@ -1,0 +1,26 @@
+"""For the site: links of notebooks to pages, ``../guide.md``, go to the pages as they are built."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from typing import Any
+
+from mkdocs.exceptions import PluginError
+
+_LINK = re.compile(r'href="([^":#]+\.(?:md|ipynb))')
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """The page's HTML; raises where it links to no page."""
+    here = page.file.src_uri
+    if not here.endswith(".ipynb"):
+        return html
+
+    def built(found: re.Match[str]) -> str:
+        target = files.get_file_from_path(posixpath.normpath(posixpath.join(posixpath.dirname(here), found[1])))
+        if target is None:
+            raise PluginError(f"{here}: there is no page {found[1]}")
+        return f'href="{target.url_relative_to(page.file)}'
+
+    return _LINK.sub(built, html)
