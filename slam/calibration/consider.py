@@ -74,17 +74,18 @@ class RigUncertainty:
             self._followed, self._stamp, self._measured = Followed.start(T, self._columns), stamp, stamp
             return
         local = transform(inverse(T), positions)
-        ids, local = ids[local[:, 2] > 0], local[local[:, 2] > 0]
+        front = local[:, 2] > 0
+        ids, local, positions = ids[front], local[front], positions[front]
         lately = before.ids[(before.unseen < _UNSEEN) | _isin(before.ids, ids)]
         rows = np.flatnonzero(_isin(ids, others.ids))
         wanted = _chosen(np.concatenate([lately, ids[rows]]))
         now, others = self._exchanged(before, others, wanted)
-        now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
         rows = rows[_isin(ids[rows], wanted)]
-        if len(rows):
+        if len(rows):  # before the motion, whose error they share with all that is followed
             again = np.searchsorted(others.ids, ids[rows])
-            now = now.seen_again(others.select(again), local[rows])
+            now = now.seen_again(others.select(again), transform(inverse(now.T_world), positions[rows]))
             others = others.select(np.delete(np.arange(len(others.ids)), again))
+        now = now.moved(T, *self._motion_sigmas(stamp - self._stamp))
         place = {i: row for row, i in enumerate(now.ids.tolist())}
         rows = np.array([place.get(i, -1) for i in ids.tolist()], np.intp)
         rows, points = rows[rows >= 0], local[rows >= 0]

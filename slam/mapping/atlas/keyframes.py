@@ -13,6 +13,8 @@ from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.rig_error import Correction
 
+_ROUNDING = 1e-14  # numerics: of the largest variance: what is below is none
+
 
 @dataclass(frozen=True)
 class Keyframe:
@@ -163,7 +165,9 @@ def what_was_added(after: Array, before: Array) -> Array:
 
     Rotations and metres are brought to one scale by the deviations of `after`.
     """
-    deviations = np.sqrt(np.diagonal(after, axis1=-2, axis2=-1))[..., :, None]
+    variances = np.diagonal(after, axis1=-2, axis2=-1)
+    least = np.maximum(_ROUNDING * variances.max(axis=-1, keepdims=True), np.finfo(float).tiny)
+    deviations = np.sqrt(np.maximum(variances, least))[..., :, None]
     values, vectors = np.linalg.eigh((after - before) / (deviations * np.swapaxes(deviations, -1, -2)))
     root = deviations * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     return np.asarray(root @ np.swapaxes(root, -1, -2))

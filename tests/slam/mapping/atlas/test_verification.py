@@ -181,6 +181,9 @@ def test_what_was_added_is_never_negative():
     np.testing.assert_allclose(what_was_added(P + Q, P), Q, atol=1e-10)
     assert np.linalg.eigvalsh(what_was_added(P, P + 0.5 * Q)).max() < 1e-10
     assert np.abs(what_was_added(P, P)).max() == 0
+    P[2] = P[:, 2] = 0.0  # as where two huge covariances were subtracted
+    assert np.isfinite(what_was_added(P, Q)).all()
+    assert np.abs(what_was_added(0 * P, 0 * P)).max() == 0
 
 
 def test_a_keyframe_whose_points_tell_no_pose_is_no_place_seen_again():
