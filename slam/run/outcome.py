@@ -82,7 +82,7 @@ def motion_doubt(record: RunRecord, motion: MotionModel) -> str:
     if len(counted) < _LEAST_CHANGES:
         return ""
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
-    if ratio < _JERKY:
+    if not ratio >= _JERKY:  # also where it is no number
         return ""
     return (
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
