@@ -20,9 +20,7 @@ from slam.tracking.association import AssociationConfig
 #: are those of 300, or smaller.
 MAPS = {
     "handheld": MapConfig(),
-    "driving": MapConfig(
-        target_in_view=150, max_landmarks=200, descriptor_update=1.0, confirmed=1, restart_after=5, spacing=0.0
-    ),
+    "driving": MapConfig(target_in_view=150, max_landmarks=200, descriptor_update=1.0, confirmed=1, spacing=0.0),
 }
 
 #: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter.

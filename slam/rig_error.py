@@ -12,27 +12,23 @@ from slam.geometry.arrays import Array
 
 @dataclass(frozen=True)
 class CommonError:
-    """What poses are off by through the rig's error: ``shares @ (scale @ c + known)``, with the same c for all poses.
+    """What poses are off by through the rig's error: ``shares @ scale @ c``, with the same c for all poses.
+
+    What has become known of the error since a pose was made, and stays in it, is one column of `scale`: how far the
+    pose moves by it is known from a model of the estimator alone, and counts as an error, too.
 
     Attributes:
         shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
         scale: these errors by ones of unit variance, c, as they are known now (m, n).
-        known: the part of them that is known by now, but stays in poses of before (m,).
     """
 
     shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
     scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    known: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def root(self) -> Array:
-        """A square root (m, n + 1) of the errors' covariance; that the known part was not corrected counts as well."""
-        return np.column_stack([self.scale, self.known])
 
     @property
     def covariance(self) -> Array:
         """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.root
+        root = self.shares @ self.scale
         return np.asarray(root @ root.T)
 
 

@@ -20,7 +20,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
 from slam.landmarks import LandmarkRows
-from slam.mapping.atlas.atlas import Atlas
+from slam.mapping.atlas.atlas import Atlas, Gap
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper
@@ -231,6 +231,7 @@ class StereoSlam:
             seen = self._associate(prediction, features, index)
         with stages.stage("update"):  # the measurement of the landmarks
             report, spared, state = self._update(seen, dt)
+            seen = self._begin_anew(seen, state, index)
         with stages.stage("estimate"):
             estimate = self._estimate_pose(report)
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
@@ -296,6 +297,8 @@ class StereoSlam:
         change = self._mapper.update(self.backend, seen.landmarks, step)
         T = step.estimate.T_world_left
         anchors = self._aligner.anchored(self.frontend, seen.aligned, seen.matches, change.added, T)
+        if self.landmarks is not None and not len(seen.landmarks):  # left behind, where the map has begun anew
+            change = replace(change, erased=np.concatenate([self.landmarks.ids, change.erased]))
         new = np.setdiff1d(change.added.ids, change.erased)
         self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
         return change, anchors
@@ -308,8 +311,7 @@ class StereoSlam:
         """The step with the rig's error in its estimate, and the atlas; after a loop the old landmarks are back."""
         estimate, common = self._rig_error.added_to(step.estimate), self._rig_error.common(as_given=False)
         step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
-        restarts = len(self.restarted)
-        atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path, restarts)
+        atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path)
         if seen_again is not None:
             change = self._mapper.give_back(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
@@ -394,7 +396,7 @@ class StereoSlam:
 
     @property
     def restarted(self) -> list[int]:
-        """Indices of the frames in which another back end took over, as the camera had been kidnapped."""
+        """Indices of the frames in which another back end took over: a kidnapped camera, or a map begun anew."""
         return self._relocalizer.restarted
 
     def _revise(self) -> Revision | None:
@@ -449,12 +451,36 @@ class StereoSlam:
         if not self._relocalizer.can_restart(self.backend):
             return landmarks, prediction, LandmarkMatches.nothing()
         new, path = self._relocalizer.restart(self.backend, matches.T_world_left)
+        place = None
         if found is not None and matches.T_world_left is found.T_odom_left:
-            landmarks = self._mapper.insert(new, landmarks, found.place)
+            landmarks, place = self._mapper.insert(new, landmarks, found.place), found.stamp
             positions = new.positions(landmarks.ids)
-        prediction, r = new.predict(features.stamp), self._relocalizer
-        self.backend, self._rig_error.given, r.past, r.restarted = (
-            new, self.calibration.applied, [*r.past, path], [*r.restarted, index],
+        prediction = new.predict(features.stamp)
+        gap = Gap(self._last.measured_at, features.stamp)
+        self._take_over(new, path, self.atlas.found_again(gap, place), index)
+        return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)
+
+    def _begin_anew(self, seen: Associated, state: TrackingState, index: int) -> Associated:
+        """Where the camera is in an unknown place, a map of its own begins there with a new back end.
+
+        How that map lies to the earlier one is known as well as the predicted pose is, until a place of the atlas is
+        seen again. The earlier landmarks are left to the atlas.
+        """
+        unknown, c = state.in_unknown_place(self.config.map.restart_after), self.config.atlas
+        if not (unknown and c.enabled and len(self.atlas) and self._relocalizer.can_restart(self.backend)):
+            return seen
+        before = self._rig_error.added_to(require_estimate(self.backend.estimate(landmarks=False), self.backend))
+        new, path = self._relocalizer.begin_anew(self.backend, seen.features.stamp)
+        after, common = new.estimate(landmarks=False), self._rig_error.common(as_given=False)
+        since, models = self._last.measured_at, self.config.models
+        self._take_over(new, path, self.atlas.begun_anew(since, before, after, common, models), index)
+        none = LandmarkRows.empty(seen.features.descriptors.shape[1])
+        return replace(seen, landmarks=none, matches=LandmarkMatches.nothing())
+
+    def _take_over(self, new: Backend, path: Trajectory, atlas: Atlas, index: int) -> None:
+        """Go on with another back end, after a path that the old one leaves."""
+        r = self._relocalizer
+        self.backend, self.atlas, self._rig_error.given, r.past, r.restarted = (
+            new, atlas, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
         self.objects.restart()
-        return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)

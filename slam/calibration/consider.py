@@ -168,23 +168,23 @@ class RigUncertainty:
             positions[known] += L @ np.swapaxes(L, 1, 2)
         return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
 
-    def shared(self, covariance: Array, kept: Array) -> tuple[Array, Array, Array]:
+    def shared(self, covariance: Array, kept: Array) -> tuple[Array, Array]:
         """What the errors of this pose and of those of other frames have in common, as factors.
 
-        The covariance that `added_to` adds to the pose is ``J (S Sᵀ + k kᵀ) Jᵀ``. Poses of several frames have the
-        common errors ``J₁ (S c + k)``, ``J₂ (S c + k)``, …, with the same c of unit variance, where S and k are of
-        the last frame.
+        The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
+        ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
 
         Args:
             covariance: of the parameters (n, n).
             kept: the correction (n,) that the path was made with, after all changes told to `path_keeps`.
 
         Returns:
-            J (6, n + 2), in the axes of the left camera, S (n + 2, n + 1) and k (n + 2,).
+            J (6, n + 2), in the axes of the left camera, and S (n + 2, n + 2).
         """
         J = self._by_left_camera()
         J[:, -1] -= J[:, :-2] @ kept
-        return J, self._factor(covariance)[:, :-1], np.concatenate([kept, [0.0, 1.0]])
+        known = np.concatenate([kept, [0.0, 1.0]])
+        return J, np.column_stack([self._factor(covariance)[:, :-1], known])
 
     @property
     def pose(self) -> Array:

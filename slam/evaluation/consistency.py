@@ -163,10 +163,10 @@ def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array)
 
     Where one end is after a loop nothing is apart: there the difference of the covariances is added to `N` (M, 6, 6).
     """
-    G = np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
+    G = np.zeros((len(ends), _DOF, max(last.scale.shape[1] for _, last in ends)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
         if first.shares.shape == last.shares.shape:
-            G[row, :, : last.root.shape[1]] = (last.shares - a @ first.shares) @ last.root
+            G[row, :, : last.scale.shape[1]] = (last.shares - a @ first.shares) @ last.scale
         else:
             N[row] += last.covariance - a @ first.covariance @ a.T
     return G

@@ -36,8 +36,8 @@ class MapConfig:
         descriptor_update: weight of a landmark's newest descriptor against the one kept; 1 keeps the last, 0 the first.
         lost_after: the camera is lost after this many frames without a match, if the predicted pixels are less certain
             than `association.tight_window`.
-        restart_after: after this many unmatched frames with enough features to be localised in a known place,
-            landmarks are added from the predicted pose; again after as many more.
+        restart_after: after this many unmatched frames with enough features to be localised in a known place, a new map
+            begins at the predicted pose; again after as many more.
         max_landmarks: size of the map; beyond it, those measured longest ago are erased.
         monocular: features without a stereo match become landmarks too, when two views give their depth (paper B, 2.2).
     """
@@ -57,7 +57,7 @@ class MapConfig:
     same_descriptor: float = 0.4
     descriptor_update: float = 0.0
     lost_after: int = 5
-    restart_after: int = 30
+    restart_after: int = 5
     max_landmarks: int = 1000
     monocular: bool = False
 

@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 
 from slam import registry
-from slam.data import Estimate, FrameResult, FrameStatus, Prediction, StereoFeatures, UpdateReport, UpdateStatus
+from slam.data import (
+    Estimate,
+    FrameResult,
+    FrameStatus,
+    Observations,
+    Prediction,
+    StereoFeatures,
+    UpdateReport,
+    UpdateStatus,
+)
 from slam.errors import ConfigurationError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array
@@ -98,13 +107,32 @@ class Relocalizer:
 
     def start(self, T_world_left: Array) -> Backend:
         """A back end without landmarks at a pose (4, 4) that is only roughly known."""
-        assert self._backend is not None
         models = replace(
             self._models,
             T_world_left=T_world_left.tolist(),
             initial_position_sigma=POSITION_SIGMA,
             initial_rotation_sigma=ROTATION_SIGMA,
         )
+        return self._new(models)
+
+    def begin_anew(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory]:
+        """A new back end without landmarks where an old one says that the camera is, which defines its coordinates.
+
+        An estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen from
+        there: its linear equations do not hold over such angles, and make it sure of a pose that is wrong.
+
+        Returns:
+            the new back end at the time `stamp`, and the path that the old one leaves, but for its newest pose.
+        """
+        T = old.estimate(landmarks=False).T_world_left
+        new = self._new(replace(self._models, T_world_left=T.tolist()))
+        new.predict(stamp)
+        new.update(Observations.empty(), None)
+        return new, old.trajectory().select(slice(None, -1))
+
+    def _new(self, models: EstimatorModels) -> Backend:
+        """Another back end of the same kind."""
+        assert self._backend is not None
         backend: Backend = registry.create("backends", self._backend, self._rig, models=models, **self._options)
         return backend
 

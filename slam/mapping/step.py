@@ -90,6 +90,7 @@ class Completed:
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
         anchors: what landmarks looked like at first sight.
+        measured_at: time of the last frame whose pose was measured [s]; −inf before the first.
     """
 
     index: int = -1
@@ -97,8 +98,10 @@ class Completed:
     dimensions: int | None = None
     mapped: bool = False
     anchors: Anchors = field(default_factory=Anchors.none)
+    measured_at: float = -np.inf
 
     def after(self, step: Step, added: int, anchors: Anchors) -> Completed:
         """The same after one more step, in which so many landmarks joined the map."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors)
+        measured_at = self.measured_at if step.state.unmatched else step.features.stamp
+        return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors, measured_at)

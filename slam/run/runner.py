@@ -251,8 +251,8 @@ def _recording(
         )
     if isinstance(system, StereoSlam) and system.restarted:
         raise SlamError(
-            f"{options.record}: not written: the camera was moved while it saw nothing, and a new back end took over "
-            f"in frame {system.restarted[0]}; what is recorded is for one"
+            f"{options.record}: not written: the camera was lost, and a new back end took over in frame "
+            f"{system.restarted[0]}; what is recorded is for one"
         )
     whole = Recording.of(tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
     return replace(whole, kind=sequence.kind)

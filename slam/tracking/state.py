@@ -40,10 +40,10 @@ class TrackingState:
         lost = self.lost or (uncertain and unmatched >= lost_after)
         return TrackingState(unmatched, self.unknown + enough, lost, enough)
 
-    def may_add(self, restart_after: int) -> bool:
-        """Whether new landmarks may join the map.
+    def in_unknown_place(self, restart_after: int) -> bool:
+        """Whether the camera has just shown `restart_after` frames of a place that the map does not know."""
+        return self.showed_enough and self.unknown % restart_after == 0
 
-        Not while the pose is unknown. But after `restart_after` frames that showed enough and matched nothing, the
-        place is taken for an unknown one, and is mapped from the predicted pose on.
-        """
-        return not self.unmatched or (self.showed_enough and self.unknown % restart_after == 0)
+    def may_add(self, restart_after: int) -> bool:
+        """Whether new landmarks may join the map: not while the pose is unknown, unless the place is so, too."""
+        return not self.unmatched or self.in_unknown_place(restart_after)

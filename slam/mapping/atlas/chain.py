@@ -5,8 +5,7 @@ along the path, where noise averages out, so the two are kept apart: with T the 
 
     T_true = T exp(noise + C c),
 
-where c are common errors of unit variance, the same for all steps (a consider state: Schmidt, 1966). What has become
-known of the rig since a step was made, and was not corrected in it, is neither: it is added to ``C c`` as it is.
+where c are common errors of unit variance, the same for all steps (a consider state: Schmidt, 1966).
 """
 
 from __future__ import annotations
@@ -29,19 +28,15 @@ class Chain:
         steps: covariance (K, 6, 6) of the motion from the keyframe before by noise, perturbing on the right; the first
             has no meaning.
         common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; none by default.
-        known: by what the same motion is known to be off (K, 6); zero by default.
     """
 
     poses: Array
     steps: Array
     common: Array = field(default=None)  # type: ignore[arg-type]
-    known: Array = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         if self.common is None:
             object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
-        if self.known is None:
-            object.__setattr__(self, "known", np.zeros((len(self.poses), 6)))
 
     def propagated(self, ends: NDArray[np.intp]) -> Propagated:
         """Error that each stretch has propagated to its keyframes, perturbing the pose at which it ends.
@@ -54,7 +49,7 @@ class Chain:
         begin = ends[np.maximum(np.searchsorted(ends, number) - 1, 0)]
         A = adjoints(inverse(self.poses[end]) @ self.poses)
         parts = []
-        for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common, (A @ self.known[:, :, None])[:, :, 0]):
+        for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common):
             step[ends[0]] = 0
             total = np.cumsum(step, axis=0)
             total -= total[begin]
@@ -65,10 +60,10 @@ class Chain:
         """Motion (4, 4) from one keyframe to another, and its covariance (6, 6), perturbing on the right."""
         a, b = sorted((first, second))
         rows = slice(a, b + 1)
-        part = Chain(self.poses[rows], self.steps[rows], self.common[rows], self.known[rows])
-        noise, common, known = (each[-1] for each in part.propagated(np.unique([0, b - a])))
+        part = Chain(self.poses[rows], self.steps[rows], self.common[rows])
+        noise, common = (each[-1] for each in part.propagated(np.unique([0, b - a])))
         P = noise + common @ common.T
-        T = inverse(self.poses[a]) @ self.poses[b] @ exp(known)
+        T = inverse(self.poses[a]) @ self.poses[b]
         if first > second:
             A = adjoint(T)
             T, P = inverse(T), A @ P @ A.T
@@ -81,12 +76,10 @@ class Propagated(NamedTuple):
     Attributes:
         noise: covariance (K, 6, 6).
         common: derivative (K, 6, m) by the common errors.
-        known: by what it is known to be off (K, 6).
     """
 
     noise: Array
     common: Array
-    known: Array
 
 
 def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: Array, common: Array) -> Array:
@@ -104,11 +97,11 @@ def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: 
     number = np.arange(len(chain.poses))
     at = np.maximum(np.searchsorted(ends, number), 1) - 1  # row of each keyframe's stretch
     rest = inverse(chain.poses) @ chain.poses[ends[at + 1]]
-    known = propagated.common @ common + propagated.known
+    expected = propagated.common @ common
     change = log(inverse(chain.poses[ends[1:]]) @ chain.poses[ends[:-1]] @ inverse(moved[:-1]) @ moved[1:])
     whole = propagated.noise[ends[1:]] + LEAST_VARIANCE * np.eye(6)
-    weight = np.linalg.solve(whole, (change - known[ends[1:]])[:, :, None])
-    part = known + (propagated.noise @ weight[at])[:, :, 0]
+    weight = np.linalg.solve(whole, (change - expected[ends[1:]])[:, :, None])
+    part = expected + (propagated.noise @ weight[at])[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change
     out = shared_out(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)

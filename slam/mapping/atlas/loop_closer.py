@@ -58,10 +58,12 @@ class Found:
     Attributes:
         T_odom_left: its pose (4, 4) in the back end's frame.
         place: landmarks of the place.
+        stamp: when that place was seen [s]; −inf in an earlier run.
     """
 
     T_odom_left: Array
     place: KnownPlace
+    stamp: float
 
 
 class LoopCloser:
@@ -96,7 +98,7 @@ class LoopCloser:
 
     @one_blas_thread
     def update(
-        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory], restarts: int
+        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """The atlas after a frame, and what it shows again where a loop was closed.
 
@@ -105,14 +107,16 @@ class LoopCloser:
             step: what the frame brought.
             added: landmarks that joined the map in it.
             path: gives the path in odom so far.
-            restarts: how often another back end has taken over so far, as the camera had been kidnapped.
         """
-        if not self._config.enabled or (step.state.unmatched and len(atlas)) or not self._is_keyframe(atlas, step):
+        first, restarts = not len(atlas), len(atlas.gaps)
+        begins = first or restarts > atlas.restarts
+        known = begins or not step.state.unmatched
+        if not (self._config.enabled and known and (begins or self._is_keyframe(atlas, step))):
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[added.rows] = added.ids
         step = replace(step, features=self._rectify(step.features))
-        new = self._keyframe(atlas, step, landmark_of, restarts > atlas.restarts)
+        new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas, None
         candidates = self._candidates(atlas, new, step, landmark_of)
@@ -145,7 +149,9 @@ class LoopCloser:
         if any(2 * other.inliers > loop.inliers and not self._same_place(atlas, loop, other) for other, _ in verified):
             return None
         T_odom_keyframe = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
-        return Found(T_odom_keyframe @ loop.T_first_second, self._place(seen.keyframe, T_odom_keyframe))
+        place = self._place(seen.keyframe, T_odom_keyframe)
+        stamp = -np.inf if loop.first < atlas.known else seen.keyframe.stamp
+        return Found(T_odom_keyframe @ loop.T_first_second, place, stamp)
 
     def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
         """A keyframe's features as landmarks, where its pose is (4, 4)."""
@@ -182,7 +188,7 @@ class LoopCloser:
         pending = atlas.pending
         return pending is not None and pending.second == len(atlas) - 1 and not atlas.confirmed
 
-    def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray, moved_blindly: bool) -> Keyframe | None:
+    def _keyframe(self, atlas: Atlas, step: Step, landmark_of: IdArray) -> Keyframe | None:
         """The frame as a keyframe; None where too few features have a depth."""
         features, moving = step.features, step.labels.moving
         known = features_with_depth(self._rig, features, self._sigma, self._max_depth_error)
@@ -196,10 +202,13 @@ class LoopCloser:
         if len(atlas):
             last = atlas.keyframes[-1]
             travelled = last.travelled + _UNKNOWN_WAY
-        if len(atlas) > atlas.known and not moved_blindly:
+        gaps = atlas.gaps[atlas.restarts :]
+        if len(atlas) > atlas.known and not gaps:
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
             added = step_covariance(last, T, P)
+        elif len(gaps) == 1 and gaps[0].covariance is not None:
+            added = gaps[0].covariance + P
         return Keyframe(
             step.index,
             features.stamp,
@@ -223,7 +232,8 @@ class LoopCloser:
         it knows by itself.
         """
         poses, here = atlas.poses_in_map(), atlas.T_map_odom @ new.T_odom_left
-        possible = self._within_reach(atlas, new, poses, here, step.estimate.covariance)
+        covariance = atlas.estimate(step.estimate, step.common).covariance
+        possible = self._within_reach(atlas, new, poses, here, covariance)
         if not possible.any():
             return np.zeros(0, np.intp)
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
@@ -289,7 +299,7 @@ class LoopCloser:
         from slam.mapping.atlas.pose_graph import PoseGraph
 
         chain = atlas.chain(rig, path())
-        common = None if atlas.anchor is None else atlas.anchor.common_as(rig)
+        common = None if atlas.solved is None else atlas.solved.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
         limit = self._config.gate_sigmas**2
         if disagreement(graph, loop) > limit:

@@ -1,7 +1,9 @@
 """Which keyframe shows a place like this one: vectors of locally aggregated descriptors (VLAD; Jégou et al., 2010).
 
 A keyframe's descriptors are shared out to the nearest of some words, and their differences from it are added up: a
-vector of fixed length. The words are learnt from the first keyframes of a run, by k-means from evenly chosen ones.
+vector of fixed length. The words are learnt by k-means from all keyframes so far, again and again at first: words
+learnt from a few places lie in the middle of their descriptors, whose differences then say nothing, so that just those
+places would not be known again. For the same reason vectors are compared by what they differ by from their mean.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ from numpy.typing import NDArray
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
-_TRAINING = 50  # cost: descriptors for each word, before the words are learnt
+_TRAINING = 50  # cost: descriptors for each word, of which the words are learnt
+_LEARN_AT = (8, 16, 32, 64, 128)  # cost: numbers of keyframes at which the words are learnt
 _ROUNDS = 10  # numerics: of k-means
+_NONE = 1e-12  # numerics: length of a vector that says nothing
 
 
 @dataclass(frozen=True)
@@ -23,40 +27,47 @@ class PlaceIndex:
     """Vectors of keyframes, and the words that they are made with.
 
     Attributes:
-        words: (W, D); None while too few descriptors have been seen to learn them.
-        early: descriptors (F, D) of the keyframes before the words were learnt.
+        words: (W, D); None before they have been learnt.
+        early: descriptors (F, D) of the keyframes so far, as long as words will be learnt from them.
         count: number of keyframes.
-        vectors: theirs, in the first `count` rows.
+        vectors: theirs, in the first `count` rows; none without words.
     """
 
     words: Vectors | None = None
-    early: tuple[Vectors, ...] = ()
+    early: tuple[NDArray[np.float16], ...] = ()
     count: int = 0
     vectors: Vectors = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def with_new(self, descriptors: Vectors) -> PlaceIndex:
         """With one more keyframe, of descriptors (F, D)."""
-        if self.words is not None:
-            return self._appended(aggregate(descriptors, self.words))
-        early = (*self.early, descriptors)
-        every = np.concatenate(early)
-        number = max(_LENGTH // max(descriptors.shape[1], 1), 1)
-        if len(every) < number * _TRAINING:
-            return replace(self, early=early, count=self.count + 1)
-        index = PlaceIndex(words=learn_words(every, number))
+        count = self.count + 1
+        early = (*self.early, descriptors.astype(np.float16)) if count <= _LEARN_AT[-1] else ()
+        if count not in _LEARN_AT:
+            return replace(self._appended(descriptors), early=early)
+        every = np.concatenate(early).astype(np.float32)
+        number = min(max(_LENGTH // max(every.shape[1], 1), 1), len(every))
+        index = PlaceIndex(words=learn_words(every, number) if number else None)
         for some in early:
-            index = index._appended(aggregate(some, index.words))  # type: ignore[arg-type]
-        return index
+            index = index._appended(some.astype(np.float32))
+        return replace(index, early=early if count < _LEARN_AT[-1] else ())
 
     def similarity(self, descriptors: Vectors) -> NDArray[np.float32]:
         """How similar each keyframe (count,) is to descriptors (F, D): 1 for the same, about 0 for another place."""
         if self.words is None:
             return np.zeros(self.count, np.float32)
-        return np.asarray(self.vectors[: self.count] @ aggregate(descriptors, self.words))
+        vectors = self.vectors[: self.count]
+        mean = vectors.mean(axis=0)
+        wanted = aggregate(descriptors, self.words) - mean
+        products = vectors @ np.stack([wanted, mean], axis=1)
+        squares = np.einsum("kn,kn->k", vectors, vectors) - 2 * products[:, 1] + mean @ mean
+        lengths = np.sqrt(np.maximum(squares, 0)) * np.linalg.norm(wanted)
+        return np.asarray((products[:, 0] - mean @ wanted) / np.maximum(lengths, _NONE), np.float32)
 
-    def _appended(self, vector: NDArray[np.float32]) -> PlaceIndex:
-        """With one more vector. Rows beyond `count` are nobody's, so earlier indices keep theirs."""
-        vectors = self.vectors
+    def _appended(self, descriptors: Vectors) -> PlaceIndex:
+        """With one more keyframe. Rows beyond `count` are nobody's, so earlier indices keep theirs."""
+        if self.words is None:
+            return replace(self, count=self.count + 1)
+        vector, vectors = aggregate(descriptors, self.words), self.vectors
         if self.count >= len(vectors):
             vectors = np.zeros((max(64, 2 * self.count), len(vector)), np.float32)
             if self.count:
@@ -66,8 +77,10 @@ class PlaceIndex:
 
 
 def learn_words(descriptors: Vectors, number: int) -> Vectors:
-    """Centres (number, D) of descriptors (F, D), by k-means from evenly chosen ones."""
-    words = descriptors[np.linspace(0, len(descriptors) - 1, number).astype(int)].copy()
+    """Centres (number, D) of descriptors (F, D), by k-means of evenly chosen ones."""
+    some = min(number * _TRAINING, len(descriptors))
+    descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
+    words = descriptors[np.linspace(0, some - 1, number).astype(int)].copy()
     for _ in range(_ROUNDS):
         nearest = _nearest(descriptors, words)
         count = np.bincount(nearest, minlength=number)
@@ -83,9 +96,9 @@ def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
     if len(descriptors):
         nearest = _nearest(descriptors, words)
         np.add.at(parts, nearest, descriptors - words[nearest])
-    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-12)
+    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), _NONE)
     vector = parts.ravel()
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12), np.float32)
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), _NONE), np.float32)
 
 
 def _nearest(descriptors: Vectors, words: Vectors) -> NDArray[np.intp]:

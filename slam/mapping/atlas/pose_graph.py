@@ -84,7 +84,25 @@ class PoseGraph:
     def with_loop(self, loop: Loop) -> PoseGraph:
         """With one loop more, between keyframes that are variables."""
         problem = self.problem.with_loop(loop)
-        return PoseGraph(self.chain, problem, *problem.optimised(self.poses, self.common))
+        starts = self.poses, self._bent(loop)
+        start = min(starts, key=lambda poses: problem.cost(poses, self.common))
+        return PoseGraph(self.chain, problem, *problem.optimised(start, self.common))
+
+    def _bent(self, loop: Loop) -> Array:
+        """Poses (M, 4, 4) of the variables that put both ends of a loop where it says; what it changes is shared out.
+
+        A stretch that is hardly known takes nearly all of it, and what follows moves as a whole, however far that is.
+        Linear equations of single poses would bend it.
+        """
+        p, last = self.problem, len(self.poses) - 1
+        noise, common = (each[p.ends] for each in p.propagated)
+        path = Chain(self.poses, noise + common @ np.swapaxes(common, 1, 2))
+        first, second = np.searchsorted(p.ends, loop.pair)
+        ends = np.unique([0, first, second, last])
+        moved = self.poses[ends].copy()
+        target = self.poses[first] @ loop.T_first_second
+        moved[ends >= second] = target @ inverse(self.poses[second]) @ moved[ends >= second]
+        return spread(path, ends, path.propagated(ends), moved, np.zeros(0))
 
     def relative_pose(self, first: int, second: int) -> tuple[Array, Array]:
         """Pose (4, 4) of a keyframe in another one's coordinates, and its covariance (6, 6); both are variables."""
@@ -121,7 +139,6 @@ class _Problem:
         motions: measured (E, 4, 4).
         roots: of their information (E, 6, 6): a residual r weighs |root r|².
         common: derivative of the motions by the common errors (E, 6, m).
-        known: by what they are known to be off (E, 6).
         propagated: of all keyframes, see `slam.mapping.atlas.chain.Chain.propagated`.
     """
 
@@ -131,7 +148,6 @@ class _Problem:
     motions: Array
     roots: Array
     common: Array
-    known: Array
     propagated: Propagated
 
     @classmethod
@@ -140,7 +156,7 @@ class _Problem:
         ends = np.unique([0, last, *also, *(k for loop in loops for k in (loop.first, loop.second))]).astype(np.intp)
         propagated = chain.propagated(ends)
         begin, end = ends[:-1], ends[1:]
-        common, known = propagated.common[end], propagated.known[end]
+        common = propagated.common[end]
         covariances = np.concatenate([propagated.noise[end], np.array([x.covariance for x in loops]).reshape(-1, 6, 6)])
         motions = inverse(chain.poses[begin]) @ chain.poses[end]
         return cls(
@@ -150,7 +166,6 @@ class _Problem:
             np.concatenate([motions, np.array([x.T_first_second for x in loops]).reshape(-1, 4, 4)]),
             _root_of_information(covariances),
             np.concatenate([common, np.zeros((len(loops), *common.shape[1:]))]),
-            np.concatenate([known, np.zeros((len(loops), 6))]),
             propagated,
         )
 
@@ -163,13 +178,12 @@ class _Problem:
             np.concatenate([self.motions, loop.T_first_second[None]]),
             np.concatenate([self.roots, _root_of_information(loop.covariance[None])]),
             np.concatenate([self.common, np.zeros((1, *self.common.shape[1:]))]),
-            np.concatenate([self.known, np.zeros((1, 6))]),
             self.propagated,
         )
 
     def expected(self, common: Array) -> Array:
-        """By what the motions (E, 6) are off, as far as the common errors (m,) and what is known say it."""
-        return np.asarray(self.common @ common + self.known)
+        """By what the motions (E, 6) are off, as far as the common errors (m,) say it."""
+        return np.asarray(self.common @ common)
 
     def residuals(self, poses: Array, common: Array) -> Array:
         """What the motions (E, 6) of poses (M, 4, 4) differ by from the measured ones."""

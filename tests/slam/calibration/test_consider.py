@@ -123,8 +123,8 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
             system.calibration._motion_agrees = lambda: True
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
-    np.testing.assert_array_equal(result.common.known[:-2], mean)
-    in_path = system._rig_error.common(as_given=False).known[:-2]
+    np.testing.assert_array_equal(result.common.scale[:-2, -1], mean)
+    in_path = system._rig_error.common(as_given=False).scale[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
 
 

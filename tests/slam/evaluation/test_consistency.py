@@ -84,7 +84,7 @@ def with_common_error(seed: int):
         if k:
             A = adjoint(inverse(inverse(true.poses[k - 1]) @ true.poses[k]))
             shares = A @ shares + np.concatenate([np.zeros(3), STEP[3:]])[:, None]
-        common.append(CommonError(shares, np.array([[0.02]]), np.zeros(1)))
+        common.append(CommonError(shares, np.array([[0.02]])))
         own.poses[k] = own.poses[k] @ exp(-off * shares[:, 0])
     return own, true, P + np.array([c.covariance for c in common]), common
 

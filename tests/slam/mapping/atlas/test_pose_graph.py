@@ -204,26 +204,6 @@ def test_shared_out_keeps_the_ends(share: float):
     np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
 
 
-def test_what_is_known_is_taken_off_each_step():
-    _, chain, loops, errors = problem_with_common_errors(5)
-    known = chain.common @ errors
-    of_steps = [inverse(a) @ b @ exp(k) for a, b, k in zip(chain.poses, chain.poses[1:], known[1:])]
-    mended = [chain.poses[0]]
-    for step in of_steps:
-        mended.append(mended[-1] @ step)
-    told = Chain(chain.poses, chain.steps, chain.common, known)
-    at_once = Chain(np.array(mended), chain.steps, chain.common)
-    moved = np.linalg.norm(at_once.poses[:, :3, 3] - chain.poses[:, :3, 3], axis=1).max()
-    difference = solve(told, loops, told.poses).poses - solve(at_once, loops, at_once.poses).poses
-    assert np.abs(difference).max() < 0.05 * moved
-    T, P = told.motion(10, 25)
-    expected, Q = at_once.motion(10, 25)
-    assert np.linalg.norm(log(inverse(expected) @ T)) < 0.05 * np.linalg.norm(
-        log(inverse(expected) @ chain.motion(10, 25)[0])
-    )
-    np.testing.assert_allclose(P, Q, atol=0.1 * np.abs(Q).max())
-
-
 def test_one_loop_more_is_the_same_as_all_at_once():
     _, chain, loops, _ = problem_with_common_errors(6)
     last = loops[-1]

@@ -1,0 +1,139 @@
+"""A camera that is moved unseen to a place that it has not been to: a map of its own begins there, until a loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import slam
+from slam.data import FrameResult, StereoFeatures
+from slam.geometry.se3 import inverse, log
+from slam.system import StereoSlam
+from tests.slam.mapping.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
+
+BACKENDS = ("ekf", "smoother")
+SEEN, DARK, SKIPPED = 35, 30, 12  # frames before the dark, in it, and how much farther than they the camera was carried
+
+
+class Run:
+    """A round of 100 m with a dark stretch, in which the camera is carried farther than it would have gone."""
+
+    def __init__(self, sequence, backend: str, *settings: str) -> None:  # noqa: F811
+        self.system: StereoSlam = system_for(sequence, backend, settings)
+        self.results: list[FrameResult] = []
+        shown = [*range(SEEN + DARK), *range(SEEN + DARK + SKIPPED, len(sequence))]
+        for k, at in enumerate(shown):
+            features = replace(sequence.observations(at), stamp=0.1 * k)
+            dark = SEEN <= k < SEEN + DARK
+            self.results.append(self.system.process_features(StereoFeatures.empty(0.1 * k, 16) if dark else features))
+        self.truth = inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses[shown]
+
+    def squares(self, k: int) -> float:
+        """Squared error of a frame's pose over its covariance."""
+        e = self.results[k].estimate
+        error = log(inverse(e.T_world_left) @ self.truth[k])
+        return float(error @ np.linalg.solve(e.covariance, error))
+
+    @property
+    def begins(self) -> int:
+        """The frame in which the map begins anew."""
+        (frame,) = self.system.restarted
+        return frame
+
+    @property
+    def loop(self) -> int:
+        """The first frame that closes a loop."""
+        return next(r.index for r in self.results if r.loop is not None)
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def run(request, sequence) -> Run:  # noqa: F811
+    return Run(sequence, request.param)
+
+
+def test_it_goes_on_in_a_map_of_its_own(run):
+    restart_after = run.system.config.map.restart_after
+    assert run.begins == SEEN + DARK + restart_after - 1
+    assert [name for name, _ in groupby(r.status.value for r in run.results)] == [
+        "started", "tracked", "predicted", "lost", "tracked",
+    ]  # fmt: skip
+    assert run.results[run.begins + 1].status.value == "tracked"
+    old = np.concatenate([r.added for r in run.results[:SEEN]])
+    matched = np.concatenate([r.matched for r in run.results[run.begins : run.loop]])
+    assert len(matched) and not np.isin(matched, old).any()
+    assert run.results[run.begins].map_size == len(run.results[run.begins].added) > 0
+
+
+def test_it_says_how_little_is_known_of_where_that_map_is(run):
+    at, end = run.begins, run.loop
+    distance = np.linalg.norm(run.results[at].estimate.T_world_left[:3, 3] - run.truth[at][:3, 3])
+    assert distance > 3.0  # so that there is something to know
+    assert max(run.squares(k) for k in range(at, end)) < chi2.ppf(0.999, 6)
+    assert max(run.squares(k) for k in range(end, len(run.results))) < chi2.ppf(0.999, 6)
+    before, after = (np.diag(run.results[k].estimate.covariance) for k in (at - 1, at))
+    assert (after > before).all()  # no information comes from nowhere
+
+
+def test_landmarks_are_as_uncertain_as_the_place_where_the_map_begins(sequence):  # noqa: F811
+    run = Run(sequence, "ekf", "atlas.inliers=1000")  # no loop
+    e = run.system.estimate()
+    assert len(e.ids)
+    deviations = np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))
+    assert (deviations > 0.5 * np.sqrt(np.trace(e.covariance[3:, 3:]))).all()
+
+
+def test_a_loop_puts_the_map_in_its_place(run):
+    path = run.system.trajectory()
+    assert len(path) == len(run.results)
+    off = np.linalg.norm(path.positions - run.truth[:, :3, 3], axis=1)
+    assert off[:SEEN].max() < 0.3
+    assert off[run.begins :].max() < 0.5
+    online = np.linalg.norm([r.estimate.T_world_left[:3, 3] - T[:3, 3] for r, T in zip(run.results, run.truth)], axis=1)
+    assert online[run.loop + 1 :].max() < 0.5
+    assert off[SEEN - 1] < 0.3 and off[run.begins + 1] < 0.5  # all of the change is in the dark
+
+
+def test_what_was_seen_before_is_found_again_where_the_camera_returns_at_once(sequence):  # noqa: F811
+    """A second map begins; then the camera is carried back to the first one, whose frame it is in again."""
+    system = system_for(sequence, "ekf")
+    shown = [*range(40), *[-1] * 20, *range(60, 80), *[-1] * 6, *range(10, 30)]
+    results = []
+    for k, at in enumerate(shown):
+        dark = StereoFeatures.empty(0.1 * k, 16)
+        results.append(system.process_features(dark if at < 0 else replace(sequence.observations(at), stamp=0.1 * k)))
+    assert len(system.restarted) == 2
+    last = results[-1]
+    assert last.status.value == "tracked"
+    truth = (inverse(sequence.ground_truth.poses[0]) @ sequence.ground_truth.poses[shown[-1]])[:3, 3]
+    assert np.linalg.norm(last.estimate.T_world_left[:3, 3] - truth) < 0.3
+    assert np.sqrt(np.trace(last.estimate.covariance[3:, 3:])) < 1.0
+    assert np.sqrt(np.trace(results[75].estimate.covariance[3:, 3:])) > 2.0
+
+
+def test_without_an_atlas_the_map_goes_on(sequence):  # noqa: F811
+    run = Run(sequence, "ekf", "atlas.enabled=false")
+    assert not run.system.restarted
+    assert run.results[-1].status.value == "tracked"
+
+
+def test_an_interrupt_while_the_map_begins_anew_leaves_a_system_that_goes_on(sequence, monkeypatch):  # noqa: F811
+    done = Run(sequence, "ekf")
+    system = system_for(sequence, "ekf")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    for r in done.results[: done.begins]:
+        system.process_features(r.features)
+    with monkeypatch.context() as patch:
+        patch.setattr("slam.system.frame_result", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            system.process_features(done.results[done.begins].features)
+    statuses = [system.process_features(r.features).status.value for r in done.results[done.begins + 1 :][:15]]
+    assert statuses[-5:] == ["tracked"] * 5
+    system.estimate()
+    assert isinstance(system.snapshot(), slam.SavedMap)
