@@ -136,12 +136,15 @@ class Localizer:
     ) -> TrackingState:
         """Whether the pose was measured; a lost camera must match more landmarks than a tracked one.
 
-        It was not where the back end uses less than half of the landmarks that agree with each other.
+        It was not where the back end uses less than half of the landmarks that agree with each other. A frame that
+        gives a pose as the one before did, and waits for a third one, counts as one with too few features: its place
+        is known.
         """
         least = self.config.minimum_consistent if state.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
         uncertain = median_deviation(prediction) > self.config.tight_window
-        return state.after(measured, uncertain, int(features.has_stereo.sum()), self._lost_after)
+        enough = 0 if self._hypotheses.count > 1 else int(features.has_stereo.sum())
+        return state.after(measured, uncertain, enough, self._lost_after)
 
     def match(
         self,

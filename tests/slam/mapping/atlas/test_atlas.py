@@ -113,7 +113,8 @@ def test_loops_are_closed_where_they_are(closed):
     for now, then in [(r.index, r.loop) for r in results if r.loop is not None]:
         assert abs(now - then - LAP) <= 8
     assert first_loop(results) < LAP + 12
-    assert system.atlas.summary()["refused"] == 0
+    assert system.atlas.summary()["refused"] <= 1  # a true one may miss the gate by chance; the others stay
+    assert system.atlas.summary()["closed"] >= 7
     assert system.atlas.summary()["keyframes"] == sum(r.keyframe for r in results)
 
 
