@@ -16,6 +16,8 @@ from slam.naming import unknown
 from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
+ANYWHERE = 1e3  # numerics: standard deviation of a position of which nothing is known [m]
+
 _DENSITIES = (1e-6, 1e6)  # of velocity noise
 _SIGMAS = (1e-7, 1e6)  # of the initial state
 _RANGES = {

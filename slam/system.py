@@ -249,7 +249,8 @@ class StereoSlam:
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
-            self._last.after(step, len(change.added), anchors), change.landmarks, atlas, Stages(),
+            self._last.after(step, len(change.added), anchors, index in self.restarted[-1:]), change.landmarks, atlas,
+            Stages(),
         )  # fmt: skip
         return result
 
@@ -355,14 +356,14 @@ class StereoSlam:
         with self._stepping, self._named("the estimate"):
             return self._estimate()
 
-    def _estimate(self) -> Estimate:
-        """`estimate`, in the only thread."""
+    def _estimate(self, of_map: bool = False) -> Estimate:
+        """`estimate`, in the only thread; landmarks `of_map` are as uncertain as they are to each other."""
         self._roll_back()
         search = self._relocalizer.search
         if search is not None:
             return search.estimate(float("nan"))
         estimate = self._rig_error.added_to(require_estimate(self.backend.estimate(), self.backend))
-        return self.atlas.estimate(estimate, self._rig_error.common(as_given=False))
+        return self.atlas.estimate(estimate, self._rig_error.common(as_given=False), not of_map)
 
     @one_blas_thread
     def snapshot(self) -> SavedMap:
@@ -376,7 +377,7 @@ class StereoSlam:
         with self._stepping, self._named("the map"):
             if self._relocalizer.search is not None:
                 return self._relocalizer.search.known
-            estimate = self._estimate() if self.landmarks is not None else None
+            estimate = self._estimate(of_map=True) if self.landmarks is not None else None
             if estimate is None or self.landmarks is None:
                 raise SlamError("there is no map yet: no frame was processed")
             rows = self.landmarks.moved(self.atlas.T_map_odom)

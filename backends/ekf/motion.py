@@ -9,9 +9,7 @@ import numpy as np
 from backends.ekf.covariance import CAMERA, POSE
 from slam.geometry.euler import body_rate_matrix
 from slam.geometry.se3 import Array
-from slam.models import EstimatorModels
-
-_ANYWHERE = 1e3  # numerics: standard deviation of a position of which nothing is known [m]
+from slam.models import ANYWHERE, EstimatorModels
 
 
 def initial_covariance(models: EstimatorModels, phi: Array) -> Array:
@@ -48,6 +46,6 @@ def covariance_after_gap(models: EstimatorModels, phi: Array, position: Array, d
     """
     P, E = initial_covariance(models, phi), np.linalg.inv(body_rate_matrix(phi))
     P[:3, :3] = position + (models.initial_velocity_sigma * dt) ** 2 * np.eye(3)
-    P[:3, :3] *= min(1.0, _ANYWHERE**2 / P[:3, :3].diagonal().max())
+    P[:3, :3] *= min(1.0, ANYWHERE**2 / P[:3, :3].diagonal().max())
     P[3:6, 3:6] = np.pi**2 / 3 * E @ E.T
     return P

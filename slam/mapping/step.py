@@ -90,7 +90,7 @@ class Completed:
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
         anchors: what landmarks looked like at first sight.
-        measured_at: time of the last frame whose pose was measured [s]; −inf before the first.
+        measured_at: time of the last frame whose pose was measured, or at which a map begins [s].
     """
 
     index: int = -1
@@ -100,8 +100,9 @@ class Completed:
     anchors: Anchors = field(default_factory=Anchors.none)
     measured_at: float = -np.inf
 
-    def after(self, step: Step, added: int, anchors: Anchors) -> Completed:
-        """The same after one more step, in which so many landmarks joined the map."""
+    def after(self, step: Step, added: int, anchors: Anchors, begun_anew: bool) -> Completed:
+        """The same after one more step, in which so many landmarks joined the map, or one of its own has begun."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        measured_at = self.measured_at if step.state.unmatched else step.features.stamp
+        known = not step.state.unmatched or not self.mapped or begun_anew
+        measured_at = step.features.stamp if known else self.measured_at
         return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors, measured_at)

@@ -21,7 +21,7 @@ from slam.mapping.atlas.chain import Chain, adjoints, shared_out
 from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
 from slam.mapping.atlas.places import PlaceIndex, Vectors
 from slam.mapping.atlas.rows import KeyframeRows
-from slam.models import EstimatorModels
+from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 
 if TYPE_CHECKING:
@@ -83,8 +83,8 @@ class Gap:
     Attributes:
         since: time of the last measured pose before it [s].
         until: time of the first pose after it [s].
-        covariance: of that pose (6, 6), perturbing on the right, by what the motion model says; None where the camera
-            was found elsewhere, so that nothing is known of how it came there.
+        covariance: of that pose (6, 6), perturbing on the right, see `moved_unseen`; None where the camera was found
+            elsewhere, so that nothing is known of how it came there.
         anchor: that pose, where a map of its own begins with it that no loop has tied to the rest so far.
     """
 
@@ -286,12 +286,13 @@ class Atlas:
             return np.asarray(self.corrected[number])
         return self.T_map_odom @ self.keyframes[number].T_odom_left
 
-    def estimate(self, estimate: Estimate, common: CommonError) -> Estimate:
+    def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
         """An estimate in odom, taken to the map; after a loop or a restart it is as certain as its anchor says.
 
         Args:
             estimate: with covariances by noise and by the common error.
             common: what the pose's error has in common with those of other frames.
+            gaps: whether landmarks are also as uncertain as where their map begins, which is the same for all of them.
         """
         if self.anchor is None:
             return estimate
@@ -305,7 +306,7 @@ class Atlas:
             T_world_left=T @ estimate.T_world_left,
             covariance=covariance,
             positions=estimate.positions @ R.T + T[:3, 3],
-            covariances=R @ landmarks_by_pose(estimate, covariance, may_grow=bool(self.gaps)) @ R.T,
+            covariances=R @ landmarks_by_pose(estimate, covariance, may_grow=gaps and bool(self.gaps)) @ R.T,
         )
 
     def path(self, path: Trajectory) -> Trajectory:
@@ -330,18 +331,18 @@ def moved_unseen(covariance: Array, duration: float, models: EstimatorModels) ->
     """Covariance (6, 6) of a predicted pose after a gap, in which a camera may have moved as cameras of its kind do.
 
     The prediction takes changes of velocity for noise. Over a gap, a bend or a stop is none: the velocity after it is
-    that of a camera of which nothing is known. Nor can a direction be more uncertain than an unknown one.
+    that of a camera of which nothing is known. Nor can a direction or a place be more uncertain than unknown ones.
 
     Args:
         covariance: by the motion model (6, 6).
         duration: of the gap [s].
         models: velocities of a camera of this kind.
     """
-    m = models
-    speeds = np.repeat([m.initial_angular_velocity_sigma, m.initial_velocity_sigma], 3)
-    P = covariance + np.diag((speeds * duration) ** 2)
-    scale = np.ones(6)
-    scale[:3] = min(1.0, _UNKNOWN_DIRECTION / np.sqrt(np.linalg.eigvalsh(P[:3, :3])[-1]))
+    speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
+    most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])
+    P = covariance + np.diag(np.repeat(np.minimum(speeds * duration, most), 3) ** 2)
+    largest = np.sqrt([np.linalg.eigvalsh(P[:3, :3])[-1], np.linalg.eigvalsh(P[3:, 3:])[-1]])
+    scale = np.repeat(np.minimum(1.0, most / largest), 3)
     return np.asarray(scale[:, None] * P * scale)
 
 

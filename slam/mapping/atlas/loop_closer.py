@@ -108,10 +108,9 @@ class LoopCloser:
             added: landmarks that joined the map in it.
             path: gives the path in odom so far.
         """
-        first, restarts = not len(atlas), len(atlas.gaps)
-        begins = first or restarts > atlas.restarts
-        known = begins or not step.state.unmatched
-        if not (self._config.enabled and known and (begins or self._is_keyframe(atlas, step))):
+        begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
+        wanted = begins or (not step.state.unmatched and self._is_keyframe(atlas, step))
+        if not (self._config.enabled and wanted):
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
         landmark_of[added.rows] = added.ids
@@ -122,7 +121,7 @@ class LoopCloser:
         candidates = self._candidates(atlas, new, step, landmark_of)
         descriptors = new.descriptors.astype(np.float32)
         kept = new if self._file is None else self._file.put(new)
-        atlas = replace(atlas.with_new(kept, descriptors), restarts=restarts)
+        atlas = replace(atlas.with_new(kept, descriptors), restarts=len(atlas.gaps))
         found = self._verified(atlas, candidates, step.features, step.correction, step.index)
         best = max(found, key=_inliers, default=None)
         return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)

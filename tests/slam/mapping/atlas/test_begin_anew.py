@@ -12,8 +12,11 @@ from scipy.stats import chi2
 import slam
 from slam.data import FrameResult, StereoFeatures
 from slam.geometry.se3 import inverse, log
+from slam.mapping.atlas.atlas import moved_unseen
+from slam.models import KINDS
 from slam.system import StereoSlam
 from tests.slam.mapping.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
+from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother")
 SEEN, DARK, SKIPPED = 35, 30, 12  # frames before the dark, in it, and how much farther than they the camera was carried
@@ -84,6 +87,41 @@ def test_landmarks_are_as_uncertain_as_the_place_where_the_map_begins(sequence):
     assert len(e.ids)
     deviations = np.sqrt(np.trace(e.covariances, axis1=1, axis2=2))
     assert (deviations > 0.5 * np.sqrt(np.trace(e.covariance[3:, 3:]))).all()
+
+
+def test_a_run_in_such_a_map_is_in_its_coordinates(sequence, tmp_path):  # noqa: F811
+    """Where the whole map is uncertain, its landmarks still hold together."""
+    first = Run(sequence, "ekf", "atlas.inliers=1000")
+    slam.save_map(tmp_path / "first.map", first.system)
+    known = slam.load_map(tmp_path / "first.map")
+    second = slam.StereoSlam(sequence.rig, None, "ekf", config=first.system.config, prior_map=known)
+    last = [second.process_features(first.results[k].features) for k in range(-12, 0)][-1]
+    assert last.status.value == "tracked"
+    apart = inverse(first.results[-1].estimate.T_world_left) @ last.estimate.T_world_left
+    assert np.linalg.norm(apart[:3, 3]) < 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_camera_that_sees_another_place_in_each_frame_goes_on(backend):
+    """Pictures of a slide show: nothing is ever measured, and no number overflows."""
+    config = slam.config.SystemConfig.for_kind("handheld", None, backend)
+    system = StereoSlam(RIG, None, backend, config=config)
+    frames = [Cloud(150, seed=k).features(T, k / 30, 0.3)[0] for k, T in enumerate(path(30))]
+    results = [system.process_features(features) for features in frames]
+    assert len(system.restarted) >= 4
+    assert {r.status.value for r in results[1:]} <= {"predicted", "lost"}
+    assert all(np.isfinite(r.estimate.covariance).all() for r in results)
+    assert len(system.trajectory()) == 30
+
+
+@pytest.mark.parametrize("duration", [0.0, 1.0, 1e5, 1e12])
+@pytest.mark.parametrize("kind", ["handheld", "driving"])
+def test_nothing_is_more_uncertain_than_unknown(kind, duration):
+    before = np.diag(np.repeat([0.1, 2.0], 3) ** 2)
+    P = moved_unseen(before, duration, KINDS[kind])
+    assert (np.linalg.eigvalsh(P) > 0).all()
+    assert np.sqrt(P[0, 0]) < 1.9 and np.sqrt(P[3, 3]) < 1001.0
+    assert duration or np.array_equal(P, before)
 
 
 def test_a_loop_puts_the_map_in_its_place(run):
