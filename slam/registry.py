@@ -11,9 +11,11 @@ Without a package, ``my_module:MyBackend`` is a name as well; the module may be 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 
@@ -85,15 +87,38 @@ def create(role: str, name: str, rig: Any, **options: Any) -> Any:
     """
     what = role[:-1].replace("end", " end")
     made = resolve(role, name)
+
+    def failed(error: BaseException) -> str:
+        return f"{what} {name!r} cannot be created: {cause(error)}"
+
     if options.get("models", options) is None:  # as where a class hands on its own default
         del options["models"]
     try:
         created = made(rig, **options)
     except SlamError:
         raise
+    except TypeError as error:
+        raise ConfigurationError(_unknown_option(f"{what} {name!r}", made, options) or failed(error)) from error
     except (Exception, SystemExit) as error:  # whatever a foreign class does
-        raise ConfigurationError(f"{what} {name!r} cannot be created: {cause(error)}") from error
+        raise ConfigurationError(failed(error)) from error
     return require_methods(role, created, repr(name))
+
+
+def _unknown_option(what: str, made: Any, options: Mapping[str, Any]) -> str:
+    """The line for the first option that a class does not take; empty where it takes all, or does not say."""
+    try:
+        known = signature(made).parameters
+    except (TypeError, ValueError):
+        return ""
+    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in known.values()):
+        return ""
+    wrong = next((option for option in options if option not in known), None)
+    if wrong is None:
+        return ""
+    own = [option for option in list(known)[1:] if option != "models"]  # the first one is the rig
+    if wrong == "models":
+        return f"{what} cannot be created: it does not take the argument models"
+    return f"{what}: {unknown('option', wrong, own)}" if own else f"{what} has no options, got {wrong!r}"
 
 
 def require_methods(role: str, part: Any, name: str = "") -> Any:

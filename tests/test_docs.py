@@ -23,7 +23,10 @@ from slam.commands.cli import app
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
+from slam.sequences.calibration_files import write_opencv
 from slam.testing import check_backend, findings
 from tests.scripts import load_script
 
@@ -97,11 +100,34 @@ def test_two_streams_of_arrays_are_followed(capsys):
     assert capsys.readouterr().out.count("tracked") == 3
 
 
-def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["write_bag.py", "synthetic:desk?frames=3", str(tmp_path / "walk")])
+def raw_folder(folder):
+    """Images of cameras that are distorted and turned to each other; what they show does not matter."""
+    import cv2
+
+    turned = cv2.Rodrigues(np.array([0.01, -0.02, 0.005]))[0]
+    left, right = (
+        PinholeCamera(150.0, 151.0, 80.0, 60.0, 160, 120, "radtan", (-0.1, k, 0.0, 0.0)) for k in (0.01, 0.02)
+    )
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        for k in range(3):
+            noise = np.random.default_rng(k).integers(0, 255, (120, 160), np.uint8)
+            cv2.imwrite(str(folder / side / f"{k:03d}.png"), noise)
+    write_opencv(folder / "calibration.yaml", StereoRig(left, right, turned, np.array([-0.1, 0.002, 0.001])))
+    return f"{folder}?fps=10"
+
+
+@pytest.mark.parametrize("name", ["walk", "walk.bag"])  # ROS 2, ROS 1
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_bag_is_written_and_read_again(tmp_path, monkeypatch, raw, name):
+    source = str(raw_folder(tmp_path / "raw")) if raw else "synthetic:desk?frames=3"
+    monkeypatch.setattr(sys, "argv", ["write_bag.py", source, str(tmp_path / name)])
     runpy.run_path(str(DOCS / "examples" / "write_bag.py"))
-    written, read = slam.open_sequence("synthetic:desk?frames=3"), slam.open_sequence(tmp_path / "walk")
+    written, read = slam.open_sequence(source), slam.open_sequence(tmp_path / name)
+    assert read.rig.is_rectified != raw
     assert read.rig.baseline == pytest.approx(written.rig.baseline)
+    np.testing.assert_allclose(read.rig.left.distortion, written.rig.left.distortion)
+    np.testing.assert_allclose(read.rig.R, written.rig.R, atol=1e-9)
     np.testing.assert_allclose(read.rig.left.K, written.rig.left.K)
     for one, other in zip(written, read, strict=True):
         assert one.stamp == pytest.approx(other.stamp, abs=1e-6)
@@ -375,7 +401,7 @@ def test_pages_show_the_examples_as_they_are_tested(file):
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.
 FOR_THE_READER = {
     "README.md": {"path/to/kitti_or_euroc_folder": "synthetic:desk?frames=3"},
-    "docs/sequences.md": {"sys.argv[1]": "'synthetic:desk?frames=3'", "sys.argv[2]": "'walk'"},
+    "docs/sequences.md": {"sys.argv[1:]": "('synthetic:desk?frames=3', 'walk')"},
     "docs/worlds.md": {"box=1": "box=1&width=160&height=120"},
 }
 #: Run by a test of its own.

@@ -1,14 +1,16 @@
-"""A ROS 2 recording of a rectified stereo sequence: ``python write_bag.py recording walk`` writes the folder walk."""
+"""A ROS recording of a stereo sequence: ``python write_bag.py SEQUENCE walk.bag`` (ROS 1) or ``… walk`` (ROS 2)."""
 
 import sys
 
 import numpy as np
-from rosbags.rosbag2 import Writer
+from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 import slam
 
-store = get_typestore(Stores.ROS2_HUMBLE)
+source, target = sys.argv[1:]
+ros1 = target.endswith(".bag")
+store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
 Time, Header, Image, CameraInfo, Region = (
     store.types[f"{package}/msg/{name}"]
     for package, name in [
@@ -21,26 +23,40 @@ Time, Header, Image, CameraInfo, Region = (
 )
 
 
-def camera_info(header, rig, baseline):
-    """CameraInfo of rectified images: no distortion D, no turn R, and the baseline [m] in P of the right camera."""
-    P = np.column_stack([rig.left.K, [-rig.left.fu * baseline, 0, 0]])
-    K, R, D = rig.left.K.ravel(), np.eye(3).ravel(), np.zeros(5)
-    return CameraInfo(header, rig.height, rig.width, "plumb_bob", D, K, R, P.ravel(), 0, 0, Region(0, 0, 0, 0, False))
+def header(time):
+    """Header at a time [ns]; ROS 1 counts messages in it."""
+    stamp = Time(*divmod(time, 10**9))
+    return Header(0, stamp, "stereo") if ros1 else Header(stamp, "stereo")
 
 
-sequence = slam.open_sequence(sys.argv[1])
-if not sequence.rig.is_rectified:
-    sys.exit("its images are not rectified: as image_rect they would give a wrong path")
-with Writer(sys.argv[2], version=9) as bag:
+def camera_info(header, camera, R, P):
+    """CameraInfo of a camera: K and D of its images, R and P (3, 4) of the rectified ones."""
+    D = np.array(camera.distortion or (0.0,) * 5)
+    model = "rational_polynomial" if len(D) > 5 else "plumb_bob"
+    if camera.model == "equidistant":
+        model = "equidistant"
+    K, R, P = camera.K.ravel(), R.ravel(), P.ravel()
+    return CameraInfo(header, camera.height, camera.width, model, D, K, R, P, 0, 0, Region(0, 0, 0, 0, False))
+
+
+sequence = slam.open_sequence(source)
+rectified = sequence.rig.rectified
+to_right = [-rectified.rig.left.fu * rectified.rig.baseline, 0, 0]  # the baseline is in P of the right camera
+cameras = {
+    "left": (sequence.rig.left, rectified.R_left, np.column_stack([rectified.rig.left.K, np.zeros(3)])),
+    "right": (sequence.rig.right, rectified.R_right, np.column_stack([rectified.rig.left.K, to_right])),
+}
+image_name = "image_rect" if sequence.rig.is_rectified else "image_raw"
+with rosbag1.Writer(target) if ros1 else rosbag2.Writer(target, version=9) as bag:
     topics = {
         (side, name): bag.add_connection(f"/stereo/{side}/{name}", kind.__msgtype__, typestore=store)
-        for side in ("left", "right")
-        for name, kind in (("image_rect", Image), ("camera_info", CameraInfo))
+        for side in cameras
+        for name, kind in ((image_name, Image), ("camera_info", CameraInfo))
     }
     for frame in sequence:
-        time = round(frame.stamp * 1e9)  # [ns]
-        header = Header(Time(*divmod(time, 10**9)), "stereo")
-        for side, image, baseline in (("left", frame.left, 0.0), ("right", frame.right, sequence.rig.baseline)):
-            pixels = Image(header, *image.shape, "mono8", 0, image.shape[1], image.ravel())
-            for name, message in (("image_rect", pixels), ("camera_info", camera_info(header, sequence.rig, baseline))):
-                bag.write(topics[side, name], time, store.serialize_cdr(message, message.__msgtype__))
+        time = round(frame.stamp * 1e9)
+        for side, image in (("left", frame.left), ("right", frame.right)):
+            pixels = Image(header(time), *image.shape, "mono8", 0, image.shape[1], image.ravel())
+            for name, message in ((image_name, pixels), ("camera_info", camera_info(header(time), *cameras[side]))):
+                serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+                bag.write(topics[side, name], time, serialize(message, message.__msgtype__))

@@ -373,7 +373,7 @@ def _title(sequence: Sequence | Recording, backend: str) -> str:
 
 
 def _finish(summary: dict[str, Any], folder: Path, picture: bool, quiet: bool) -> None:
-    """Leave the picture of a run and print its table, and a line where most frames were not tracked.
+    """Leave the picture of a run and print its table, and a line where many frames were not tracked.
 
     The exit status is 1 where none was.
     """

@@ -13,6 +13,7 @@ import numpy as np
 
 from slam.compare.collect import SERIES_COLUMNS
 from slam.compare.measure import Metric
+from slam.compare.plan import is_world
 from slam.compare.sweep import Run
 from slam.compare.tables import Group
 from slam.compare.trial import SERIES
@@ -21,7 +22,7 @@ from slam.evaluation.metrics import align, associate, chi_square_band
 from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import widths
+from slam.run.figures import stretch, widths
 from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
@@ -55,15 +56,19 @@ def pictures(group: Group) -> list[Picture]:
     shown = example(group)
     if not shown:
         return []
-    seed = next(iter(shown.values())).trial.seed
+    trial = next(iter(shown.values())).trial
+    of_seed = f", seed {trial.seed}" if is_world(trial.sequence) else ""
+    noisy = "" if is_world(trial.sequence) else (
+        " The band does not count what is not known of the recorded truth, which NEES does."
+    )  # fmt: skip
     known = {metric.key: metric for metric in group.metrics}
     main = known.get("ate_online_m") or known.get("gps_m")
-    found = [Picture("paths", "Paths from above", f"Paths from above, seed {seed}.", partial(draw_paths, group))]
+    found = [Picture("paths", "Paths from above", f"Paths from above{of_seed}.", partial(draw_paths, group))]
     if main is not None and group.trials > 1:
         text = f"{main.label}, of every trial; lines join the back ends' runs on the same recording."
         found.insert(0, Picture("trials", main.label, text, partial(draw_pairs, group, main)))
     if "nees_per_dof" in known:
-        text = f"Error of the position, seed {seed}, and the ±3σ that each back end claims (shaded)."
+        text = f"Error of the position{of_seed}, and the ±3σ that each back end claims (shaded).{noisy}"
         found.append(Picture("errors", "Error over time", text, partial(draw_errors, group)))
         text = (
             "NEES / 6 from the start over time, mean of the trials; 1 is expected, and the mean of a consistent "
@@ -135,14 +140,18 @@ def draw_paths(group: Group) -> Figure:
     """Top view of the first trial's paths and the true one."""
     figure, axis = _axes(3.6)
     truth = None
+    shown = []
     for width, (name, run) in zip(widths(len(group.runs), 1.6), example(group).items()):
         own, true = paths(run)
         truth = true if truth is None else truth
+        shown.append(own.positions[:, [0, 2]])
         axis.plot(*own.positions[:, [0, 2]].T, color=colours(group)[name], lw=width, label=name)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color="0.3", lw=1, label="truth")
+        shown.append(truth.positions[:, [0, 2]])
     axis.set(xlabel="right [m]", ylabel="forward [m]")
-    axis.axis("equal")
+    if not stretch(axis, np.concatenate(shown)):
+        axis.axis("equal")
     axis.locator_params(nbins=6)
     _legend_above(axis)
     return figure

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.compare.figures import as_pdf, pictures
 from slam.compare.measure import Metric
-from slam.compare.plan import Plan, short_name
+from slam.compare.plan import Plan, folder_name, is_world, short_name
 from slam.compare.statistics import FEWEST, LEVEL, Difference
 from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
@@ -192,7 +192,8 @@ def _difference_cells(d: Difference) -> list[str]:
 def _what(group: Group) -> str:
     """The sequence, which may go on in the next line behind a sign, and the variant."""
     variant = "" if group.variant.name == "surf" else f", {latex(group.variant.name)}"
-    name = re.sub(r"([:?/=_,-]|\\&|\\_)", r"\1\\allowbreak{}", latex(group.sequence))
+    shown = group.sequence if is_world(group.sequence) else folder_name(group.sequence)
+    name = re.sub(r"([:?/=_,-]|\\&|\\_)", r"\1\\allowbreak{}", latex(shown))
     return f"\\texttt{{{name}}}{variant}"
 
 

@@ -43,8 +43,8 @@ _HONESTY = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof")
 
 
 _REPLAYED = (
-    "in a replay the covariances are the back ends' own; those of a closed loop also hold what is not known of the "
-    "rig's calibration, so they are larger."
+    "covariances of a replay are the back end's alone; those of a closed loop are larger, as they count what is not "
+    "known of the rig's calibration."
 )
 
 

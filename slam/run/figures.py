@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
 _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
+_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
 
 
@@ -160,7 +161,7 @@ def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> 
     for axis, run, colour in zip(axes, runs, backend_colours([run.backend for run in runs])):
         draw_map(axis, run, truth, colour)
         axis.set(title=run.name)
-        _draw_end(axis, run.online, truth, colour)
+        _draw_end(axis, run, truth, colour)
     axes[-1].legend(*_named_once(axes), loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
     _save(figure, path)
 
@@ -184,7 +185,7 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) ->
         axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=shade, label=f"landmarks {label}")
     draw_path(axis, run, run.online, f"path of {run.name}", color=colour, lw=3, alpha=0.6)
     draw_loops(axis, run)
-    _draw_truth(axis, run.online, truth, (0, 2))
+    _draw_truth(axis, run, truth)
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
     _limit_to_most(axis, run)
 
@@ -258,45 +259,73 @@ def _ink(figure: Any) -> tuple[float, float, float, float]:
     return columns[0] / width, 1 - (rows[-1] + 1) / height, (columns[-1] + 1) / width, 1 - rows[0] / height
 
 
+def stretch(axis: Axes, points: np.ndarray) -> bool:
+    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
+    extent = np.ptp(points, axis=0)
+    narrow = int(np.argmin(extent))
+    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
+        return False
+    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
+    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
+    if narrow == 0:
+        axis.set(xlim=(middle - half, middle + half), xlabel=f"{axis.get_xlabel()}, on a scale of its own")
+    else:
+        axis.set(ylim=(middle - half, middle + half), ylabel=f"{axis.get_ylabel()}, on a scale of its own")
+    return True
+
+
 def widths(count: int, last: float) -> list[float]:
     """Widths of lines, the first the widest: where lines coincide, each is seen beside the one drawn over it."""
     return [last * (1 + 1.2 * (count - 1 - i)) for i in range(count)]
 
 
+def place_of_truth(run: RunData, truth: Trajectory) -> Array:
+    """Pose (4, 4) of the true path's world in the run's, in which both paths begin at the same position.
+
+    It is turned by the first pose where the truth is exact. A recorded one is turned so that the whole paths fit: an
+    error of its first orientation by some tenths of a degree would look like an error of the path that grows with the
+    distance.
+    """
+    own, true = associate(run.online, truth, 0.02, interpolated=True)
+    T = np.eye(4)
+    T[:3, :3] = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
+    T[:3, 3] = own.positions[0] - T[:3, :3] @ true.positions[0]
+    return T
+
+
 def position_errors(run: RunData, truth: Trajectory) -> tuple[Array, Array, Array]:
     """Time since the start (N,) [s], error of the online position and its claimed standard deviation, (N, 3) [m] each.
 
-    Both are along the axes of the run's world, in which the truth begins at the estimated position. It is turned by the
-    first pose where the truth is exact. A recorded one is turned so that the whole paths fit: an error of its first
-    orientation by some tenths of a degree would look like an error of the path that grows with the distance.
+    Both are along the axes of the run's world, see `place_of_truth`.
     """
     own, true = associate(run.online, truth, 0.02, interpolated=True)
-    R = own.poses[0, :3, :3] @ true.poses[0, :3, :3].T if run.truth_is_exact else align(true, own).R
-    expected = (true.positions - true.positions[0]) @ R.T + own.positions[0]
+    T = place_of_truth(run, truth)
+    expected = true.positions @ T[:3, :3].T + T[:3, 3]
     rows = np.searchsorted(run.online.stamps, own.stamps)
     return own.stamps - run.online.stamps[0], own.positions - expected, run.deviations[rows]
 
 
-def _draw_truth(axis: Axes, online: Trajectory, truth: Trajectory | None, components: tuple[int, int]) -> None:
-    """The true path, aligned to the estimated one."""
+def _draw_truth(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
+    """The true path of the estimated poses, from above, as `place_of_truth` says."""
     if truth is None:
         return
-    own, true = associate(online, truth, 0.02, interpolated=True)
-    aligned = align(true, own).apply_trajectory(true)
-    axis.plot(*aligned.positions[:, list(components)].T, "--", color=_TRUTH, lw=1.2, label="true path")
+    _, true = associate(run.online, truth, 0.02, interpolated=True)
+    T = place_of_truth(run, truth)
+    axis.plot(*(true.positions @ T[:3, :3].T + T[:3, 3])[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
 
 
-def _draw_end(axis: Axes, online: Trajectory, truth: Trajectory | None, colour: str) -> None:
+def _draw_end(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) -> None:
     """The end of the path in an inset, large enough to tell it from the true path."""
+    online = run.online
     if truth is None or len(online) < 3:
         return
     extent = max(float(np.ptp(online.positions, axis=0).max()), 1e-3)
-    own, true = associate(online, truth, 0.02, interpolated=True)
-    error = float(np.linalg.norm((align(true, own).apply_trajectory(true).positions - own.positions)[-1]))
-    end, half = own.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
+    _, errors, _ = position_errors(run, truth)
+    error = float(np.linalg.norm(errors[-1]))
+    end, half = online.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
     inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
     inset.plot(*online.positions[:, [0, 2]].T, color=colour, lw=3, alpha=0.6)
-    _draw_truth(inset, online, truth, (0, 2))
+    _draw_truth(inset, run, truth)
     inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
     inset.set(xticks=[], yticks=[])
     inset.set_title(f"end, {200 * half:.2g} cm wide", fontsize=7)

@@ -21,12 +21,7 @@ _TRACKED = "tracked"
 _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
 
-#: What may be the cause where each step gave enough.
-_ANY = (
-    "features are found in both images, but not again in the next frame: a vehicle's camera without --kind "
-    "driving, frames too far apart, images that are not in order of time or have other times than theirs (fps=…, "
-    "times=…), or the calibration of another camera"
-)
+_MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
 
 def outcome(
@@ -36,8 +31,9 @@ def outcome(
     in_map: bool = False,
     dropped: int = 0,
     doubt: str = "",
+    driving: bool = False,
 ) -> str:
-    """What to say of a run in which most frames were not tracked, with the likely cause; empty for others.
+    """What to say of a run in which many frames were not tracked, with the likely cause; empty for others.
 
     Args:
         record: of the run. Its first frame is not counted: there is no map yet.
@@ -46,14 +42,16 @@ def outcome(
         in_map: the run began in the map of an earlier one.
         dropped: frames of a live run that came too late.
         doubt: of the motion, see `motion_doubt`; a cause where nothing else is one.
+        driving: the motion is known to be that of a vehicle.
     """
-    frames, tracked = len(record.statuses) - 1, record.statuses[1:].count(_TRACKED)
-    if frames < 1 or 2 * tracked >= frames:
+    untracked = [row for row, status in enumerate(record.statuses) if row and status != _TRACKED]
+    frames = len(record.statuses) - 1
+    tracked = frames - len(untracked)
+    if frames < 1 or len(untracked) <= _MANY * frames:
         return ""
-    how = "no frame was" if not tracked else f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'}"
-    first = warnings[0] if warnings else _cause(record, rig, in_map) or doubt
+    first = warnings[0] if warnings else _cause(record, untracked, rig, in_map) or doubt
     if not first and dropped < frames:  # where most came, the gaps are hardly all of it
-        first = _ANY
+        first = _any_cause(driving)
     causes = [first] if first else []
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
@@ -61,13 +59,33 @@ def outcome(
             f"{few} dropped, and the frames about them are far apart: make a frame cheaper (smaller images, --set "
             "objects.mode=off), or move more slowly"
         )
-    return f"{how} tracked; likely cause: {'; and '.join(causes)}"
+    return f"{_how_many(tracked, frames)}; likely cause: {'; and '.join(causes)}"
 
 
-def motion_doubt(record: RunRecord, motion: MotionModel) -> str:
+def _how_many(tracked: int, frames: int) -> str:
+    """How many of the frames were tracked, or were not where these are fewer."""
+    if not tracked:
+        return "no frame was tracked"
+    if 2 * tracked < frames:
+        return f"only {tracked} of {frames} frames {'was' if tracked == 1 else 'were'} tracked"
+    return f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
+
+
+def _any_cause(driving: bool) -> str:
+    """What may be the cause where each step gave enough."""
+    kind = "" if driving else "a vehicle's camera without --kind driving, "
+    return (
+        f"features are found in both images, but not again in the next frame: {kind}frames too far apart, images that "
+        "are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of another "
+        "camera"
+    )
+
+
+def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
     """What to say where velocities change from frame to frame far more than the motion model lets them; else empty.
 
-    Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand.
+    Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand, unless the
+    motion is known to be that of a vehicle.
     """
     measured = np.array(record.measured, bool)
     stamps, poses = np.array(record.stamps), np.array(record.poses).reshape(-1, 4, 4)
@@ -84,9 +102,10 @@ def motion_doubt(record: RunRecord, motion: MotionModel) -> str:
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
     if not ratio >= _JERKY:  # also where it is no number
         return ""
+    kind = "" if driving else ", and whether this is a vehicle (--kind driving)"
     return (
         f"from frame to frame the velocity changes {ratio:.0f} times as much as expected: check the times of the "
-        "images (fps=…, or seconds in times=…), and whether this is a vehicle (--kind driving)"
+        f"images (fps=…, or seconds in times=…){kind}"
     )
 
 
@@ -95,16 +114,16 @@ def nothing_tracked(summary: dict[str, Any]) -> bool:
     return summary["frames"] > 1 and not summary["status"].get(_TRACKED)
 
 
-def _cause(record: RunRecord, rig: StereoRig, in_map: bool) -> str:
-    """The first step that gave too little, and what to look at; empty where none did."""
-    features, stereo = np.median(record.features, axis=0)
+def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: bool) -> str:
+    """The first step that gave frames that were not tracked too little, and what to look at; empty where none did."""
+    features, stereo = np.median(np.array(record.features)[untracked], axis=0)
     if features < ENOUGH_FEATURES:
-        return f"the images show hardly anything to follow ({features:.0f} features in the median frame)"
+        return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
     if stereo < ENOUGH_FEATURES:
         return (
-            f"in the median frame {stereo:.0f} of {features:.0f} features are found in the right image: check that the "
-            "images are of two cameras, the left one first, and the calibration"
+            f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
+            "check that the images are of two cameras, the left one first, and the calibration"
         )
     return baseline_doubt(rig)

@@ -14,10 +14,19 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from slam.errors import SlamError
-from slam.evaluation.metrics import align, associate
+from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
-from slam.run.figures import RunData, draw_map, draw_path, position_errors, well_known, widths
+from slam.run.figures import (
+    RunData,
+    draw_map,
+    draw_path,
+    place_of_truth,
+    position_errors,
+    stretch,
+    well_known,
+    widths,
+)
 from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 
 if TYPE_CHECKING:
@@ -31,8 +40,8 @@ PICTURE = "summary.png"
 _LETTER = 0.6  # mean width of a letter in sizes of the font
 _TRUTH = "0.25"
 _AXES = ("right", "down", "forward")
+_HEADROOM = 1.2  # height of a map over that of what it shows: room for the legend
 _MOST_MAPS = 3  # side by side in the summary
-_STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _PAGE = 8.0  # [in] below which text is small, as in a paper
 _LEAST_HEIGHT = 7.8  # [in] of the summary, below which legends take the place of the panels
 _HANDLE = 4.8  # width of what stands beside a label of a legend, in sizes of the font
@@ -209,25 +218,10 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     _set_title(axis, "Path, online, from above (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     shown = paths if truth is None else [*paths, truth]
-    if not _stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
+    if not stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
         axis.set_aspect("equal", adjustable="datalim")
     axis.legend(frameon=False)
     axis.grid(color="0.9", lw=0.5)
-
-
-def _stretch(axis: Axes, points: np.ndarray) -> bool:
-    """Give each axis a scale of its own where points (N, 2) lie nearly in a line along one; whether it did."""
-    extent = np.ptp(points, axis=0)
-    narrow = int(np.argmin(extent))
-    if not extent[narrow] * _STRAIGHT < extent[1 - narrow]:
-        return False
-    half = 0.6 * max(float(extent[narrow]), 0.01 * float(extent[1 - narrow]))  # what is straight is not blown up
-    middle = float(points[:, narrow].max() + points[:, narrow].min()) / 2
-    if narrow == 0:
-        axis.set(xlim=(middle - half, middle + half), xlabel=f"{axis.get_xlabel()}, on a scale of its own")
-    else:
-        axis.set(ylim=(middle - half, middle + half), ylabel=f"{axis.get_ylabel()}, on a scale of its own")
-    return True
 
 
 def _colours(runs: Sequence[RunData]) -> list[str]:
@@ -238,10 +232,11 @@ def _map_panel(axis: Axes, run: RunData, colour: str) -> None:
     """The map from above with ellipses."""
     draw_map(axis, run, run.truth, colour)
     _widen(axis)
+    axis.set_ylim(top=axis.get_ylim()[0] + _HEADROOM * float(np.ptp(axis.get_ylim())))
     known, every = len(well_known(run)), len(run.positions)
     shown = "2σ ellipses" if known == every else f"2σ ellipses of the {known} that are well known"
     _set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
-    axis.legend(fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
+    axis.legend(loc="upper left", ncols=2, fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
 
 
 def _widen(axis: Axes, ratio: float = 1.15) -> None:
@@ -272,7 +267,7 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
                 label = f"{run.name}, not tracked"
                 axis.plot(untracked, np.zeros(len(untracked)), "x", ms=4, color=colour, label=label)
     for axis, name in zip(axes, _AXES):
-        axis.set_ylabel(f"{name} [{unit}]")
+        axis.set_ylabel(f"{name} [{unit}]" if known else f"σ {name} [{unit}]")
         axis.axhline(0, color="0.6", lw=0.5)
         axis.margins(x=0.01)
     turned = ", truth turned to fit" if any(run.truth is not None and not run.truth_is_exact for run in runs) else ""
@@ -322,16 +317,15 @@ def _in_one_world(runs: Sequence[RunData]) -> tuple[list[Trajectory], Trajectory
     first = next((run for run in runs if run.truth is not None), None)
     if first is None or first.truth is None:
         return [run.online for run in runs], None
-    own, true = associate(first.online, first.truth, 0.02)
-    to_first = align(true, own)
+    to_first = place_of_truth(first, first.truth)
     paths = []
     for run in runs:
         if run is first or run.truth is None:
             paths.append(run.online)
             continue
-        own, true = associate(run.online, run.truth, 0.02)
-        paths.append(to_first.apply_trajectory(align(own, true).apply_trajectory(run.online)))
-    return paths, to_first.apply_trajectory(first.truth)
+        in_truth = inverse(place_of_truth(run, run.truth)) @ run.online.poses
+        paths.append(Trajectory(run.online.stamps, to_first @ in_truth))
+    return paths, Trajectory(first.truth.stamps, to_first @ first.truth.poses)
 
 
 def _unit(largest: float) -> tuple[float, str]:

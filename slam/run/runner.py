@@ -307,10 +307,10 @@ def _finish(
 ) -> dict[str, Any]:
     """Write the last files, each whether or not another fails, and return the summary."""
     warnings = getattr(system, "warnings", ())
-    doubt = motion_doubt(record, options.config.models.motion)
-    tracking = outcome(
-        record, sequence.rig, warnings, options.prior_map is not None, live.dropped if live else 0, doubt
-    )
+    driving = options.origin.get("kind") == "driving"
+    doubt = motion_doubt(record, options.config.models.motion, driving)
+    in_map, dropped = options.prior_map is not None, live.dropped if live else 0
+    tracking = outcome(record, sequence.rig, warnings, in_map, dropped, doubt, driving)
     if doubt and not tracking:
         logger.warning("%s", doubt)
     summary: dict[str, Any] = {

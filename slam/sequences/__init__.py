@@ -141,11 +141,25 @@ def _require_recording(folder: Path, text: str) -> None:
     if _is_ros(folder):
         return
     if not folder.exists():
-        raise SequenceError(f"{folder}: there is no such folder{_world_meant(text) or _folder_meant(folder)}")
+        raise SequenceError(f"{folder}: there is no such {_kind(folder)}{_world_meant(text) or _folder_meant(folder)}")
     if not folder.is_dir():
-        raise SequenceError(f"{folder}: a file where the sequence's folder should be")
+        raise SequenceError(f"{folder}: a file where the sequence's folder should be{_video_meant(folder)}")
     if not any(folder.iterdir()):
         raise SequenceError(f"{folder}: the folder is empty")
+
+
+def _kind(path: Path) -> str:
+    """What a name that does not exist would be."""
+    return "file or folder" if path.suffix else "folder"
+
+
+def _video_meant(file: Path) -> str:
+    """How to run a video; empty where the file is none."""
+    from slam.sequences.videos import VIDEO_SUFFIXES
+
+    if file.suffix.lower() not in VIDEO_SUFFIXES:
+        return ""
+    return f"; a video with both images side by side is camera:{file}, two videos are {file.parent}?left=…&right=…"
 
 
 def _world_meant(text: str) -> str:

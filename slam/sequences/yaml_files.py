@@ -45,7 +45,7 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
 
     text = read_calibration(path)
     if text.startswith("%YAML:"):
-        text = text.partition("\n")[2]
+        text = "\n" + text.partition("\n")[2]  # rows keep their numbers
     text = re.sub(r"\.(Nan|Inf)\b", lambda match: match[0].lower(), text)
     loader = _loader()
     try:

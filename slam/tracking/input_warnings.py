@@ -22,6 +22,10 @@ SHORTEST, LONGEST = 1e-3, 10.0
 #: guard: Baselines that rigs have [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
+#: guard: How far a principal point may be from the middle of an image, in parts of its width or height. That of a
+#: calibration for images half or twice as large is off by a quarter or a half.
+_OFF_MIDDLE = 0.2
+
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: frames in a row that must show too little before it is said
 _LAST_LOOK = 64  # guard: frame at which the pair is looked at for the last time
@@ -47,8 +51,7 @@ class InputWarnings:
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
         self._pair_is_known = self._texture_is_known = self._partners_are_known = False
-        unlikely = baseline_doubt(rig)
-        if unlikely:
+        for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig))):
             self._warn(unlikely)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
@@ -148,6 +151,20 @@ def baseline_doubt(rig: StereoRig) -> str:
         f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres? "
         "(an OpenCV file in millimetres needs unit=mm)"
     )
+
+
+def size_doubt(rig: StereoRig) -> str:
+    """What is wrong with a principal point far from the middle of the images; empty where it is near."""
+    middle = np.array([rig.width, rig.height]) / 2
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        point = np.array([camera.u0, camera.v0])
+        if (np.abs(point - middle) > 2 * _OFF_MIDDLE * middle).any():
+            return (
+                f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
+                f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
+                "another size?"
+            )
+    return ""
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -87,6 +87,10 @@ class Raises:
     def __init__(self, rig): raise RuntimeError("no way")
 class Quits:
     def __init__(self, rig): raise SystemExit(0)
+class Deeper:
+    def __init__(self, rig): len(3)
+class Plain:
+    def __init__(self, rig, models=None, window=5): pass
 number = 3
 """
 
@@ -106,10 +110,18 @@ def test_modules_and_classes_of_elsewhere_that_fail_get_one_line(tmp_path, monke
         "Raises": r"cannot be created: RuntimeError: no way \(foreign_classes.py, line 5\)",
         "Quits": "cannot be created: SystemExit",
         "number": "cannot be created: TypeError: 'int' object is not callable",
+        "Deeper": r"cannot be created: TypeError: .*\(foreign_classes.py, line 9\)",
     }
     for name, words in cases.items():
         with pytest.raises(ConfigurationError, match=words):
             registry.create("backends", f"foreign_classes:{name}", "rig")
+    words = r"foreign_classes:Plain': unknown option 'windo' \(did you mean 'window'\?\); known: window"
+    with pytest.raises(ConfigurationError, match=words):
+        registry.create("backends", "foreign_classes:Plain", "rig", windo=3)
+    with pytest.raises(ConfigurationError, match=r"foreign_classes:Nothing' has no options, got 'windo'"):
+        registry.create("backends", "foreign_classes:Nothing", "rig", windo=3)
+    with pytest.raises(ConfigurationError, match="does not take the argument models"):
+        registry.create("backends", "foreign_classes:Nothing", "rig", models=3)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from slam.commands.plot import leave_picture, plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import RunData, draw_map, position_errors, well_known
-from slam.run.plots import _SMALL_STYLE, _STYLE, KINDS, _in_one_world, _path_panel, _stretch, plot, read_runs
+from slam.run.figures import RunData, draw_map, position_errors, stretch, well_known
+from slam.run.plots import _SMALL_STYLE, _STYLE, KINDS, _in_one_world, _path_panel, plot, read_runs
 from slam.run.runner import RunOptions, run
 from slam.run.style import backend_colours
 from slam.sequences import open_sequence
@@ -89,6 +89,18 @@ def test_a_run_of_later_frames_lies_where_it_was(runs):
     assert np.linalg.norm(both[1].online.positions[0]) < 1e-3
 
 
+def test_the_true_path_begins_where_the_run_does(runs):
+    """Also of a run that went wrong: a path that is fitted to it would hide by how much."""
+    ((good, *_),) = read_runs([runs / "a"])
+    poses = good.online.poses.copy()
+    poses[4:, 0, 3] += 0.5
+    bad = replace(good, online=Trajectory(good.online.stamps, poses), truth_is_exact=True)
+    _, truth = _in_one_world([bad])
+    np.testing.assert_allclose(truth.positions[0], bad.online.positions[0], atol=1e-9)
+    _, error, _ = position_errors(bad, bad.truth)
+    np.testing.assert_allclose(bad.online.positions - truth.positions, error, atol=1e-9)
+
+
 def test_the_true_path_of_a_run_is_that_of_its_frames(runs):
     truth = open_sequence(WORLD).ground_truth
     kept = Trajectory.read_tum(runs / "later" / "truth.txt")
@@ -105,6 +117,12 @@ def test_a_run_without_truth_or_objects_is_drawn(runs, tmp_path, kind):
     (tmp_path / "a" / "truth.txt").unlink()
     plot_runs([tmp_path / "a"], tmp_path / "a.png", kind)
     assert (tmp_path / "a.png").stat().st_size > 1000
+    if kind == "errors":
+        from matplotlib import rc_context
+
+        with rc_context(_STYLE):
+            labels = [axis.get_ylabel() for axis in KINDS[kind]([RunData.read(tmp_path / "a", "a")], None).axes]
+        assert [label.partition(" [")[0] for label in labels] == ["σ right", "σ down", "σ forward"]
 
 
 def test_frames_that_were_not_tracked_are_told_from_others(runs, tmp_path):
@@ -162,12 +180,12 @@ def test_a_straight_path_has_a_scale_of_its_own_across(across):
     axis = Figure().subplots()
     points = np.zeros((30, 2))
     points[:, 1 - across] = np.arange(30)
-    assert not _stretch(axis, 0 * points)
-    assert _stretch(axis, points)
+    assert not stretch(axis, 0 * points)
+    assert stretch(axis, points)
     assert np.ptp((axis.get_xlim, axis.get_ylim)[across]()) == pytest.approx(0.01 * 29 * 1.2)
     assert (axis.get_xlabel, axis.get_ylabel)[across]().endswith("a scale of its own")
     points[:, across] = 3 * np.sin(np.arange(30))
-    assert not _stretch(axis, points)
+    assert not stretch(axis, points)
 
 
 def test_the_whole_true_path_is_in_the_picture(runs):

@@ -16,6 +16,7 @@ from slam.commands import display
 from slam.compare.figures import colours, draw_errors, draw_nees, draw_pairs, pictures
 from slam.compare.measure import BY_KEY
 from slam.compare.paper import _letters, _table, differences_table, latex, means_table, write_paper
+from slam.compare.plan import Plan
 from slam.compare.report import conclusions, write_report
 from slam.compare.statistics import Verdict
 from slam.compare.tables import count_tests, groups, write_tables
@@ -155,7 +156,7 @@ def test_replays_say_why_their_covariances_are_smaller(tmp_path):
     closed_loop, replay = conclusions(groups(of, runs))
     assert not [line for line in closed_loop.honesty if "its closed loop" in line]
     (why,) = (line for line in replay.honesty if "its closed loop" in line)
-    assert why.startswith("NEES / 6 of ekf is 1.50, and 0.50 in its closed loop: in a replay the covariances are")
+    assert why.startswith("NEES / 6 of ekf is 1.50, and 0.50 in its closed loop: covariances of a replay are")
     assert (
         "NEES / 6 of ekf is 1.50, and 0.50 in its closed loop" in write_report(of, runs, tmp_path, "here").read_text()
     )
@@ -231,6 +232,17 @@ def test_figures_for_papers(paper):
         assert content.startswith(b"%PDF")
         assert b"CreationDate" not in content
         assert b"/Type3" not in content  # fonts that many publishers refuse
+
+
+def test_captions_name_a_recording_by_its_folder(tmp_path):
+    """Where it lies on one's disk is nothing for a paper, and it has no seed."""
+    of = Plan(("/home/me/data/2011_09_26/drive_0013?kind=driving",), ("ekf", "smoother"), replay=False)
+    runs = make(tmp_path, of)
+    (caption,) = re.findall(r"\\caption\{(.*)\}\n", means_table(groups(of, runs)[0]))
+    assert "drive" in caption and "home" not in caption and "kind" not in caption
+    captions = {picture.name: picture.caption for picture in pictures(groups(of, runs)[0])}
+    assert captions["paths"] == "Paths from above."
+    assert "does not count what is not known of the recorded truth" in captions["errors"]
 
 
 WRITE = """

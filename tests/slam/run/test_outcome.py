@@ -21,9 +21,12 @@ def record(tracked: int, frames: int = 21, features: tuple[int, int] = (200, 150
 
 @pytest.mark.parametrize(
     ("tracked", "words"),
-    [(20, ""), (10, ""), (9, "only 9 of 20 frames were tracked"), (1, "only 1 of 20 frames was"), (0, "no frame was")],
-)
-def test_fewer_than_half_are_told(tracked, words):
+    [
+        (20, ""), (18, ""), (17, "3 of 20 frames were not tracked"), (10, "10 of 20 frames were not tracked"),
+        (9, "only 9 of 20 frames were tracked"), (1, "only 1 of 20 frames was"), (0, "no frame was"),
+    ],
+)  # fmt: skip
+def test_where_more_than_one_in_ten_is_not_tracked_it_is_told(tracked, words):
     said = outcome(record(tracked), RIG)
     assert said.startswith(words) and bool(said) == bool(words)
 
@@ -31,8 +34,8 @@ def test_fewer_than_half_are_told(tracked, words):
 @pytest.mark.parametrize(
     ("features", "baseline", "more", "words"),
     [
-        ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median frame)"),
-        ((200, 3), 0.12, {}, "in the median frame 3 of 200 features are found in the right image"),
+        ((8, 8), 0.12, {}, "the images show hardly anything to follow (8 features in the median of these frames)"),
+        ((200, 3), 0.12, {}, "in the median of these frames 3 of 200 features are found in the right image"),
         ((200, 150), 120.0, {}, "the cameras are 120 m apart"),
         (
             (200, 150),
@@ -55,6 +58,21 @@ def test_fewer_than_half_are_told(tracked, words):
 def test_the_first_step_that_gave_too_little_is_the_cause(features, baseline, more, words):
     rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, baseline, 320, 240)
     assert outcome(record(0, features=features), rig, **more).startswith(f"no frame was tracked; likely cause: {words}")
+
+
+def test_the_cause_is_sought_in_the_frames_that_were_not_tracked():
+    """A fifth of the frames is dark."""
+    run = record(16)
+    run.features[17:] = [(5, 5)] * 4
+    said = outcome(run, RIG)
+    assert said.startswith("4 of 20 frames were not tracked; likely cause: the images show hardly anything")
+
+
+def test_what_is_known_to_be_a_vehicle_is_not_asked_to_be_one():
+    assert "--kind driving" in outcome(record(0), RIG)
+    assert "--kind driving" not in outcome(record(0), RIG, driving=True)
+    assert "--kind driving" in motion_doubt(moving(10.0), MotionModel())
+    assert "--kind driving" not in motion_doubt(moving(10.0), MotionModel(), driving=True)
 
 
 def test_a_run_of_one_frame_has_nothing_to_track():

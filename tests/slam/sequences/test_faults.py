@@ -39,7 +39,12 @@ def test_an_empty_folder(tmp_path: Path) -> None:
 
 def test_a_file_where_the_sequence_should_be(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(SequenceError, match=r"a\.txt: a file where the sequence's folder should be"):
+    (tmp_path / "both.mp4").write_text("x")
+    with pytest.raises(SequenceError, match=r"folder should be; a video .* is camera:.*both\.mp4"):
+        open_sequence(tmp_path / "both.mp4")
+    with pytest.raises(SequenceError, match=r"nowhere\.bag: there is no such file or folder"):
+        open_sequence(tmp_path / "nowhere.bag")
+    with pytest.raises(SequenceError, match=r"a\.txt: a file where the sequence's folder should be$"):
         open_sequence(tmp_path / "a.txt")
 
 

@@ -167,6 +167,13 @@ def test_hostile_yaml(tmp_path, text):
     assert time.process_time() - started < 2.0
 
 
+@pytest.mark.parametrize("first", ["%YAML:1.0\n---", "%YAML 1.1\n---", "---\n# a comment"])
+def test_a_fault_in_yaml_is_in_the_row_that_an_editor_shows(tmp_path, first):
+    (tmp_path / "a.yaml").write_text(f"{first}\nx: 1\ny: }}\nz: 3\n")
+    with pytest.raises(CalibrationError, match=r"a\.yaml, row 4: no valid YAML"):
+        read_yaml(tmp_path / "a.yaml")
+
+
 def test_nothing_in_yaml_is_executed(tmp_path):
     (tmp_path / "a.yaml").write_text(f"x: !!python/object/apply:os.mkdir [{tmp_path / 'made'}]\n")
     assert read_yaml(tmp_path / "a.yaml") == {"x": None}

@@ -198,3 +198,16 @@ def test_a_run_says_it_on_the_terminal_and_in_its_summary(slam_command, tmp_path
         "run", f"{tmp_path / 'mine'}?fps=20&left=right&right=left", "--out", tmp_path / "o2", "--quiet", "--no-picture"
     )
     assert "swapped" not in done.stderr
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_a_calibration_for_images_of_another_size_is_suspected(times):
+    """Its file names no size: that of the images is taken."""
+    rig = slam.StereoRig.rectified_pair(times * 300.0, times * 160.0, times * 120.0, 0.12, 320, 240)
+    said = [line for line in lines(stamped([0.0]), rig=rig) if "calibration for images of another size" in line]
+    assert bool(said) == (times != 1.0)
+
+
+def test_the_image_of_a_real_rig_is_not_suspected():
+    rig = slam.StereoRig.rectified_pair(718.9, 607.2, 185.2, 0.54, 1241, 376)  # KITTI's
+    assert lines(stamped([0.0]), rig=rig) == []
