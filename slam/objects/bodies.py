@@ -56,6 +56,7 @@ class Body:
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
         apart_from: id of the body as whose part it was found, which moves otherwise; None where there is none.
+        distinct: ids of bodies that it is known not to be a part of.
         estimate: of the back end; None where there is none yet.
     """
 
@@ -89,6 +90,7 @@ class Body:
     reported: int = 0
     reported_unmeasured: int = 0
     apart_from: int | None = None
+    distinct: frozenset[int] = frozenset()
     estimate: ObjectEstimate | None = field(default=None, repr=False)
 
     @property

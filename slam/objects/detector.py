@@ -42,6 +42,7 @@ from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_ve
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
+_DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
 _ESTABLISHED = 0.4  # [s] of measured frames, at the present rate, from which a body is remembered in any case
 
 
@@ -222,7 +223,7 @@ class MovingObjectDetector:
         body = founding.body(self._next_body, tracks, group)
         others = {id: other for id, other in self.bodies.items() if id != whole}
         known = membership.overlapped(others, tracks, members, body)
-        known = known or membership.whole_of(others, tracks, members)
+        known = known or membership.whole_of(others, tracks, members, body)
         if known is None:
             body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
             self.bodies[body.id] = body
@@ -253,7 +254,7 @@ class MovingObjectDetector:
         assert tracks is not None
         for known in self.bodies.values():
             mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            if known.measured and len(mine) < len(members) and membership.part_of(body, tracks, mine):
+            if known.measured and len(mine) < len(members) and membership.part_of(body, members, tracks, mine, known):
                 return self._in_place_of(known, body, mine)
         return body
 
@@ -328,7 +329,7 @@ class MovingObjectDetector:
             body = self.bodies.get(id)  # it may have taken the place of another
             if body is not None and body.measured:
                 mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
-                older = {id: other for id, other in self.bodies.items() if id < body.id}
+                older = {id: b for id, b in self.bodies.items() if id < body.id and id not in body.distinct}
                 whole = membership.overlapped(older, tracks, mine, body)
                 alike = body.alike + 1 if whole is not None else 0
                 if alike != body.alike:
@@ -348,7 +349,13 @@ class MovingObjectDetector:
         for known in older.values():
             theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
             fewer = known.measured and len(theirs) < count and known.id != body.apart_from
-            if fewer and membership.part_of(body, tracks, theirs):
+            if not fewer or not membership.goes_with(body, tracks, theirs):
+                continue
+            mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            distinctness = membership.distinctness(body, mine, known, theirs, tracks)
+            if distinctness > _DISTINCT:
+                body = self.bodies[body.id] = replace(body, distinct=body.distinct | {known.id})
+            elif distinctness < 1.0:
                 self.bodies[known.id] = self._in_place_of(known, body, theirs)
                 tracks.body[tracks.body == body.id] = known.id
                 del self.bodies[body.id]

@@ -46,6 +46,7 @@ _MOST = 0.5  # share of the members that must fit for those to leave that do not
 _ENOUGH = 6  # frames after which a member must fit, and after which one that did not may join again
 _RETURNED = chi_square_limit(6, 0.99)  # of place and velocity of a body that is seen again
 _WEAK = 1e-8  # numerics: variance that is added to a known pose's [m²]
+_UNLIKE = 0.02  # share of their motion by which motions of two bodies differ at least: those of parts differ by 0.01
 _APART = 2.0  # a group has a motion of its own that leaves so many times less χ² than chance would make of a body's
 
 
@@ -89,6 +90,13 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
 
     A constant velocity is only the first guess for a body that starts to move: poses and points are improved in turn.
     """
+    body = _with_poses_fitted(body, tracks, rows)
+    points, A, _ = in_body_axes(body, tracks, rows)
+    return with_extent(replace(body, T=body.history[slot]), _means(points, A))
+
+
+def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+    """A body with its poses over the window fitted to what tracks measured."""
     for _ in range(_ROUNDS):
         points, A, _ = in_body_axes(body, tracks, rows)
         y = _means(points, A)
@@ -97,8 +105,7 @@ def fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp], slot: int) -> Bod
         normal = (JA @ J[:, None]).sum(axis=0) + np.diag([_TURN**-2] * 3 + [_SHIFT**-2] * 3)
         right = times_vectors(JA, points - y[:, None]).sum(axis=0)
         body = replace(body, history=body.history @ exp(np.linalg.solve(normal, right[..., None])[..., 0]))
-    points, A, _ = in_body_axes(body, tracks, rows)
-    return with_extent(replace(body, T=body.history[slot]), _means(points, A))
+    return body
 
 
 def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
@@ -299,8 +306,13 @@ def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
     return best
 
 
-def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body, near a newly found one, have moved with that all the time.
+def part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> bool:
+    """Whether the members `rows` of the body `own`, near another one, make one rigid body with its members `theirs`."""
+    return goes_with(whole, tracks, rows) and distinctness(whole, theirs, own, rows, tracks) < 1.0
+
+
+def goes_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+    """Whether the members `rows` of another body, near this one, have moved about as it has all the time.
 
     Much more is asked for than of `overlapped`: next to nothing of what the still world leaves unexplained may be left.
     """
@@ -312,11 +324,35 @@ def part_of(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     return float(_squares(points, A).sum()) < _PART_EXPLAINED * still
 
 
-def whole_of(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp]) -> Body | None:
-    """The measured body of which tracks are a part, if it has more of them that are seen; else None."""
+def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
+    """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
+
+    By the χ² that the poses of one body for all tracks leave more than those of two bodies, in the frames that both are
+    known in: as a share of what it is by chance (99 %), and of what it is where the motions differ by `_UNLIKE` of the
+    motion itself. The lesser one counts: errors of stereo are alike in successive frames, so chance alone is no measure
+    for a fast body.
+    """
+    both = one.known & other.known
+    one, other = replace(one, known=both), replace(other, known=both)
+
+    def left(body: Body, rows: NDArray[np.intp]) -> float:
+        return float(_squares(*in_body_axes(_with_poses_fitted(body, tracks, rows), tracks, rows)[:2]).sum())
+
+    every = np.concatenate([ones, others])
+    more = left(one, every) - left(one, ones) - left(other, others)
+    _, _, known = in_body_axes(one, tracks, every)
+    still = float(_squares(tracks.p[every], np.where(known[..., None, None], tracks.A[every], 0.0)).sum())
+    return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
+
+
+def whole_of(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+    """The measured body of which tracks are a part, if it has more of them that are seen; else None.
+
+    `own` is a body made of them alone.
+    """
     for body in bodies.values():
-        seen = int((tracks.seen & (tracks.body == body.id)).sum())
-        if body.measured and seen >= len(rows) and part_of(body, tracks, rows):
+        theirs = np.flatnonzero(tracks.seen & (tracks.body == body.id))
+        if body.measured and len(theirs) >= len(rows) and part_of(body, theirs, tracks, rows, own):
             return body
     return None
 

@@ -144,6 +144,27 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
     np.testing.assert_allclose(transform(more.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
+@pytest.mark.parametrize(("share", "one"), [(0.0, True), (0.01, True), (0.15, False)])
+def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, one: bool) -> None:
+    """The older one goes about as the young one does: only what one rigid body would leave tells them apart."""
+    other = (1 + share) * MOVING
+    local = corners(12, 14)
+    tracks = table(np.concatenate([seen_from(path(other), local[:4], 15), seen_from(path(MOVING), local[4:], 16)]))
+    few = body_along(path(other), np.arange(4), tracks, id=1)
+    more = body_along(path(MOVING), np.arange(4, 12), tracks, id=2)
+    theirs, mine = np.arange(4), np.arange(4, 12)
+    assert membership.goes_with(more, tracks, theirs)
+    assert membership.part_of(more, mine, tracks, theirs, few) == one
+    none = np.zeros(0, np.int64)
+    believed = ObjectEstimate(2, 0.0, more.T, np.eye(6), MOVING, np.eye(6), True, none, none)
+    detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
+    detector.tracks, detector.bodies = tracks, {1: few, 2: replace(more, seen=5, estimate=believed)}
+    detector._outgrow(detector.bodies[2], 8, {1: few})
+    assert list(detector.bodies) == ([1] if one else [1, 2])
+    if not one:  # known for good: in a later frame they may happen to move alike
+        assert detector.bodies[2].distinct == {1}
+
+
 def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
     tracks = table(seen_from(path(MOVING), corners(8, 12), 13))
     body = body_along(path(MOVING), np.arange(8), tracks)
