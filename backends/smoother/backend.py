@@ -159,7 +159,7 @@ class SmootherBackend:
             self._graph.add_landmarks(observations.ids, z, local)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
-        """See `slam.interfaces.Backend.remove`. What a landmark has told about the poses stays known."""
+        """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""
         slots = self.measurement_log.landmarks.slots(np.unique(np.asarray(ids, np.int64)))
         with self._whole():
             self._graph.remove_landmarks(slots)
@@ -217,13 +217,13 @@ class SmootherBackend:
 
     @property
     def revises_path(self) -> bool:
-        """See `slam.interfaces.RevisingBackend`: all poses are in the problem still, with their measurements."""
+        """See `slam.interfaces.RevisingBackend`: True while all poses and measurements are still in the problem."""
         self._commit()  # poses may leave with it
         return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
 
     @one_blas_thread
     def revise(self, mend: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: all is solved anew, as long as a run of so many frames."""
+        """See `slam.interfaces.RevisingBackend.revise`: solves the whole problem again, as long as that takes."""
         self._commit()
         if self.measurement_log.measurements.count:
             with self._whole():
@@ -245,7 +245,7 @@ class SmootherBackend:
     # --- copies ---
 
     def __reduce_ex__(self, protocol: object) -> str:
-        """Refuse to be copied: gtsam ends the process where its objects are.
+        """Refuse to be copied: copying gtsam's objects would abort the process.
 
         Raises:
             CopyError: always.
@@ -259,7 +259,7 @@ class SmootherBackend:
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
-        """What is done within either happens or, where it is interrupted, does not: the measurement log is restored."""
+        """Make a block atomic: if it is interrupted, the measurement log is restored."""
         self._graph.mend()
         restore = snapshot(self.measurement_log)
         try:
@@ -291,7 +291,7 @@ class SmootherBackend:
         self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, observations: Observations,
         guess: Array | None,
     ) -> Agreement:  # fmt: skip
-        """First value of the newest pose, and which measurements agree with it."""
+        """Initial value of the newest pose, and which measurements agree with it."""
         marks, z = self.measurement_log.landmarks, self._stereo.measure(observations)
         noise = residual_noise(self._stereo, self._make.sigma, points, z)
         known = marks.prior[slots].any()  # what is known in the world does not move with the poses

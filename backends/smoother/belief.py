@@ -1,6 +1,6 @@
-"""What the smoother believes: the newest pose, the poses of the window, and the landmarks, with covariances.
+"""The smoother's estimates with covariances: the newest pose, the poses of the window, and the landmarks.
 
-Everything follows from the factor graph as it stands; what has been worked out is kept until the graph changes.
+All follow from the factor graph; results are cached until the graph changes.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Belief:
         return self._window
 
     def last_poses(self, count: int) -> PoseSet:
-        """The window, or the last `count` poses where it leaves some of them out: those without measurements."""
+        """The window; or the last `count` poses if it lacks some of them, as it skips those without measurements."""
         window, path = self.window(), self._log.path
         frames = np.arange(max(self._log.history.first, path.count - count), path.count)
         if np.isin(frames, window.frames).all():
@@ -98,9 +98,9 @@ class Belief:
         return int(np.searchsorted(frames, measured[-1])) if measured else len(frames) - 1
 
     def lost(self) -> bool:
-        """Whether the newest pose that measured landmarks is turned in the world by an unknown angle.
+        """Whether the orientation in the world of the newest pose that measured landmarks is unknown.
 
-        No linearisation holds for the landmarks that it measured then.
+        The landmarks that it measured cannot be linearised then.
         """
         window, path = self.window(), self._log.path
         if not len(window) or not path.measured or not recovery.unknown_turn(window.covariance[-6:, -6:]):
@@ -125,8 +125,8 @@ class Belief:
     def landmark_covariances(self, slots: IndexArray) -> Array:
         """Covariances (M, 3, 3) of landmark positions.
 
-        Exact for variables that were measured lately: the solver has those at hand. For the others, what is older than
-        the window is taken to move with its oldest pose, which makes them a little too large.
+        Exact for variables that were measured lately, which the solver gives quickly. For the others, poses older than
+        the window are taken as fixed to its oldest pose; these covariances are a little too large.
         """
         marks, path = self._log.landmarks, self._log.path
         if not path.count:  # a map that is known, and no pose in it yet

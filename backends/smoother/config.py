@@ -14,13 +14,14 @@ class SmootherConfig:
     Attributes:
         track: observations after which a landmark's smart factor is finished; each landmark's own limit lies between
             `track` and twice that, so that no frame finishes them all.
-        explicit: how many landmarks in view at most become variables of their own when their smart factor is finished;
-            they tie the trajectory together over any time. The others go on in a new smart factor.
+        explicit: most landmarks in view that become variables of their own when their smart factor is finished;
+            they constrain the trajectory over any length of time. The others continue in a new smart factor.
         relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately: in
-            every tenth frame; ten times as much in the others, next to nothing when the whole path or map is asked for.
-        window: poses whose joint covariance is asked for in every frame; what is older is taken to move with them.
-        lag: poses that stay variables, at least; what is older is marginalised, so that neither time nor memory grows
-            with the run. Null (in Python None) keeps all of them and revises the whole path.
+            every tenth frame. Ten times as much in the other frames; nearly zero when the whole path or map is
+            requested.
+        window: poses whose joint covariance is computed in every frame; older ones are taken as fixed to the oldest.
+        lag: least number of poses that stay variables. Older ones are marginalised, so that neither time nor memory
+            grows with the run. Null (in Python None) keeps all poses and revises the whole path.
 
     Raises:
         ConfigurationError: a value is out of its range.

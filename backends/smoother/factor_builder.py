@@ -1,4 +1,4 @@
-"""How measurements become factors: tracks that grow, landmarks that become variables, and what is eliminated late."""
+"""Measurements to factors: smart factors that grow, landmarks that become variables, and the elimination order."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class FactorBuilder:
     """Puts measurements into factors.
 
     A landmark is a smart factor that grows with each measurement. When its track is long enough the factor is
-    finished: the landmark becomes a variable with a factor for each measurement, as long as few of those in view are,
-    or else goes on in a new smart factor. No measurement is ever used twice.
+    finished: the landmark becomes a variable with a factor for each measurement, or, if there are enough variables in
+    view, continues in a new smart factor. Each measurement is used once.
 
     Args:
         make: makes the factors.
@@ -41,9 +41,9 @@ class FactorBuilder:
         self._config = config
 
     def eliminate_late(self, change: Change, first: int = 0, gone: Collection[int] = ()) -> None:
-        """Have the landmarks of late eliminated late, and the newest poses last.
+        """Order the elimination: recently seen landmarks late, the newest poses last.
 
-        Without poses before frame `first` and without the landmark variables `gone`.
+        Poses before frame `first` and the landmark variables `gone` are left out.
         """
         marks, frame = self.log.landmarks, self.log.path.count - 1
         landmarks, poses = change.late
@@ -87,13 +87,13 @@ class FactorBuilder:
         return grown
 
     def _well_known(self, slot: int) -> bool:
-        """Whether a landmark's position is known to a tenth of its distance: else it is no good as a variable."""
+        """Whether a landmark's position is known to a tenth of its distance; its variable is ill-conditioned if not."""
         marks = self.log.landmarks
         offset = marks.position[slot] - self.log.path.poses[-1][:3, 3]
         return bool(np.trace(marks.covariance[slot]) < 0.01 * (offset @ offset))
 
     def _make_variable(self, change: Change, slot: int, track: Track) -> None:
-        """Give a landmark a variable of its own, with all that its track holds."""
+        """Turn a landmark's smart factor into a variable with a factor for each measurement."""
         key = self._new_variable(change, slot)
         self.log.history.explicit[key] = track.rows
         for point, pose in zip(track.points, track.keys):
@@ -101,12 +101,12 @@ class FactorBuilder:
         track.restart()
 
     def _known(self, slot: int) -> Known | None:
-        """What was known of a landmark beforehand, as long as the pose that it is relative to is in the solver."""
+        """A landmark's prior; None once the pose that it is relative to has left the solver."""
         known = self.log.history.known.get(int(self.log.landmarks.serial[slot]))
         return None if known is None or known.is_before(self.log.history.first) else known
 
     def _enter_known(self, change: Change, slots: IndexArray) -> None:
-        """Give landmarks that were known beforehand variables of their own, where they have none yet."""
+        """Create variables for landmarks with a prior that have none yet."""
         if not self.log.history.known:
             return
         marks = self.log.landmarks

@@ -1,4 +1,4 @@
-"""The smoother's factor graph: solved incrementally, and set up again from the measurement log where that fails."""
+"""The smoother's factor graph: solved incrementally, and rebuilt from the measurement log if that fails."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ _ROUNDS = 6  # numerics: of linearising everything anew, at most
 class FactorGraph:
     """Poses, landmarks and their factors in ISAM2. Which factors: see `backends.smoother.factor_builder`.
 
-    Everything that is put in is in the measurement log as well, and what the solver finds is written back to it. A
-    solver that fails is replaced by a new one that is given the whole log.
+    All measurements are in the measurement log as well, and the solver's results are written back to it. A solver that
+    fails is replaced by a new one, built from the log.
 
     Args:
         make: makes the factors.
@@ -58,9 +58,9 @@ class FactorGraph:
         config: limits and thresholds.
         log: poses, measurements and landmarks, with the latest values of poses and positions.
         solver: holds the factors.
-        solutions: how often the poses have been solved for: what depends on them is out of date once this has changed.
+        solutions: counts solutions for the poses: results derived from them are out of date once it has changed.
         placements: the same for the landmarks.
-        rebuilds: how often all was put into a new solver.
+        rebuilds: how often a new solver was built.
     """
 
     def __init__(self, make: FactorMaker, config: SmootherConfig) -> None:
@@ -88,7 +88,7 @@ class FactorGraph:
         return self._seconds + self.solver.seconds
 
     def interrupted(self) -> None:
-        """Note that the solver may hold what is not on record: it is made anew before anything else is done."""
+        """Note that solver and log may differ after an interrupt: the solver is rebuilt before the next operation."""
         self._broken = True
         self._out_of_date()
 
@@ -122,7 +122,7 @@ class FactorGraph:
             z: their measurements (M, 3).
 
         Returns:
-            what failed, in one line; empty if nothing did. After a failure the frame stands without measurements.
+            what failed, in one line; empty if nothing did. After a failure the frame has no measurements.
         """
         marks, frame = self.log.landmarks, self.log.path.count
         self.log.path.append(stamp, T_world_left)
@@ -156,7 +156,7 @@ class FactorGraph:
     def start_anew(
         self, stamp: float, T_world_left: Array, covariance: Array, covariances: Array, slots: IndexArray, z: Array
     ) -> str:
-        """Add a frame whose pose follows from the landmarks and not from the poses before it.
+        """Add a frame whose pose is set by the landmarks, not by the poses before it.
 
         Earlier poses stay as they are. Landmarks keep their position relative to the new pose.
 
@@ -190,7 +190,7 @@ class FactorGraph:
         return ""
 
     def add_landmarks(self, ids: IdArray, z: Array, local: Array) -> None:
-        """Take in landmarks at their first sight, at `local` (M, 3) in the newest camera's coordinates."""
+        """Add new landmarks at `local` (M, 3) in the newest camera's coordinates."""
         path, marks, frame = self.log.path, self.log.landmarks, self.log.path.count - 1
         limits = [self.config.track + i % self.config.track for i in ids.tolist()]
         slots = marks.add(ids, transform(path.poses[-1], local), frame, limits)
@@ -204,7 +204,7 @@ class FactorGraph:
         self.placements += 1
 
     def add_known(self, ids: IdArray, positions: Array, covariances: Array, frame: int | None = None) -> None:
-        """Take in landmarks of which much is known, at `positions` (M, 3) with covariances (M, 3, 3).
+        """Add landmarks with a prior: `positions` (M, 3) with covariances (M, 3, 3).
 
         In world coordinates, or in the camera's of a frame. They become variables when they are first measured.
         """
@@ -223,7 +223,7 @@ class FactorGraph:
         self.placements += 1
 
     def remove_landmarks(self, slots: IndexArray) -> None:
-        """Take landmarks out of the map; what they have told about the poses stays known."""
+        """Remove landmarks from the map; what their measurements said about the poses is kept."""
         marks = self.log.landmarks
         for slot in slots.tolist():
             self.log.finish(marks.tracks[slot])
@@ -256,7 +256,7 @@ class FactorGraph:
         return P if len(others) < len(keys) else P[6:, 6:]
 
     def converge(self) -> None:
-        """Solve to convergence: every variable is linearised anew until none moves any more."""
+        """Solve to convergence: relinearise all variables until none moves any more."""
         if self._solved:
             return
         try:
@@ -270,7 +270,7 @@ class FactorGraph:
         self.solutions += 1
 
     def _read_all(self, before: Array | None = None) -> None:
-        """Bring all poses and landmarks on record up to what the solver has; `before` are the poses as they were."""
+        """Write all poses and landmarks from the solver to the log; `before` are the poses as they were."""
         path = self.log.path
         if path.count:
             before = path.poses.copy() if before is None else before
@@ -289,7 +289,7 @@ class FactorGraph:
         return poses
 
     def _new_solver(self) -> Solver:
-        """An empty solver for as many variables as there will be."""
+        """An empty solver, sized for the variables to come."""
         c = self.config
         return Solver(self._seldom, None if c.lag is None else c.lag + c.explicit)
 
@@ -311,11 +311,11 @@ class FactorGraph:
     # --- the lag ---
 
     def _overdue(self) -> int | None:
-        """Frame of the oldest pose that shall stay, where others leave in this frame."""
+        """Frame of the oldest pose to keep, if poses are to be marginalised in this frame; else None."""
         return None if self.config.lag is None else overdue(self.log, self.config.lag)
 
     def _advance(self) -> None:
-        """Marginalise what is older than the lag and go on with a new solver; after a failure the next frame tries."""
+        """Marginalise what is older than the lag, and go on with a new solver; after a failure the next frame tries."""
         first = self._overdue()
         if first is None:
             return
@@ -345,8 +345,8 @@ class FactorGraph:
     def _read_back(self, slots: IndexArray) -> None:
         """Poses of the window and the landmarks just measured, as the solver has them now.
 
-        What lies further back changes seldom: it follows once the window's oldest pose has been revised by as much as
-        makes the solver linearise anew.
+        Older poses change seldom: they are read once the window's oldest pose has moved beyond the threshold of
+        relinearisation.
         """
         path = self.log.path
         first = max(self.log.history.first, path.count - self.config.window)
@@ -367,9 +367,9 @@ class FactorGraph:
     # --- failures ---
 
     def _diverged(self, slots: IndexArray, z: Array) -> bool:
-        """Whether most of the newest measurements would not pass the gate any more: ISAM2 steps without looking.
+        """Whether most of the newest measurements fail the gate after the step: ISAM2 does not check that a step helps.
 
-        Solving all anew takes long, so it is not said twice in a few frames.
+        A rebuild takes long, so this is not reported twice within a few frames.
         """
         T, marks = self.log.path.poses[-1], self.log.landmarks
         if self.log.path.count < self._rebuilt + _EVERY:
@@ -380,9 +380,9 @@ class FactorGraph:
         return 2 * int(passed.sum()) < len(z)
 
     def recover(self) -> None:
-        """Rebuild; where the problem has no solution, as it stands; where not even that, without what was measured.
+        """Rebuild: solved as a whole; if that fails, at the present values; if that fails too, without measurements.
 
-        Where the solver takes nothing at all, it stays broken, and the next step tries again.
+        If the solver refuses everything, it stays broken, and the next step tries again.
         """
         for solved, forget in ((True, False), (False, False), (False, True)):
             if forget:
@@ -392,7 +392,7 @@ class FactorGraph:
                 return
 
     def _rebuild(self, solved: bool = True, near: bool = False) -> None:
-        """A new solver for all that is on record, solved as a whole first; by a single step where that is `near`.
+        """A new solver with everything in the log, solved as a whole first; by a single step if the values are `near`.
 
         Raises:
             SolverError: that cannot be solved either.
@@ -428,5 +428,5 @@ class FactorGraph:
 
 
 def _informed(held: Held | None, solver: Solver) -> Held | None:
-    """What is known of the pose that is held, by a solver that is new."""
+    """The held pose with its covariance from a new solver."""
     return None if held is None else held.informed(solver.joint_covariance([held.key]))

@@ -18,7 +18,7 @@ from slam.models import EstimatorModels
 
 
 def to_pose3(T: Array) -> gtsam.Pose3:
-    """A gtsam pose of a matrix (4, 4) that is nearly rigid; gtsam itself would keep the error."""
+    """A gtsam pose of a nearly rigid matrix (4, 4), made orthonormal: gtsam would not do that."""
     return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
 
 
@@ -69,12 +69,12 @@ class FactorMaker:
         return gtsam.PriorFactorPose3(key, to_pose3(m.initial_pose), noise)
 
     def first_motion(self, keys: tuple[int, int], dt: float) -> gtsam.NonlinearFactor:
-        """Between the first two poses: the prior of the velocity."""
+        """Between the first two poses: the prior on the velocity."""
         noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.first_velocity_sigmas(self.models, dt))
         return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise)
 
     def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float) -> gtsam.NonlinearFactor:
-        """Between three successive poses: constant velocity but for an impulse (see `motion`)."""
+        """Between three successive poses: constant velocity with a random impulse (see `motion`)."""
 
         def error(_this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any) -> Any:
             poses = [values.atPose3(key) for key in keys]
@@ -88,7 +88,7 @@ class FactorMaker:
         return gtsam.CustomFactor(noise, list(keys), error)
 
     def step(self, keys: tuple[int, int], relative: Array, dt: float) -> gtsam.NonlinearFactor:
-        """Between two successive poses that are known to stand `relative` (4, 4) to each other as well as motion is."""
+        """Between two successive poses: their relative pose (4, 4), with the covariance of the motion model."""
         noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.motion_sigmas(self.models, dt))
         return gtsam.BetweenFactorPose3(*keys, to_pose3(relative), noise)
 
@@ -103,10 +103,10 @@ class FactorMaker:
         return factor
 
     def known(self, key: int, known: Known) -> gtsam.NonlinearFactor:
-        """What was known of a landmark variable beforehand, in the world or before a camera.
+        """The prior on a landmark variable, in the world or in a camera's coordinates.
 
-        Where a camera has measured it, it is held as [x/z, y/z, 1/z]: depth from two views is more nearly Gaussian so
-        than in metres.
+        If a camera has measured it, the prior is on [x/z, y/z, 1/z]: depth from two views is closer to Gaussian in
+        inverse depth than in metres.
         """
         if known.frame is None:
             noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)

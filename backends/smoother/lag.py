@@ -1,7 +1,7 @@
-"""A fixed lag: which variables leave the problem, so that neither a frame's cost nor memory grows with the run.
+"""A fixed lag: which variables are marginalised, so that neither a frame's cost nor memory grows with the run.
 
-What leaves is marginalised (see `backends.smoother.marginal`), all at the values of that moment, and the solver is made
-anew of what is left. So it is done for many poses together: a share of the lag.
+They are marginalised (see `backends.smoother.marginal`) at their present values, and a new solver is built of the rest.
+That is costly, so it is done for many poses together: a share of the lag.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _SHARE = 2
 
 @dataclass(frozen=True)
 class Rest:
-    """The problem without what has left.
+    """The problem after marginalisation.
 
     Attributes:
         first: frame of the oldest pose.
-        gone: landmark variables that have left.
+        gone: landmark variables that were marginalised.
         finished: tracks whose factor has become part of the prior.
-        prior: what has left, on what stays.
-        held: the oldest pose, where it is held.
+        prior: what the marginalised part says of the rest.
+        held: the oldest pose, if it is held; else None.
         change: all factors and values for a new solver.
         slots: places of the old solver's factors in the change.
     """
@@ -45,7 +45,7 @@ class Rest:
 
 
 def overdue(log: MeasurementLog, lag: int) -> int | None:
-    """Frame of the oldest pose that shall stay, where it is time that others leave."""
+    """Frame of the oldest pose to keep, if it is time to marginalise others; else None."""
     first = log.path.count - lag
     return first if first >= log.history.first + max(1, lag // _SHARE) else None
 
@@ -53,11 +53,11 @@ def overdue(log: MeasurementLog, lag: int) -> int | None:
 def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> Rest:
     """Marginalise the poses before frame `first`, and landmark variables last measured before it.
 
-    Those of landmarks that are not in the map any more leave, and those of others where there are more than `most`.
-    Nothing is changed on record or in the solver; the prior that follows is put on record by the caller.
+    Those of erased landmarks leave, and of the others the oldest if there are more than `most`.
+    Neither log nor solver is changed; the caller enters the prior in the log.
 
     Raises:
-        SolverError: what leaves cannot be marginalised.
+        SolverError: the variables cannot be marginalised.
     """
     history, kept = log.history, Change()
     gone = _old_landmarks(log, first, most)
@@ -91,7 +91,7 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
 
 
 def held_pose(log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
-    """The oldest pose, held where it stands; None where landmarks that are known in the world tell where that is."""
+    """The oldest pose, held where it is; None if landmarks with a prior in the world fix it already."""
     if any(known.frame is None for known in log.history.known.values()):
         return None
     return prior.held(values.atPose3(prior.poses[0]).matrix())
@@ -100,7 +100,7 @@ def held_pose(log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -
 def _solved_together(
     some: gtsam.NonlinearFactorGraph, others: gtsam.NonlinearFactorGraph, values: gtsam.Values
 ) -> gtsam.Values:
-    """One step of Gauss-Newton with all variables linearised where they stand; none where it gains nothing.
+    """One step of Gauss-Newton with all variables linearised at their values; no step if it gains nothing.
 
     Raises:
         SolverError: gtsam failed.
@@ -119,7 +119,7 @@ def _solved_together(
 
 
 def _old_landmarks(log: MeasurementLog, first: int, most: int) -> list[int]:
-    """Landmark variables to leave: last measured before frame `first`, those of erased landmarks and the surplus."""
+    """Landmark variables to marginalise: last measured before frame `first`, erased from the map or surplus."""
     marks, history, frame = log.landmarks, log.history, log.measurements.frame
     used = marks.used()
     mapped = dict(zip(marks.serial[used].tolist(), marks.last[used].tolist()))

@@ -1,4 +1,4 @@
-"""What is predicted of the newest pose and of the landmarks before they are measured, and how well that fits."""
+"""Prediction of the newest pose and of the landmarks, and how well measurements fit it."""
 
 from __future__ import annotations
 
@@ -104,8 +104,8 @@ def predict_points(predicted: PredictedPose, points: Array, own: Array, by_windo
 def residual_noise(stereo: RectifiedStereo, sigma: float, points: PredictedPoints, z: Array) -> Array:
     """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
 
-    Pixel noise and the landmark's own uncertainty, linearised where the landmark is believed to be or where it was
-    measured, whichever leaves less: close to the camera a small error of depth would explain any pixel.
+    Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position, whichever
+    gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
     """
     _, J = stereo.project(points.local)
     own = J @ points.own @ np.swapaxes(J, 1, 2)
@@ -124,8 +124,8 @@ def normalised_innovation(
     `points` are as seen from the solved pose, which lies `step` (6,) from the predicted one. The
     innovation at the prediction follows by linearising at the solved pose, which holds for long steps too.
 
-    S is the innovations' joint covariance: what the poses of the window and the motion do to all, and each landmark's
-    own. It is inverted through the poses (Woodbury), which are fewer.
+    S is the innovations' joint covariance: from the poses of the window and the motion, common to all, and from each
+    landmark's own. It is inverted by Woodbury's identity, as the poses are fewer.
     """
     h, J = stereo.project(points.local)
     r = z - h
@@ -148,5 +148,5 @@ def normalised_innovation(
 
 
 def _root(P: Array) -> Array:
-    """A lower triangular L with ``L Lᵀ = P``; a trace of noise keeps it real where P is all but singular."""
+    """A lower triangular L with ``L Lᵀ = P``; a little is added to the diagonal, as P may be nearly singular."""
     return np.linalg.cholesky(P + 1e-10 * np.diag(np.diag(P)))

@@ -1,4 +1,4 @@
-"""The whole problem set up again from the measurement log and solved: where ISAM2 has failed, or all has changed."""
+"""The whole problem, built from the measurement log and solved: after a failure of ISAM2 or a change of all pixels."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[
 
 
 def add_poses(change: Change, make: FactorMaker, log: MeasurementLog, restarted: int = 0) -> None:
-    """All poses that are variables, with what ties them to each other and to the world.
+    """All poses that are variables, with their priors and the motion between them.
 
-    Those of the first `restarted` frames stand to each other as they are on record.
+    The relative poses of the first `restarted` frames are kept as in the log.
     """
     path, first, prior = log.path, log.history.first, log.history.prior
     if prior is not None:
@@ -59,7 +59,7 @@ def add_poses(change: Change, make: FactorMaker, log: MeasurementLog, restarted:
 
 
 def pose_factor(make: FactorMaker, path: Path, i: int) -> gtsam.NonlinearFactor:
-    """What ties the pose of frame `i` to those before it, or to the world."""
+    """The motion factor of the pose of frame `i`, or its prior."""
     if i == 0:
         return make.prior(pose_key(0))
     if i == 1 or path.jumped(i - 1):
@@ -88,7 +88,7 @@ def optimise(change: Change, iterations: int = _ITERATIONS) -> gtsam.Values:
 
 
 def stepped(change: Change) -> gtsam.Values:
-    """The values after one step of Gauss-Newton, where they were near the solution before a small change.
+    """The values after one step of Gauss-Newton from values that were the solution before a small change.
 
     Raises:
         SolverError: gtsam failed, or the step gains less than the linear problem promises.

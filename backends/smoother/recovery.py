@@ -1,11 +1,10 @@
-"""What the smoother tries where most observations contradict its prediction.
+"""What the smoother tries if most observations contradict its prediction.
 
-Then the prediction is wrong, not the observations. There are two cases, tried in turn:
+Then the prediction is probably wrong, not the observations. There are two cases, tried in turn:
 
-- It is so far off that the solution is not found from there: the pose on which the landmarks agree is the start.
-- The camera is where its earlier poses say that it cannot be: these were wrong for a while, in a stretch with hardly
-  anything to see. The problem starts anew with that pose among the landmarks (`FactorGraph.start_anew`), and the poses
-  before it stay as they are.
+- It is so far off that the solution is not found from there: start from the pose on which the landmarks agree.
+- The camera is where its earlier poses exclude it: these were wrong, after a stretch with hardly anything to see. The
+  problem starts anew with that pose and the landmarks (`FactorGraph.start_anew`); earlier poses stay as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class Agreement:
     Attributes:
         T: the newest pose (4, 4).
         used: which observations (M,) agree with it.
-        jump: where the problem shall start anew, variances (6,) that the prediction lacks; else None.
+        jump: variances (6,) that the prediction lacks, if the problem shall start anew; else None.
         contradicted: updates in succession, with this one, in which most observations agreed on another pose than
             was expected.
     """
@@ -55,7 +54,7 @@ Search = Callable[[], "Array | None"]
 def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, contradicted: int, lost: bool) -> Agreement:
     """The newest pose with which most observations agree.
 
-    Less than a third of the observations is not heeded where as many wrong ones might agree by chance.
+    Agreement of less than a third of the observations counts only if so many cannot agree by chance.
 
     Args:
         problem: landmarks and measurements.
@@ -79,12 +78,12 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
 
 
 def unknown_turn(P: Array) -> bool:
-    """Whether a pose with covariance P (6, 6) is turned by an angle that is not known to a radian."""
+    """Whether the orientation of a pose with covariance P (6, 6) is uncertain by more than a radian."""
     return bool(np.linalg.eigvalsh(P[:3, :3]).max() > _RADIAN)
 
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
-    """At the pose on which landmarks agree; None where most do not agree with it after all."""
+    """The solution from the pose on which landmarks agree; None if most do not agree with it after all."""
     x = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ there))
     limit = chi_square_limit(6, problem.probability)
     jump = None
@@ -115,9 +114,9 @@ def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> boo
 
 
 def world_covariance(P: Array) -> Array:
-    """What is known in the world of a pose that is seated among the landmarks, of its predicted covariance P (6, 6).
+    """Covariance in the world of a pose found from the landmarks, given its predicted covariance P (6, 6).
 
-    The landmarks are known as well in the world as the poses that saw them, which are known at least so well. No turn
-    is less known than one by any angle at all, equally probable: its variance is π²/3.
+    The landmarks are as well known in the world as the poses that saw them, which are at least that well known. The
+    variance of a rotation is bounded by π²/3, that of an angle of which nothing is known.
     """
     return P / max(1.0, float(np.linalg.eigvalsh(P[:3, :3]).max()) / _ANY_TURN)

@@ -1,7 +1,7 @@
-"""Restores the measurement log after a call that was interrupted.
+"""Restores the measurement log after an interrupted call.
 
-Lists of rows only grow at their end or are replaced by new ones, so that their lengths are enough; arrays are copied.
-Values of poses and measurements that were there before may have been revised since: the solver's are as good as those.
+Lists of rows only grow at their end or are replaced, so it is enough to keep their lengths; arrays are copied. Earlier
+poses may have been revised since; these newer values are as good.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from backends.smoother.measurement_log import MeasurementLog
 
 
 def snapshot(log: MeasurementLog) -> Callable[[], None]:
-    """A function that puts the log back to how it is now."""
+    """A function that restores the log to its present state."""
     parts = (log.path, log.measurements, log.landmarks, log.history)
     states = [_state(part) for part in parts]
     # There are hundreds, in every call: no function is called for each.
@@ -40,7 +40,7 @@ _GROWING = frozenset(("_stamps", "_poses", "_z", "_frame", "_landmark"))
 
 
 def _state(part: Any) -> dict[str, Any]:
-    """What is in the attributes of a part."""
+    """The values of a part's attributes."""
     out: dict[str, Any] = {}
     for name, value in vars(part).items():
         if isinstance(value, np.ndarray) and name not in _GROWING:
@@ -61,7 +61,7 @@ def _put_back(part: Any, state: dict[str, Any]) -> None:
 
 
 def _as_it_was(value: Any) -> Any:
-    """A list, or the lists in a dictionary, as long as they were; anything else as it is."""
+    """A list, or the lists in a dictionary, cut to their former length; anything else as it is."""
     if not isinstance(value, tuple):
         return value
     before, length = value

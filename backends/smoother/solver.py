@@ -29,7 +29,7 @@ _BALLAST = 2000
 
 
 class _SeenEnoughError(Exception):
-    """Ends a computation that has shown what was wanted of it."""
+    """Ends a computation of gtsam once it has given what is wanted."""
 
 
 class SolverError(SlamError):
@@ -44,9 +44,9 @@ class Change:
         factors: new factors.
         values: first values of new variables.
         removed: slots of factors to take out.
-        late: variables to eliminate late, those of the first set before those of the second: what will be touched
-            again soon. Without it a landmark that was seen from many poses may be eliminated before them, and with it
-            in between everything is touched by everything.
+        late: variables that will be measured again soon, to be eliminated late; those of the first set before those of
+            the second. Otherwise a landmark seen from many poses may be eliminated before them, which connects all
+            of these.
     """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
@@ -60,7 +60,7 @@ class Solver:
 
     Args:
         thresholds: how far each kind of variable may move before it is linearised anew.
-        variables: about so many there will be at most; None for no end of them.
+        variables: expected number at most; None for no bound.
 
     Attributes:
         seconds: CPU time spent in gtsam so far.
@@ -78,7 +78,7 @@ class Solver:
         self._guarded(lambda: self._isam.update(*_ballast(self._ballast)))
 
     def update(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap | None = None) -> list[int]:
-        """One step; returns the slots of the new factors, in their order.
+        """One update; returns the slots of the new factors, in their order.
 
         Args:
             change: what is new.
@@ -97,7 +97,7 @@ class Solver:
         return result.getNewFactorsIndices()
 
     def converge(self, change: Change, thresholds: gtsam.ISAM2ThresholdMap, rounds: int) -> None:
-        """Steps without anything new, at most so many, until no variable moves farther than by the thresholds.
+        """At most so many updates without new factors, until no variable moves by more than the thresholds.
 
         Raises:
             SolverError: gtsam failed.
@@ -135,7 +135,7 @@ class Solver:
     def point_covariances(self, keys: list[int], newest: int, held: Held | None = None) -> dict[int, Array]:
         """Covariances (3, 3) of those point variables that were eliminated together with the newest pose, or after it.
 
-        As they are while the pose `held` is not.
+        As if the pose `held` was not held.
 
         Raises:
             SolverError: gtsam failed.
@@ -167,7 +167,7 @@ class Solver:
         return np.asarray(0.5 * (P + P.T))  # what is hardly known comes back symmetric to some digits only
 
     def values(self) -> gtsam.Values:
-        """All variables, solved to the last."""
+        """All variables, from a complete back-substitution."""
         return self._guarded(self._isam.calculateBestEstimate)
 
     def factors(self) -> Iterator[tuple[int, gtsam.NonlinearFactor]]:
@@ -190,7 +190,7 @@ class Solver:
 
 
 def _groups(*late: set[int]) -> gtsam.KeyGroupMap:
-    """Sets of variables in the order of their elimination, as gtsam takes them; what is in none comes first."""
+    """Sets of variables in the order of elimination, in gtsam's form; variables in none of them come first."""
     groups = gtsam.KeyGroupMap()
     for number, keys in enumerate(filter(None, late), start=1):
         for key in keys:
@@ -201,9 +201,9 @@ def _groups(*late: set[int]) -> gtsam.KeyGroupMap:
 def _root_of(isam: gtsam.ISAM2, key: int) -> tuple[list[int], Array] | None:
     """The root of the Bayes tree, if `key` is in it: its variables, and its triangular matrix R with RᵀR = P⁻¹.
 
-    gtsam does not hand out the tree, but it hands the root's conditional to whatever function shall eliminate the
-    others from it. gtsam's own would square the matrix and factorise it again; it is triangular already, so what it
-    says of the variables that were eliminated last stands in its last rows.
+    gtsam's Python interface does not give the tree, but it passes the root's conditional to the function that
+    eliminates other variables from it. gtsam's own function would square the matrix and factorise it again. The matrix
+    is triangular already, so its last rows are about the variables that were eliminated last.
     """
     found: list[tuple[list[int], Array]] = []
 

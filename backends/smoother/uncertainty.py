@@ -52,10 +52,10 @@ def position_step(
 ) -> tuple[Array, Array, Array]:
     """Gauss-Newton steps (M, 3) of the positions, their covariances (M, 3, 3) where all poses are known, and gains.
 
-    `older` (M, 3, 3) is the information of measurements that are not among the linearised ones, on positions that stand
-    `moved` (M, 3) from where they are now; `prior` (M, 3, 3) what was known beforehand of positions `offset` (M, 3)
-    from where they are now. `damping` (M,) multiplies the information's diagonal. The gain (M,) is by how much a step
-    lessens the sum of squares, were it linear.
+    `older` (M, 3, 3) is the information of measurements that are not linearised here, about positions that are `moved`
+    (M, 3) from the present ones; `prior` (M, 3, 3) is prior information about positions `offset` (M, 3) from these.
+    `damping` (M,) multiplies the information's diagonal. The gain (M,) is the decrease of the sum of squares by a step,
+    to first order.
     """
     count, width = r.shape[:2]
     E = E.reshape(count, 3 * width, 3)
@@ -73,9 +73,9 @@ def position_step(
 def refined(
     stereo: RectifiedStereo, sigma: float, poses: Array, measurements: Measurements, marks: Landmarks, slots: IndexArray
 ) -> Array:
-    """Positions (M, 3) of landmarks that fit their recent measurements, by Levenberg-Marquardt on each by itself.
+    """Positions (M, 3) of landmarks that fit their recent measurements, by Levenberg-Marquardt for each landmark alone.
 
-    A single step of Gauss-Newton from afar may end behind the camera.
+    A single step of Gauss-Newton from a distant start may end behind the camera.
     """
     start, rows, older = marks.position[slots], marks.recent[slots], marks.older[slots]
     prior, mean = marks.prior[slots], marks.mean[slots]
@@ -113,9 +113,9 @@ def _form(A: Array, x: Array) -> Array:
 def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, slots: IndexArray) -> Array:
     """Jacobians (M, 3, 6 W) of landmark positions by poses of the set.
 
-    A measurement from another pose counts for the pose of the set that comes next, as if the two were fixed to each
-    other; what is no longer among the recent measurements counts for the pose next to the oldest one that is. What was
-    known beforehand depends on no pose.
+    A measurement from a pose outside the set counts for the next pose of the set, as if both were fixed to each other.
+    Older measurements that are no longer kept count for the pose next to the oldest kept one. A prior depends on no
+    pose.
     """
     rows, count, width = landmarks.recent[slots], len(slots), len(known)
     if not width:
@@ -131,7 +131,7 @@ def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, s
 
 
 class WindowJacobians:
-    """`by_poses` for one set of poses, each landmark's kept once it has been worked out.
+    """`by_poses` for one set of poses, cached for each landmark.
 
     Args:
         window: the poses.

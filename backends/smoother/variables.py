@@ -1,7 +1,7 @@
-"""Names of the variables, and how far each may move before it is linearised anew.
+"""Names of the variables, and how far each may move before it is relinearised.
 
-gtsam names a variable by a letter and a number, and takes one threshold per letter. A far landmark may move much
-further than a near one for the same error in the image; so landmarks have letters by how far they may move.
+gtsam names a variable by a letter and a number, and takes one threshold for each letter. A far landmark may move
+much further than a near one for the same error in the image, so a landmark's letter follows from its threshold.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def pose_key(frame: int) -> int:
 
 
 def landmark_key(number: int, threshold: float = _FINEST) -> int:
-    """Variable of a landmark's position that may move by `threshold` [m], or by little less."""
+    """Variable of a landmark's position with a threshold of relinearisation of `threshold` [m] or slightly less."""
     letter = int(np.clip(np.floor(np.log2(threshold / _FINEST)), 0, len(_LETTERS) - 1))
     return int(gtsam.symbol(_LETTERS[letter], number))
 
