@@ -1,7 +1,7 @@
 """Stereo SLAM with interchangeable estimators: see `slam.StereoSlam` and `slam.open_sequence`.
 
-What SLAM is, whatever detects and whatever estimates. Importing this package loads NumPy only; everything else is
-loaded when it is used.
+This package holds everything that does not depend on the front end or back end in use. Importing it loads NumPy only;
+everything else is loaded when it is used.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ __all__ = sorted(_PUBLIC)
 
 
 def __dir__() -> list[str]:
-    """The public names, and what a module has of itself."""
+    """The public names, and the attributes of every module."""
     return sorted({*_PUBLIC, *(n for n, v in globals().items() if n.startswith("__") or isinstance(v, ModuleType))})
 
 

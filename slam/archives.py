@@ -1,4 +1,4 @@
-"""Zip archives of NumPy arrays from anybody: sizes are checked before anything is unpacked, nothing is executed."""
+"""Untrusted zip archives of NumPy arrays: sizes are checked before anything is unpacked, nothing is executed."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import numpy as np
 
 from slam.errors import SlamError
 
-#: Bytes that an archive may unpack to: so much at any size, and so many times its own size.
+#: Bytes that an archive may unpack to: the larger of this many, and this many times its own size.
 _AT_LEAST, _TIMES = 64 * 2**20, 50
 
-_MEMBERS = 100  # most of them
+_MEMBERS = 100  # most members of an archive
 _HEADER = 10_000  # bytes of an array's header
 _KINDS = "biufU"  # of arrays: numbers and text, never objects
 _TEXT = 2**20  # characters of a text that is read as JSON
@@ -40,7 +40,7 @@ def unpack(data: bytes, source: str, error: type[SlamError] = SlamError) -> dict
         error: what is raised.
 
     Raises:
-        SlamError: of type `error`, where it is damaged, encrypted, packed in an unusual way, or would unpack to far
+        SlamError: of type `error`, if it is damaged, encrypted, compressed in an unusual way, or would unpack to far
             more than its own size.
     """
     try:
@@ -68,10 +68,10 @@ def _require_plain(members: list[zipfile.ZipInfo], size: int) -> None:
 
 
 def array(data: bytes, name: str, source: str, error: type[SlamError] = SlamError) -> np.ndarray:
-    """The array of an ``.npy`` member; its header must be true of what follows.
+    """The array of an ``.npy`` member, whose header must agree with the data after it.
 
     Raises:
-        SlamError: of type `error`, where it is none, or one of objects.
+        SlamError: of type `error`, if it is no array, or one of objects.
     """
     try:
         return _array(data)
@@ -96,10 +96,10 @@ def _array(data: bytes) -> np.ndarray:
 
 
 def json_text(text: str | bytes, source: str, error: type[SlamError] = SlamError) -> Any:
-    """What a text in JSON says.
+    """Parse a JSON text.
 
     Raises:
-        SlamError: of type `error`, where it is none, or too long.
+        SlamError: of type `error`, if it is no JSON, or too long.
     """
     if len(text) > _TEXT:
         raise error(f"{source}: {len(text)} characters of JSON")

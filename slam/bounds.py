@@ -43,7 +43,7 @@ def require_positive(config: object, ranges: Ranges | None = None, owner: str = 
 
 
 def require_not_negative(config: object, ranges: Ranges | None = None, owner: str = "") -> None:
-    """The same for numbers that may be zero; see `require_positive`."""
+    """As `require_positive`, for numbers that may be zero."""
     _require(config, ranges or {}, owner, positive=False)
 
 
@@ -63,7 +63,7 @@ def _require(config: object, ranges: Ranges, owner: str, positive: bool) -> None
 
 
 def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool) -> str:
-    """What a number must be and is not; empty where it is in its range."""
+    """What is required of a number outside its range; empty if it is inside."""
     whole = isinstance(number, numbers.Integral)
     text = "positive and finite" if positive else "finite and not negative"
     if not (whole or np.isfinite(number)) or number < 0 or (positive and number == 0):
@@ -80,7 +80,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _type_fault(value: Any, hint: Any) -> str:
-    """What a value must be and is not; empty where it is of its type."""
+    """What is required of a value of the wrong type; empty if the type is right."""
     if get_origin(hint) in (Union, UnionType):
         faults = [_type_fault(value, kind) for kind in get_args(hint)]
         return "" if "" in faults else " or ".join(filter(None, faults))
@@ -105,7 +105,7 @@ def _type_fault(value: Any, hint: Any) -> str:
 
 
 def _tuple_fault(value: Any, kinds: tuple[Any, ...]) -> str:
-    """The same for a tuple or a list in its place."""
+    """As `_type_fault`, for a tuple, or a list in its place."""
     if not isinstance(value, (tuple, list)):
         return "a list"
     if len(kinds) == 2 and kinds[1] is Ellipsis:

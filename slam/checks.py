@@ -1,4 +1,4 @@
-"""Checks of what callers give to a back end, the same for all: times, poses, pixels."""
+"""Checks of a back end's input, the same for all back ends: times, poses, pixels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from slam.errors import MeasurementError
 from slam.geometry.arrays import Array
 
-#: Farthest pixel from the origin [px] and latest stamp from zero [s] that are taken for a measurement.
+#: Limits of a measurement: farthest pixel from the origin [px], latest stamp from zero [s].
 FARTHEST_PIXEL, LATEST_STAMP = 1e6, 1e12
 
-#: Largest coordinate of a position [m]: beyond, a double has too few digits for what a camera sees.
+#: Largest coordinate of a position [m]: beyond it, a double has too few digits for what a camera sees.
 FARTHEST_POSITION = 1e8
 
 #: Largest id of a landmark, and largest count, in files: doubles hold them exactly, and there is room for later ones.

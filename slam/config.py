@@ -15,22 +15,22 @@ from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
 from slam.tracking.association import AssociationConfig
 
-#: Map management by kind of motion: a car does not soon come back to what lies behind it, and comes so much nearer to
-#: what lies ahead that descriptors change. With 200 landmarks, errors on three drives and in three seeds of `street`
-#: are those of 300, or smaller.
+#: Map management by kind of motion: a car does not soon return to what it has passed, and gets so much nearer to what
+#: lies ahead that descriptors change. With 200 landmarks, errors on three drives and three seeds of `street` are no
+#: larger than with 300.
 MAPS = {
     "handheld": MapConfig(),
     "driving": MapConfig(target_in_view=150, max_landmarks=200, descriptor_update=1.0, confirmed=1, spacing=0.0),
 }
 
-#: Association by kind of motion: a car updates the descriptors of what it comes nearer to, so the view does not matter.
-#: Alignment keeps these features from sliding over surfaces.
+#: Association by kind of motion: in a car, descriptors are updated on approach, so the angle and distance of view are
+#: not limited. Alignment keeps these features from drifting over surfaces.
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
     "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),
 }
 
-#: Moving objects by kind of motion: what moves on a street is faster than what a hand or a robot moves.
+#: Moving objects by kind of motion: traffic is faster than what a hand or a robot moves.
 OBJECTS = {
     "handheld": ObjectsConfig(),
     "driving": ObjectsConfig(max_speed=25.0, min_speed=1.0, suspect=40.0, group_test=70.0, size=2.0),
@@ -54,9 +54,9 @@ class SystemConfig:
     Attributes:
         models: noise, priors and motion model of all back ends.
         association: search windows, descriptor distances, geometric check.
-        map: which features become landmarks and which landmarks are dropped.
-        atlas: keyframes, and loops where one of them is seen again.
-        self_calibration: the rig's error, found while running.
+        map: which features become landmarks and which landmarks are erased.
+        atlas: keyframes and loop closure.
+        self_calibration: estimation of the rig's error while running.
         objects: the detector of moving objects.
         frontend: options of the front end by name.
         backend: options of the back end by name.
@@ -127,7 +127,7 @@ class SystemConfig:
         return self.from_json(tree)
 
 
-#: What is wanted of a setting, by pydantic's name of the fault.
+#: What is required of a setting, by pydantic's name of the fault.
 _WANTED = {
     "int": "a whole number", "float": "a number", "finite": "a finite number", "bool": "true or false",
     "string": "a text", "list": "a list", "tuple": "a list", "is": "a list", "dict": "an object", "none": "null",

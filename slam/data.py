@@ -61,12 +61,12 @@ class ImagePair:
 
 @dataclass(frozen=True)
 class Patches:
-    """What the image looks like around some pixels, a row each; made and understood by a front end.
+    """Image patches around pixels, one row each; made and used by a front end.
 
     Attributes:
         images: (N, S, S) float32, NaN beyond the image.
-        centres: the pixels in them (N, 2).
-        size: of the features there (N,) [px].
+        centres: coordinates of the pixels within the patches (N, 2).
+        size: of the features at the pixels (N,) [px].
     """
 
     images: NDArray[np.float32]
@@ -110,7 +110,7 @@ class StereoFeatures:
         laplacian: sign of the Laplacian (N,) int8, +1 for a dark blob on bright ground.
         descriptors: unit vectors (N, D) float32.
         threshold: the detector's D_threshold in force (paper A, III.A); NaN where there is none.
-        images: that they are from, for features to be aligned in; None where there are none.
+        images: in which the features were found, kept for alignment; None if not kept.
     """
 
     stamp: float
@@ -167,8 +167,8 @@ class Observations:
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, a left pixel is not finite, a right one is infinite, or one
-            lies in no image.
+        MeasurementError: shapes differ, an id occurs twice, a left pixel is not finite, a right one is infinite, or one
+            is too far off to be in any image.
     """
 
     ids: IdArray
@@ -243,8 +243,8 @@ class UpdateStatus(StrEnum):
 
     Attributes:
         OK: measurements were used.
-        EMPTY: nothing was measured (or nothing passed the gate): the prediction stands.
-        FAILED: the estimator could not solve; the prediction stands; the reason is in the report.
+        EMPTY: nothing was measured, or nothing passed the gate: the estimate is the prediction.
+        FAILED: the estimator could not solve; the estimate is the prediction, and the report gives the reason.
     """
 
     OK = "ok"
@@ -311,7 +311,7 @@ class Estimate:
         return f"Estimate({self.stamp:.3f} s, {where}, {count(len(self.ids), 'landmark')})"
 
     def to_table(self) -> dict[str, NDArray]:
-        """The landmarks as columns (N,), of the names and units of ``landmarks.csv``; a data frame takes them as is.
+        """The landmarks as columns (N,) with the names and units of ``landmarks.csv``, for instance for a data frame.
 
         Returns:
             ``id``, ``x``, ``y``, ``z`` [m] in world coordinates, and the covariance terms ``cxx`` to ``czz`` [m²].
@@ -326,8 +326,8 @@ class FrameStatus(StrEnum):
     Attributes:
         STARTED: first frame, or the first one with anything to see: the map begins.
         TRACKED: the pose was measured against the map.
-        LOST: no match for several frames: the pose is predicted only, and may be far off.
-        PREDICTED: nothing (or too little) to see: the pose is the motion model's.
+        LOST: no match for several frames: the pose is only predicted, and may be far off.
+        PREDICTED: no or too few matches: the pose is the motion model's.
         FAILED: the back end could not solve; the pose is the motion model's.
     """
 
@@ -339,7 +339,7 @@ class FrameStatus(StrEnum):
 
     @property
     def measured(self) -> bool:
-        """Whether the pose was measured; accuracy is that of such frames alone."""
+        """Whether the pose was measured; accuracy is evaluated on such frames only."""
         return self in (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 
@@ -351,7 +351,7 @@ class FrameResult:
         index: number of the step.
         status: how it ended.
         reason: one line that says why, if the status is not tracked; else empty.
-        estimate: pose after the step, without landmarks; `StereoSlam.estimate` has these, too.
+        estimate: pose after the step, without landmarks; `StereoSlam.estimate` includes them.
         report: the back end's report.
         features: of the frame.
         predicted: number of landmarks in the angle of view.
@@ -364,18 +364,18 @@ class FrameResult:
         milliseconds: wall time per stage.
         moving_features: rows of features classified as moving (V,); they never become landmarks.
         objects: the moving bodies, by ascending id.
-        located: False as long as the camera has not been found in the map that the system was started with; there is no
-            pose then.
-        revision: the new correction of all earlier pixels, where it changed before this step (`RevisingBackend`); else
-            None.
+        located: False as long as the camera has not been found in the prior map that the system was started with; the
+            pose is meaningless then.
+        revision: the change of the correction of all earlier pixels, if there was one before this step
+            (`RevisingBackend`); else None.
         T_map_odom: pose (4, 4) in the map of the back end's own world frame, in which poses never jump; the identity
             before the first loop.
-        loop: index of the earlier frame of the same place, where a loop is closed; −1 if it is in the map that the
-            system was started with; None without a loop.
-        refused_loop: the same for a loop that is refused because it contradicts the path.
+        loop: if the frame closed a loop, index of the earlier frame of the same place, or −1 if that is in the prior
+            map; else None.
+        refused_loop: the same for a loop that was refused because it contradicts the path.
         keyframe: whether the frame has become a keyframe.
-        returned: ids of landmarks of that place that are in the map again.
-        common: the part of the pose's covariance that all frames share; empty after a loop, which mixes the two.
+        returned: ids of the revisited place's landmarks that have rejoined the map.
+        common: the part of the pose's error that all frames share; empty after a loop, which mixes it with noise.
     """
 
     index: int

@@ -16,15 +16,15 @@ def one_line(text: str, length: int = _LONGEST) -> str:
 
 
 def text_of(error: BaseException) -> str:
-    """What an exception says; nothing where it fails to."""
+    """An exception's message; empty if its ``__str__`` fails."""
     try:
         return str(error)
-    except Exception:  # noqa: BLE001 (a class from elsewhere)
+    except Exception:  # noqa: BLE001 (a third-party class)
         return ""
 
 
 def cause(error: BaseException) -> str:
-    """An exception of somebody else's code in words, and the line that raised it."""
+    """An exception of third-party code in words, with the line that raised it."""
     place = extract_tb(error.__traceback__)[-1]
     text = f": {said}" if (said := text_of(error)) else ""
     return f"{type(error).__name__}{text} ({Path(place.filename).name}, line {place.lineno})"
@@ -33,8 +33,7 @@ def cause(error: BaseException) -> str:
 class SlamError(Exception):
     """Root of every exception that this package raises on purpose.
 
-    The message is one line that says what is wrong and where, whatever the input was called. Commands print it and
-    exit with status 2.
+    The message is always a single line that says what is wrong and where. Commands print it and exit with status 2.
     """
 
     def __str__(self) -> str:
@@ -70,4 +69,4 @@ class CopyError(SlamError, TypeError):
 
 
 class PartError(SlamError):
-    """A back end or front end from elsewhere raised an exception of its own, which is the ``__cause__``."""
+    """A third-party back end or front end raised an exception of its own, which is the ``__cause__``."""

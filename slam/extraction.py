@@ -1,4 +1,4 @@
-"""The front end at work in a system: from what it is given as images to features, timed, and with its warnings."""
+"""Runs a system's front end: from images to features, with timing and warnings about the input."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.tracking.input_warnings import InputWarnings
 
-#: How far from its row a front end looks for a feature's partner, where it does not say [px].
+#: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].
 _ROWS = 1.5
 
 
@@ -35,10 +35,10 @@ def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: fl
 
 
 class Extractor:
-    """Features of frames, in one thread at a time, which may be another one than the system's.
+    """Extracts features of frames, in one thread at a time, which may differ from the system's.
 
     Args:
-        frontend: that is used; its settings say how far features may be from their row.
+        frontend: to use; its settings give the largest row difference of left and right features.
         rig: the cameras.
         models: noise of the features.
     """
@@ -50,19 +50,19 @@ class Extractor:
 
     @property
     def warnings(self) -> list[str]:
-        """What looks wrong with the images so far, a line each (see `slam.tracking.input_warnings`)."""
+        """Warnings about the images so far, one line each (see `slam.tracking.input_warnings`)."""
         return list(self._warnings.lines)
 
     @one_blas_thread
     def extract(
         self, frontend: Frontend | None, frame: StereoFrame
     ) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
-        """A frame, its features, and how long these took [ms].
+        """A frame, its features, and the time of their extraction [ms].
 
         Raises:
             ConfigurationError: there is no front end.
             MeasurementError: this is no frame.
-            SlamError: another thread is here; or the front end failed (`PartError`).
+            SlamError: another thread is extracting; or the front end failed (`PartError`).
         """
         if frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")

@@ -1,7 +1,7 @@
-"""Files as input that may be hostile, and as output that must be whole: every reader and writer goes through here.
+"""Safe reading of untrusted files and atomic writing; every reader and writer uses this module.
 
 Only regular files are read, never a pipe or a device that would block, and never more than a limit. Files are written
-beside their place and moved there: a full disk or a kill leaves the old file or the new one, but no part of one.
+under a temporary name and then moved: after a full disk or a kill there is the old file or the new one, never a part.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
             raise error(f"{path}: not a regular file")
         if status.st_size > limit:
             raise error(f"{path}: the file is larger than {limit / _MEBI:.3g} MiB")
-        # No further than it says: what /proc holds has no size, may have no end, and may be waited for.
+        # No more than the stated size: files in /proc state none, may be endless, and may block.
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             return file.read(status.st_size) or b""
     except OSError as fault:
@@ -164,7 +164,7 @@ def expanded(text: str | Path, error: type[SlamError] = SequenceError) -> Path:
 
 
 def reason(fault: OSError) -> str:
-    """What the system says of a failure, without its number."""
+    """The operating system's message of a failure, without its number."""
     return fault.strerror or str(fault)
 
 
@@ -188,10 +188,10 @@ def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
 
 @contextmanager
 def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator[BinaryIO]:
-    """A file to write to, that takes its place only when it is complete and on the disk; until then the old one stays.
+    """A file to write to, which replaces the old one only when it is complete and on the disk.
 
     Raises:
-        SlamError: of type `error`, where it cannot be written; nothing is left of it then.
+        SlamError: of type `error`, if it cannot be written; nothing is left of it then.
     """
     place = Path(path)
     require_target(place, error)
@@ -217,7 +217,7 @@ def whole_file(path: str | Path, error: type[SlamError] = SlamError) -> Iterator
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text in UTF-8 at once or not at all.
+    """Write a text in UTF-8, completely or not at all.
 
     Raises:
         SlamError: it cannot be written.
@@ -227,12 +227,12 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 class RowFile:
-    """A text file that grows by whole rows: what fails to be written whole is taken away again.
+    """A text file that grows by whole rows: rows that cannot be written completely are removed again.
 
-    Rows are with the system as soon as `write` returns, so that a kill loses none.
+    Rows are handed to the operating system before `write` returns, so that a kill loses none.
 
     Args:
-        path: made, or emptied.
+        path: of the file, which is created or emptied.
 
     Raises:
         OSError: it cannot be opened, or what is there is not a regular file.
@@ -249,7 +249,7 @@ class RowFile:
         """Append rows.
 
         Raises:
-            OSError: they cannot be written; the rows before stay.
+            OSError: they cannot be written; earlier rows are kept.
         """
         rest = memoryview(text.encode("utf-8", "backslashreplace"))
         length = self._length + len(rest)
@@ -271,10 +271,10 @@ class RowFile:
 def lock_folder(folder: Path) -> int | None:
     """Keep other runs out of a folder until the returned descriptor is closed, or the process ends.
 
-    The folder itself is locked, so that nothing is left behind. None where the system has no such locks.
+    The folder itself is locked, so that no lock file is left behind. Returns None if the system has no such locks.
 
     Raises:
-        SlamError: another run has it.
+        SlamError: another run has locked it.
     """
     try:
         import fcntl

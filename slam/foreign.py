@@ -1,4 +1,4 @@
-"""Exceptions of back ends and front ends from elsewhere, in one line that names the part, the call and the frame."""
+"""Exceptions of third-party back ends and front ends, in one line that names the part, the call and the frame."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _OURS = ("slam", "backends", "frontends")
 
 @contextmanager
 def named_failures(place: str, *parts: object) -> Iterator[None]:
-    """Name what failed in an exception of a part from elsewhere, or in one that its answer may have caused.
+    """Turn exceptions that a third-party part raised, or that its return values may have caused, into `PartError`.
 
-    Exceptions go on as they are where all parts are our own.
+    If all parts are our own, exceptions pass unchanged.
 
     Args:
-        place: what is being done, for the message.
+        place: the present operation, for the message.
         parts: the back end, the front end.
 
     Raises:
@@ -28,7 +28,7 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
         yield
     except SlamError:
         raise
-    except (Exception, SystemExit) as error:  # whatever a foreign class does
+    except (Exception, SystemExit) as error:  # whatever a third-party class does
         foreign = [part for part in parts if type(part).__module__.partition(".")[0] not in (*_OURS, "builtins")]
         if not foreign or (isinstance(error, SystemExit) and not any(_raised_by(part, error) for part in foreign)):
             raise
@@ -38,7 +38,7 @@ def named_failures(place: str, *parts: object) -> Iterator[None]:
 
 
 def _raised_by(part: object, error: BaseException) -> bool:
-    """Whether the module of `part` raised an exception itself, unlike a signal's handler elsewhere."""
+    """Whether an exception was raised in the module of `part`, not by a signal handler elsewhere."""
     *_, (frame, _) = walk_tb(error.__traceback__)
     return frame.f_globals.get("__name__") == type(part).__module__
 

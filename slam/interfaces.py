@@ -1,4 +1,4 @@
-"""What the system asks of a front end and of a back end. Each method is documented once, here."""
+"""The protocols of front ends and back ends. Each method is documented once, here."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Frontend(Protocol):
     def extract(self, frame: StereoFrame) -> StereoFeatures:
         """Features of one stereo frame, in pixels of the rig's own images.
 
-        An image without features, or a missing right image, is no error: fewer (or no) rows come back.
+        An image without features, or a missing right image, is no error: the result has fewer rows, or none.
 
         Raises:
             SequenceError: the images are not of the rig's size or of an unusable type.
@@ -38,22 +38,22 @@ class Frontend(Protocol):
 
 @runtime_checkable
 class AligningFrontend(Protocol):
-    """What a front end offers besides, where it can align a feature to the image of an earlier one.
+    """Additional methods of a front end that can align features with image patches of earlier frames.
 
-    Its features carry the images that they are from. All pixels are those of the rectified pair.
+    Its features hold the images in which they were found. All pixels are those of the rectified pair.
     """
 
     def patches(self, images: ImagePair, uv_left: Array, size: Array) -> Patches:
-        """The left image around pixels (N, 2) of features of some size (N,) [px]."""
+        """Patches of the left image around pixels (N, 2), for features of some size (N,) [px]."""
         ...
 
     def align(
         self, images: ImagePair, patches: Patches, warps: Array, uv_left: Array, uv_right: Array
     ) -> tuple[Array, Array]:
-        """Where patches (N) are in a later pair of images: left and right pixels (N, 2), NaN where they are not.
+        """Find patches (N) in a later pair of images: left and right pixels (N, 2), NaN if not found.
 
-        `warps` (N, 2, 2) take pixel offsets in the later image to offsets in the patch; the search starts at `uv_left`
-        and `uv_right` (N, 2) [px]. Called beside `Frontend.extract` of another frame.
+        `warps` (N, 2, 2) map pixel offsets in the later image to offsets in the patch; the search starts at `uv_left`
+        and `uv_right` (N, 2) [px]. May be called while `Frontend.extract` processes another frame.
         """
         ...
 
@@ -80,10 +80,10 @@ class Backend(Protocol):
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """Correct the belief with landmarks seen at the predicted time. Zero rows are legal.
 
-        `guess` is the pose T_world_left (4, 4) on which the observations agree, where the caller knows it. It is no
-        measurement: it only says where to linearise first, for steps in which the prediction is far off.
+        `guess` is the pose T_world_left (4, 4) on which the observations agree, if the caller knows it. It is no
+        measurement, only the first linearisation point, for steps in which the prediction is far off.
 
-        A step that cannot be solved is a status with a reason, never an exception.
+        A step that cannot be solved returns a status with a reason, and raises no exception.
 
         Raises:
             MeasurementError: an id is not in the map.
@@ -128,7 +128,7 @@ class Backend(Protocol):
 
 @runtime_checkable
 class ObjectBackend(Protocol):
-    """What a back end offers besides, where it estimates moving objects; those that do not are given none.
+    """Additional methods of a back end that estimates moving objects; back ends without them are given none.
 
     Called in every step after `Backend.update`, at the same stamp.
     """
@@ -136,8 +136,8 @@ class ObjectBackend(Protocol):
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """Advance all bodies to the current stamp, correct those that are observed, and start those with a new id.
 
-        The prior is a constant velocity with an impulse between frames, as for the camera; it goes on through frames
-        in which a body is not observed. New points of a known body join it.
+        The motion model is constant velocity with random impulses between frames, as for the camera; frames in which a
+        body is not observed are predicted. New points of a known body join it.
 
         Returns:
             estimates of all bodies, observed or not, by ascending id.
@@ -158,39 +158,38 @@ class ObjectBackend(Protocol):
 
 @runtime_checkable
 class RevisingBackend(Protocol):
-    """What a back end offers besides, where it can correct past measurements anew.
+    """Additional methods of a back end that can correct past measurements.
 
     Attributes:
-        revises_path: whether the whole path would follow now; else only what is near the camera does.
+        revises_path: whether a revision would now change the whole path; if False, only its part near the camera.
     """
 
     revises_path: bool
 
     def revise(self, mend: Callable[[Array], Array]) -> None:
-        """Mend all measurements so far: `mend` takes rectified rows (uL, vL, uR) (N, 3) [px] to better ones.
+        """Correct all measurements so far: `mend` maps rectified rows (uL, vL, uR) (N, 3) [px] to corrected ones.
 
-        Called before `Backend.predict`, when more has become known of the rig's error; uR is NaN where there is none,
-        and stays so. A back end without this goes on with what it made of the measurements as they were.
+        Called before `Backend.predict` when the estimate of the rig's error has changed. A missing uR is NaN and stays
+        NaN. A back end without this method keeps its estimate from the earlier measurements.
 
         Raises:
-            MeasurementError: a mended measurement is not finite.
+            MeasurementError: a corrected measurement is not finite.
         """
         ...
 
 
 @runtime_checkable
 class MapBackend(Protocol):
-    """What a back end offers besides, where it can start in a map that is known beforehand.
+    """Additional methods of a back end that can start in a prior map.
 
-    One whose memory grows faster than the map says in an attribute ``most_landmarks`` how large a map it takes.
+    A back end whose memory grows faster than the map limits the map's size by an attribute ``most_landmarks``.
     """
 
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """Add landmarks with known positions (N, 3) [m] and covariances (N, 3, 3) [m²], independent of the pose.
 
-        At any time, before the first `predict` as well. The landmarks are in the world frame; how well the camera's
-        place in it is known is what the models' `initial_pose` and its sigmas say. Correlations between the landmarks
-        are taken to be none.
+        May be called at any time, even before the first `predict`. The landmarks are in the world frame, in which the
+        models' `initial_pose` and its sigmas describe the camera's pose. Landmarks are taken to be uncorrelated.
 
         Raises:
             MeasurementError: an id is in the map already, or a covariance is not symmetric and positive definite.
@@ -200,8 +199,8 @@ class MapBackend(Protocol):
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """Add landmarks at `local` (N, 3) [m] in the newest camera's coordinates, with covariances (N, 3, 3) [m²].
 
-        As `Backend.add`, but for landmarks whose place before the camera comes from elsewhere than a stereo pair: the
-        covariances say how well it is known. The landmarks are correlated with the camera's pose at that time.
+        As `Backend.add`, but for landmarks whose position relative to the camera was not measured by a stereo pair;
+        `covariances` is the uncertainty of that position. They become correlated with the camera's present pose.
 
         Raises:
             MeasurementError: before the first `predict`; an id is in the map already, or a covariance is not symmetric

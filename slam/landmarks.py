@@ -1,4 +1,4 @@
-"""The map's bookkeeping: what a landmark looks like and how well it is seen. Where it is, the back end alone knows."""
+"""The map's bookkeeping: landmarks' descriptors and how often they are seen. Positions are the back end's alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LandmarkRows:
 
     Attributes:
         ids: landmark ids (N,).
-        descriptors: what it looks like (N, D) float32.
+        descriptors: (N, D) float32.
         laplacian: signs of the Laplacian (N,) int8.
         seen: number of frames in which it was measured (N,).
         in_view: number of frames in which it should have been detected or was (N,).
@@ -26,8 +26,8 @@ class LandmarkRows:
         last_seen: frame index (N,).
         seen_from: where the camera was at its first sight (N, 3) [m], in world coordinates; NaN where not known.
         out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
-        unseen: number of frames since it was last measured (N,), of those in which any landmark was measured and this
-            one was not left out as possibly moving.
+        unseen: number of frames since it was last measured (N,); only frames count in which some landmark was measured
+            and this one was not withheld as possibly moving.
     """
 
     ids: IdArray
@@ -77,12 +77,12 @@ class LandmarkRows:
         rematch_after: int = 0,
         held: IdArray | None = None,
     ) -> LandmarkRows:
-        """Count what one frame showed: which ids were in view, which were measured, by which features.
+        """The rows after a frame, given which ids were in view, which were measured, and by which features.
 
-        `descriptor_update` is the weight of the new descriptors against the landmarks' own: 1 keeps the newest, 0 the
-        first. `in_image` says which landmarks (N,) lie inside the image. Where the camera's position (3,) is given,
-        landmarks seen again after `rematch_after` frames outside the image count as first seen now, from there.
-        A frame counts as neither missed nor seen for the landmarks `held`, which were not to be measured.
+        `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
+        `in_image` says which landmarks (N,) lie inside the image. If the camera's position (3,) [m] is given, landmarks
+        seen again after `rematch_after` frames outside the image count as first seen now, from there. For landmarks
+        `held`, which were withheld from the update, the frame counts as neither missed nor seen.
         """
         back = np.zeros(len(self), bool) if held is None else np.isin(self.ids, held)
         view, hit = self.rows(in_view), self.rows(measured)
@@ -142,7 +142,7 @@ class LandmarkRows:
         return whole.select(np.argsort(whole.ids, kind="stable"))
 
     def moved(self, T: Array) -> LandmarkRows:
-        """The same in another world; `T` (4, 4) takes coordinates there."""
+        """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
         return replace(self, seen_from=transform(T, self.seen_from))
 
     def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkRows:

@@ -1,4 +1,4 @@
-"""The one place for what every estimator assumes: motion model, pixel noise, priors, gate."""
+"""The assumptions shared by all estimators: motion model, pixel noise, priors, gate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from slam.naming import unknown
 from slam.object_models import FORBID_UNKNOWN as FORBID_UNKNOWN
 from slam.object_models import ObjectModels
 
-ANYWHERE = 1e3  # numerics: standard deviation of a position of which nothing is known [m]
+ANYWHERE = 1e3  # numerics: standard deviation of an unknown position [m]
 
 _DENSITIES = (1e-6, 1e6)  # of velocity noise
 _SIGMAS = (1e-7, 1e6)  # of the initial state
@@ -75,9 +75,9 @@ class EstimatorModels:
     Attributes:
         motion: the motion model.
         pixel_sigma: standard deviation of uL, vL and uR [px].
-        gate_probability: an observation is rejected where its innovation lies outside this quantile of χ².
-        initial_position_sigma, initial_rotation_sigma: standard deviations of the first pose [m], [rad]; tiny where it
-            defines the world.
+        gate_probability: an observation is rejected if its innovation lies outside this quantile of χ².
+        initial_position_sigma, initial_rotation_sigma: standard deviations of the first pose [m], [rad]; tiny if it
+            defines the world frame.
         initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of the first velocities [m/s],
             [rad/s].
         T_world_left: first pose (4, 4) of the left camera; null (in Python None) for the identity.
@@ -112,7 +112,7 @@ class EstimatorModels:
         return np.eye(4) if self.T_world_left is None else np.array(self.T_world_left, float)
 
 
-#: What is assumed of a kind of motion; every sequence of a kind runs with the same.
+#: Models by kind of motion; every sequence of a kind runs with the same.
 KINDS = {
     "handheld": EstimatorModels(
         MotionModel(acceleration=1.0, angular_acceleration=1.0),

@@ -1,4 +1,4 @@
-"""Names that are not known: the nearest known ones, for error messages."""
+"""Suggestions for unknown names, for error messages."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What flows between the detector of moving objects, the back ends and the caller. Units and frames as in `slam.data`.
+"""Data between the detector of moving objects, the back ends and the caller. Units and frames as in `slam.data`.
 
-A body's pose ``T_world_object`` takes body coordinates to world coordinates. The body frame is fixed when the body is
-found: its origin is the mean of the points seen then, its axes are those of the world. Motions are independent of that
-choice when written in world coordinates: ``H`` takes a point of the body from where it was to where it is.
+A body's pose ``T_world_object`` transforms body coordinates to world coordinates. The body frame is fixed when the body
+is found: its origin is the mean of the points seen then, its axes are those of the world. A motion ``H`` in world
+coordinates does not depend on that choice: it takes a point of the body from its earlier to its later position.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class ObjectObservations:
         points: ids of its points (M,), unique over all bodies; a point keeps its id as long as it is tracked.
         uv_left: left pixels (M, 2), finite.
         uv_right: right pixels (M, 2), NaN where there is no stereo match.
-        T_world_object: guess of the body's pose (4, 4) now, from the rigid fit of its points; no measurement: it says
-            where to linearise first, and where a new body's frame lies. None where there is no guess.
-        velocity: of a new body, [ω, v] (6,) in world axes [rad/s], [m/s], as far as it is known before; else None.
-        velocity_sigma: standard deviations of it (6,).
+        T_world_object: guess of the body's present pose (4, 4), from the rigid fit of its points; None without one. It
+            is no measurement, but the first linearisation point, and a new body's frame.
+        velocity: prior [ω, v] (6,) of a new body in world axes [rad/s], [m/s]; None without one.
+        velocity_sigma: its standard deviations (6,).
 
     Raises:
-        MeasurementError: shapes differ, a point stands twice, or a left pixel is not finite.
+        MeasurementError: shapes differ, a point occurs twice, or a left pixel is not finite.
     """
 
     id: int
@@ -66,10 +66,10 @@ class ObjectObservations:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a back end made of a body's observations in one frame.
+    """A back end's use of a body's observations in one frame.
 
     Attributes:
-        measured: whether they measured the body.
+        measured: whether the body's update used observations.
         used: ids of the points whose observations were used (K,).
         rejected: ids of those that failed the gate (R,).
     """
@@ -88,7 +88,8 @@ class ObjectEstimate:
         stamp: time [s].
         T_world_object: pose (4, 4).
         covariance: its covariance (6, 6), [rotation, translation], of a perturbation on the right (body axes),
-            given the camera's uncertainty too. It is that of the motion since the first sight, where the pose has none.
+            including the camera's uncertainty. At first sight the pose defines the body frame and is exact, so this is
+            the covariance of the motion since.
         velocity: angular [rad/s] and linear [m/s] velocity (6,) of the body's origin, in world axes.
         velocity_covariance: its covariance (6, 6).
         measured: whether the body was measured in this frame; else it was predicted.
@@ -122,8 +123,8 @@ class MovingObject:
         extent: least and largest corner (2, 3) [m] of the box around its points, in body coordinates; 5th and 95th
             percentiles, of the points that have moved with it for certain.
         moving: whether it moves now; a body that stops stays an object.
-        found_at: when it was found [s]; NaN where that was before the run.
-        measured_at: when it was last measured [s]; NaN where that is not known.
+        found_at: when it was found [s]; NaN if before the run.
+        measured_at: when it was last measured [s]; NaN if unknown.
         existence: probability that it exists.
     """
 
@@ -146,10 +147,10 @@ class MovingObject:
 
 @dataclass(frozen=True)
 class MotionLabels:
-    """What a frame's features are.
+    """Motion labels of a frame's features.
 
     Attributes:
-        moving: rows of features that move, or lie on a body that does (V,).
+        moving: rows of features that move, or lie on a moving body (V,).
         undecided: rows of features not seen for long enough to be classified, or in doubt (U,).
         landmarks: ids of landmarks that turned out to move (L,).
     """

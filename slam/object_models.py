@@ -1,4 +1,4 @@
-"""The one place for what every estimator assumes of moving bodies: motion model, priors, how many points."""
+"""The assumptions about moving bodies shared by all estimators: motion model, priors, number of points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RANGES = {
     "max_turn_rate": (1e-6, 1e6),
     "drift": (0.0, 1e3),
 }
-_SIGMAS = 3.0  # standard deviations that a change of velocity may be off
+_SIGMAS = 3.0  # standard deviations allowed to a change of velocity
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class ObjectModels:
         angular_acceleration: density of the noise of the angular velocity [rad/s / √s].
         initial_velocity_sigma, initial_angular_velocity_sigma: standard deviations of a new body's velocities [m/s],
             [rad/s], whose mean is zero.
-        points: so many points of a body are estimated at most; those unseen for longest make room for new ones.
-        max_speed, max_acceleration, max_turn_rate: no body moves beyond these [m/s], [m/s²], [rad/s]: an estimate that
-            says so is refused. The acceleration is that of a collision.
-        drift: density of the random walk of a point's pixel in both images with the angle from which it is seen
-            [px / √rad]: a feature looks otherwise from elsewhere, and is found elsewhere on the body.
+        points: largest number of points estimated per body; those unseen for longest make room for new ones.
+        max_speed, max_acceleration, max_turn_rate: limits of any body's motion [m/s], [m/s²], [rad/s]; an estimate
+            beyond them is refused. The acceleration is that of a collision.
+        drift: density of the random walk of a point's pixel, in both images alike, with the angle from which it is seen
+            [px / √rad]: from another viewpoint, a feature is found at another point of the body.
 
     Raises:
         ConfigurationError: a number is not positive and finite, or fewer than three points are allowed.
@@ -72,14 +72,14 @@ class ObjectModels:
         return self.acceleration**2 * dt, self.angular_acceleration**2 * dt
 
     def first_velocity(self, o: ObjectObservations | None) -> tuple[Array, Array]:
-        """Mean and standard deviations (6,) of a new body's [ω, v]: as known before, at least as any body's is."""
+        """Mean and standard deviations (6,) of a new body's [ω, v], at least as certain as in general."""
         sigmas = np.repeat([self.initial_angular_velocity_sigma, self.initial_velocity_sigma], 3)
         if o is None or o.velocity is None or o.velocity_sigma is None:
             return np.zeros(6), sigmas
         return o.velocity, np.minimum(o.velocity_sigma, sigmas)
 
     def possible(self, velocity: Array, covariance: Array, before: Array, covariance_before: Array, dt: float) -> bool:
-        """Whether a body can move so.
+        """Whether a change of velocity is physically possible.
 
         Args:
             velocity: [ω, v] (6,) [rad/s], [m/s].
@@ -97,10 +97,10 @@ class ObjectModels:
         )
 
     def known(self, covariance: Array, velocity_covariance: Array) -> bool:
-        """Whether an estimate says more of a body than these limits do.
+        """Whether an estimate of a body is more certain than these limits alone.
 
-        Its pose is to be known better than to within what a body goes in a second, or any orientation; its velocity
-        better than to within the largest.
+        Standard deviations are compared: of the position with the largest distance covered in a second, of the
+        orientation with π, of the velocities with the largest ones.
 
         Args:
             covariance: of the pose (6, 6), [rotation, translation].

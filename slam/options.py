@@ -13,7 +13,7 @@ _C = TypeVar("_C")
 
 
 def from_options(kind: type[_C], owner: str, options: Mapping[str, Any]) -> _C:
-    """The configuration, a dataclass `kind`, of keyword options; what is not given has its default.
+    """A configuration, of the dataclass `kind`, from keyword options; others have their defaults.
 
     Args:
         kind: the dataclass; it checks its values itself.

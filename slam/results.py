@@ -1,4 +1,4 @@
-"""The result of a step, put together from what its parts gave."""
+"""Assembles the result of a step."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def frame_result(
     atlas: Atlas,
     common: CommonError,
 ) -> FrameResult:
-    """What a step did.
+    """The result of a step.
 
     Args:
-        step: what the frame brought.
-        change: what it did to the map.
+        step: the frame's result before the map changed.
+        change: of the map.
         objects: the moving bodies.
         mapped_before: whether there ever was a landmark before this frame.
-        revision: how the pixels of earlier frames were corrected anew before it.
+        revision: change of the correction of earlier frames' pixels before the step; None without one.
         milliseconds: wall time per stage.
-        atlas: after the step; takes poses to the map.
-        common: the part of the pose's error that it shares with those of other frames, as they were given.
+        atlas: after the step; transforms poses to the map.
+        common: the part of the pose's error that it shares with the poses reported in other frames.
     """
     status, reason = frame_status(step, len(change.added), mapped_before)
     return FrameResult(
@@ -67,7 +67,7 @@ def frame_result(
 
 
 def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
-    """A body in the map's coordinates; covariances are about its own axes, but for the velocity's."""
+    """A body in the map's coordinates; of its covariances only the velocity's changes, the pose's is in body axes."""
     e, R = thing.estimate, np.kron(np.eye(2), T_map_odom[:3, :3])
     motions = (T_map_odom @ T @ inverse(T_map_odom) for T in (thing.motion, thing.motion_since_found))
     estimate = replace(

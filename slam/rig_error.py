@@ -1,4 +1,4 @@
-"""What an error of the rig's calibration does to measurements and poses, as data between the system's parts."""
+"""Effects of the rig's calibration error on measurements and poses, as data between the system's parts."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from slam.geometry.arrays import Array
 
 @dataclass(frozen=True)
 class CommonError:
-    """What poses are off by through the rig's error: ``shares @ scale @ c``, with the same c for all poses.
+    """Error of poses due to the rig's error: ``shares @ scale @ c``, with the same c for all poses.
 
-    What has become known of the error since a pose was made, and stays in it, is one column of `scale`: how far the
-    pose moves by it is known from a model of the estimator alone, and counts as an error, too.
+    If the correction has changed since a pose was estimated, the pose still contains the difference. It is one column
+    of `scale`: its effect on the pose is only known from a model of the estimator, so it counts as an error, too.
 
     Attributes:
-        shares: derivative (6, m) by errors that are the same for all poses, perturbing on the right.
-        scale: these errors by ones of unit variance, c, as they are known now (m, n).
+        shares: derivative (6, m) of the pose, perturbed on the right, by m errors that all poses share.
+        scale: derivative (m, n) of these errors by the common errors c (n,), which have unit variance.
     """
 
     shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
@@ -33,7 +33,7 @@ class CommonError:
 
 
 class Correction(Protocol):
-    """What is known of the rig's error, for whoever holds measurements."""
+    """A correction of measurements by the present estimate of the rig's error."""
 
     def rows(self, z: Array) -> Array:
         """Corrected rectified rows (uL, vL, uR) (N, 3) of measured ones [px]."""
@@ -45,7 +45,7 @@ class Correction(Protocol):
 
 
 class Revision(Protocol):
-    """A change of the rig's correction in the course of a run, for measurements that were corrected as before."""
+    """A change of the rig's correction during a run, for measurements that have the earlier correction."""
 
     def rows(self, z: Array) -> Array:
         """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""

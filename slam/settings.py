@@ -37,12 +37,12 @@ def apply_settings(tree: dict[str, Any], settings: Sequence[str]) -> None:
 
 
 def _listed(settings: Any) -> list[Any]:
-    """What can be gone through as a list; something that is no text where it cannot."""
+    """An iterable as a list; for anything else, a list with an element that is no text."""
     return list(settings) if isinstance(settings, Iterable) else [None]
 
 
 def _value(text: str) -> Any:
-    """JSON where it is JSON, else the text itself; what nests too deeply or has too many digits is no JSON either."""
+    """The parsed value if the text is JSON, else the text; too deep nesting or too many digits count as no JSON."""
     if text.count("[") + text.count("{") > _BRACKETS:
         return text
     try:
@@ -52,7 +52,7 @@ def _value(text: str) -> Any:
 
 
 def _set(tree: dict[str, Any], path: list[str], value: Any, setting: str) -> None:
-    """Set one leaf of the tree; every key on the way must exist, but for options of front end and back end."""
+    """Set one leaf of the tree; every key on the way must exist, except options of front end and back end."""
     node = tree
     for key in path[:-1]:
         if not isinstance(node.get(key), dict):

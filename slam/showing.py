@@ -38,7 +38,7 @@ def point(values: NDArray) -> str:
 
 
 def widest(positions: NDArray) -> tuple[int, int]:
-    """The two of the coordinates of positions (N, 3) that reach farthest, for a picture in the plane."""
+    """The two coordinates of positions (N, 3) with the largest range, for a plane picture."""
     if not len(positions):
         return 0, 2
     first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
@@ -46,7 +46,7 @@ def widest(positions: NDArray) -> tuple[int, int]:
 
 
 def path_svg(positions: NDArray) -> str:
-    """A path (N, 3) as a small picture: the two widest coordinates, both on one scale, a dot where it begins."""
+    """A path (N, 3) as a small picture: its two widest coordinates at equal scale, a dot at the start."""
     if not len(positions):
         return ""
     across, up = widest(positions)
@@ -81,7 +81,7 @@ def card(text: str, pictures: Sequence[str]) -> str:
 
 
 def sequence_line(sequence: Any) -> str:
-    """A sequence in one line: what it is called, how long it is, and what is known of it."""
+    """A sequence in one line: its name, its length, and further facts."""
     stamps, rig, truth = sequence.stamps, sequence.rig, sequence.ground_truth
     seconds = float(stamps[-1] - stamps[0]) if len(stamps) else 0.0
     known = "no ground truth" if truth is None else "with ground truth"

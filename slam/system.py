@@ -44,7 +44,7 @@ from slam.tracking.state import TrackingState
 def _require_types(
     rig: StereoRig, config: SystemConfig | None, prior_map: SavedMap | None, rig_prior: KeptCalibration | None
 ) -> None:
-    """Raise ConfigurationError where a system is given something else than it is documented to take."""
+    """Raise ConfigurationError if an argument of a system has another type than documented."""
     kinds: dict[str, tuple[object, type]] = {
         "rig": (rig, StereoRig), "config": (config, SystemConfig),
         "prior_map": (prior_map, SavedMap), "rig_prior": (rig_prior, KeptCalibration),
@@ -57,9 +57,9 @@ def _require_types(
 class StereoSlam:
     """Stereo SLAM with a front end and a back end of choice.
 
-    Use a system from one thread at a time; several systems may run in several threads, and give the same bytes as
-    alone. A system whose parts can be pickled or copied (`copy.deepcopy`) can be, too; the copy continues with the same
-    bytes. The first system has the process keep memory that it has freed (see `slam.runtime.memory`).
+    Use a system from one thread at a time; several systems may run in several threads, with results identical to the
+    byte. A system can be pickled or copied (`copy.deepcopy`) if its parts can; the copy continues identically. The
+    first system makes the process keep memory that it has freed (see `slam.runtime.memory`).
 
     Args:
         rig: the two cameras.
@@ -68,10 +68,10 @@ class StereoSlam:
         backend: a name (see ``backends.names()``) or an object with `Backend`'s methods.
         kind: kind of motion, ``"handheld"`` or ``"driving"``, which chooses the default settings.
         config: all settings; overrides `kind`.
-        prior_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames are lost until
-            the camera is found in it. The back end must be given by name.
+        prior_map: a map to start in (see `slam.load_map`). World coordinates are then the map's. Frames have the status
+            LOST until the camera is found in it. The back end must be given by name.
         rig_prior: errors of the rig as estimated from earlier recordings (see `slam.load_calibration`). They are
-            corrected from the first frame on, and estimated further.
+            corrected from the first frame on, and their estimation continues.
 
     Raises:
         CalibrationError: `rig_prior` is of another rig.
@@ -132,7 +132,7 @@ class StereoSlam:
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
-        self._stamp = -np.inf  # that the back end was last advanced to [s]
+        self._stamp = -np.inf  # to which the back end was last advanced [s]
         if prior_map is not None:
             prior_map.require_fits(self.frontend_name)
             self._relocalizer.search_in(prior_map, self.backend)
@@ -176,7 +176,7 @@ class StereoSlam:
         """Every frame with the result of its step.
 
         Args:
-            frames: a sequence, or frames in order of time; as `slam.LiveFrames`, those that come too late are dropped.
+            frames: a sequence, or frames in order of time; of `slam.LiveFrames`, frames that come too late are dropped.
             overlap: read the next frame and extract its features in a second thread. The results have the same bytes;
                 only the times differ.
 
@@ -186,23 +186,23 @@ class StereoSlam:
         if not isinstance(frames, Iterable):
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
         extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
-        depth = 1 if getattr(frames, "live", False) else 2  # what waits grows old
+        depth = 1 if getattr(frames, "live", False) else 2  # live frames must not wait
         for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
             with self._stepping:
                 result = self._step(features, frame.index)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
-        """One step from features: predict, associate, update, and keep the map (paper A, III and IV; paper B, 2).
+        """One step from features: predict, associate, update, and manage the map (paper A, III and IV; paper B, 2).
 
-        A frame with nothing to see is no error: the pose is predicted and the status says so. A step that is ended by
-        an exception, such as an interrupt, leaves the map as it was (see `roll_back`); the back end is already at the
-        stamp of that frame, so continue with a later one. What self-calibration has learnt from the frame stays.
+        A frame without features is no error: the pose is predicted and the status says so. A step ended by an
+        exception, such as an interrupt, leaves the map unchanged (see `roll_back`), but the back end is already at the
+        stamp of that frame, so continue with a later one. Self-calibration keeps what it has learnt from the frame.
 
         Raises:
             MeasurementError: the features are not as documented, or time does not increase. Nothing is changed then.
-            SlamError: another thread is using the system; or back end or front end give something else than their
-                protocols say, or raise an exception of their own, which is its cause then (`PartError`).
+            SlamError: another thread is using the system; or back end or front end return something else than their
+                protocols say, or raise an exception of their own, which is then the cause (`PartError`).
         """
         with self._stepping:
             return self._step(features, self._last.index + 1)
@@ -213,12 +213,12 @@ class StereoSlam:
             return self._whole_step(features)
 
     def _named(self, place: str) -> AbstractContextManager[None]:
-        """Exceptions of parts from elsewhere say what failed, and where."""
+        """Make exceptions of third-party parts say what failed, and where."""
         return named_failures(place, self.backend, self.frontend)
 
     @one_blas_thread
     def _whole_step(self, features: StereoFeatures) -> FrameResult:
-        """A step."""
+        """All stages of a step."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
         self._roll_back()
         index, stages, search = self._last.index + 1, self._stages, self._relocalizer.search
@@ -243,11 +243,11 @@ class StereoSlam:
                 estimate, labels,
             )  # fmt: skip
             change, anchors = self._manage(seen, step)
-        with stages.stage("atlas"):  # a place seen again corrects the path since
+        with stages.stage("atlas"):  # a loop closure corrects the path
             step, atlas, change = self._close_loops(step, change)
         common = self._rig_error.common(as_given=True)
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
-        # The step has happened: in one statement, so that an interrupt finds all of it done or nothing.
+        # Commit the step in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
             self._last.after(step, len(change.added), anchors, index in self.restarted[-1:]), change.landmarks, atlas,
             Stages(),
@@ -262,7 +262,7 @@ class StereoSlam:
         return prediction, dt
 
     def _associate(self, prediction: Prediction, features: StereoFeatures, index: int) -> Associated:
-        """Match landmarks with features, and align these where the front end can."""
+        """Match landmarks with features, and align the features if the front end can."""
         corrected = self.calibration.correct(features)
         landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
         landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
@@ -276,7 +276,7 @@ class StereoSlam:
         return Associated(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
 
     def _update(self, seen: Associated, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:
-        """Measure the landmarks: what the update did, landmarks that were left out of it, and how tracking goes on."""
+        """Update the back end: its report, the ids of landmarks left out of the update, and the tracking state."""
         positions = self._positions(seen.matches.ids)
         asked, spared = self._localizer.informative(seen.prediction, seen.matches, positions, dt)
         report = self.backend.update(asked.observations(seen.features), asked.T_world_left)
@@ -286,7 +286,7 @@ class StereoSlam:
         return report, spared, state
 
     def _estimate_pose(self, report: UpdateReport) -> Estimate:
-        """The camera's pose, after an update; what the rig's error does to it is taken down."""
+        """The camera's pose after an update; the rig's uncertainty is propagated to it."""
         estimate = require_estimate(self.backend.estimate(landmarks=False), self.backend)
         self._rig_error.uncertainty.observe(
             estimate.T_world_left, estimate.stamp, report.used, self._positions(report.used)
@@ -294,22 +294,22 @@ class StereoSlam:
         return estimate
 
     def _manage(self, seen: Associated, step: Step) -> tuple[MapChange, Anchors]:
-        """What a step does to the map, and what its landmarks look like."""
+        """Change the map after a frame: the change, and the landmarks' image patches."""
         change = self._mapper.update(self.backend, seen.landmarks, step)
         T = step.estimate.T_world_left
         anchors = self._aligner.anchored(self.frontend, seen.aligned, seen.matches, change.added, T)
-        if self.landmarks is not None and not len(seen.landmarks):  # left behind, where the map has begun anew
+        if self.landmarks is not None and not len(seen.landmarks):  # left behind: a new map has begun
             change = replace(change, erased=np.concatenate([self.landmarks.ids, change.erased]))
         new = np.setdiff1d(change.added.ids, change.erased)
         self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
         return change, anchors
 
     def _positions(self, ids: IdArray) -> np.ndarray:
-        """Where landmarks are in the world (N, 3)."""
+        """Landmarks' positions (N, 3) [m] in the world."""
         return require_positions(self.backend.positions(ids), ids, self.backend)
 
     def _close_loops(self, step: Step, change: MapChange) -> tuple[Step, Atlas, MapChange]:
-        """The step with the rig's error in its estimate, and the atlas; after a loop the old landmarks are back."""
+        """The step with the rig's uncertainty added, the atlas, and the map, to which a loop returns old landmarks."""
         estimate, common = self._rig_error.added_to(step.estimate), self._rig_error.common(as_given=False)
         step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
         atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path)
@@ -321,11 +321,11 @@ class StereoSlam:
 
     @one_blas_thread
     def roll_back(self) -> None:
-        """After a step that an exception ended: take back what it did to the map, in the back end as well.
+        """After a step that an exception ended: undo its changes of the map, in the back end as well.
 
-        Landmarks that it added are removed, and those that it had removed leave the map. The belief about the camera
-        stays as the step left it. Bodies are forgotten where their detector was interrupted. The next step, `estimate`
-        and `snapshot` do this by themselves; without such an exception there is nothing to do.
+        Landmarks that it added are removed; those that it had removed from the back end leave the map. The camera's
+        estimate stays as the step left it. Bodies are forgotten if their detector was interrupted. The next step,
+        `estimate` and `snapshot` do this by themselves; without such an exception there is nothing to do.
         """
         with self._stepping, self._named("taking a step back"):
             self._roll_back()
@@ -347,7 +347,7 @@ class StereoSlam:
             return self.atlas.path(self._path())
 
     def _path(self) -> Trajectory:
-        """The path as the back end has it, in its own frame."""
+        """The path by the back end, in its own frame."""
         return Trajectory.joined([*self._relocalizer.past, self.backend.trajectory()])
 
     @one_blas_thread
@@ -357,7 +357,7 @@ class StereoSlam:
             return self._estimate()
 
     def _estimate(self, of_map: bool = False) -> Estimate:
-        """`estimate`, in the only thread; landmarks `of_map` are as uncertain as they are to each other."""
+        """`estimate`, in the only thread; with `of_map`, landmarks' covariances are relative to each other."""
         self._roll_back()
         search = self._relocalizer.search
         if search is not None:
@@ -367,7 +367,7 @@ class StereoSlam:
 
     @one_blas_thread
     def snapshot(self) -> SavedMap:
-        """The map as it is now, apart from the system; one that the camera has not been found in is itself.
+        """A copy of the present map; the prior map itself, as long as the camera has not been found in it.
 
         Raises:
             SlamError: there is no map yet.
@@ -387,11 +387,11 @@ class StereoSlam:
 
     @property
     def warnings(self) -> list[str]:
-        """What looks wrong with images, stamps or baseline, a line each (see `slam.tracking.input_warnings`)."""
+        """Warnings about images, stamps or baseline, one line each (see `slam.tracking.input_warnings`)."""
         return self._extractor.warnings
 
     def __getstate__(self) -> dict[str, object]:
-        """What a copy holds; refused while another thread is in a step."""
+        """State for copying and pickling; refused while another thread is in a step."""
         with self._stepping:
             return vars(self).copy()
 
@@ -401,14 +401,14 @@ class StereoSlam:
         return self._relocalizer.restarted
 
     def _revise(self) -> Revision | None:
-        """Apply what has become known of the rig's error, also to what was given before, if the back end can."""
+        """Apply the present estimate of the rig's error, also to earlier measurements if the back end can."""
         change = self._rig_error.apply(self.backend)
         if change is not None:
             self.objects.revise(change.rows)
         return self._rig_error.revise(self.backend, restarted=bool(self._relocalizer.past))
 
     def _locate(self, features: StereoFeatures, index: int) -> bool:
-        """Look for the camera in the map that the system was started with; where it is found, the back end starts."""
+        """Look for the camera in the prior map, and start the back end if it is found; returns whether it is."""
         search = self._relocalizer.search
         assert search is not None
         T, found = search.locate(features, index), None
@@ -431,14 +431,14 @@ class StereoSlam:
     def _localize(
         self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures, index: int
     ) -> tuple[LandmarkRows, Prediction, LandmarkMatches]:
-        """Landmarks in this frame; where the camera was kidnapped, a new back end's prediction with them.
+        """Match landmarks in this frame; if the camera was kidnapped, start a new back end first.
 
-        Where it is in a place of the atlas that the map no longer holds, landmarks of that place join the map.
+        If it is at a place of the atlas that is no longer in the map, landmarks of that place join the map.
         """
         positions, found = self._positions(landmarks.ids), None
 
         def elsewhere() -> np.ndarray | None:
-            """Where the places of the atlas see the camera."""
+            """The camera's pose by the keyframes of the atlas."""
             nonlocal found
             found = self._loop_closer.find(self.atlas, features, self.calibration.applied, index)
             return None if found is None else found.T_odom_left
@@ -462,10 +462,10 @@ class StereoSlam:
         return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)
 
     def _begin_anew(self, seen: Associated, state: TrackingState, index: int) -> Associated:
-        """Where the camera is in an unknown place, a map of its own begins there with a new back end.
+        """If the camera is in an unknown place, begin a new map there with a new back end.
 
-        How that map lies to the earlier one is known as well as the predicted pose is, until a place of the atlas is
-        seen again. The earlier landmarks are left to the atlas.
+        The new map's pose relative to the earlier one is as uncertain as the predicted pose, until a place of the atlas
+        is seen again. The earlier landmarks remain in the atlas only.
         """
         unknown, c = state.in_unknown_place(self.config.map.restart_after), self.config.atlas
         if not (unknown and c.enabled and len(self.atlas) and self._relocalizer.can_restart(self.backend)):
@@ -479,7 +479,7 @@ class StereoSlam:
         return replace(seen, landmarks=none, matches=LandmarkMatches.nothing())
 
     def _take_over(self, new: Backend, path: Trajectory, atlas: Atlas, index: int) -> None:
-        """Go on with another back end, after a path that the old one leaves."""
+        """Continue with a new back end; `path` is the old one's."""
         r = self._relocalizer
         self.backend, self.atlas, self._rig_error.given, r.past, r.restarted = (
             new, atlas, self.calibration.applied, [*r.past, path], [*r.restarted, index],

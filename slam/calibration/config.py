@@ -20,17 +20,17 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class SelfCalibrationConfig:
-    """Settings of the self-calibration. What the calibration may be off by is in `slam.calibration.prior`.
+    """Settings of the self-calibration. The prior of the calibration's errors is in `slam.calibration.prior`.
 
     Attributes:
-        enabled: False leaves all measurements as they are.
-        pixel_sigma: noise of a left pixel [px] before anything is known of it; it is found from pairs of views.
+        enabled: False leaves all measurements unchanged.
+        pixel_sigma: initial noise of a left pixel [px]; it is then estimated from pairs of views.
         disparity_sigma: the same of a disparity [px].
         systematic: error of rows and disparities that all frames of a recording may share, for each parameter [px].
         kept_share: two views are compared once less than this share of the first view's features is matched.
         minimum_common: least number of features matched in both views.
-        minimum_parallax: least median of what translation moves the features by between two views [px].
-        inflation: factor on the variance of the evidence before anything is known of its scatter.
+        minimum_parallax: least median displacement of the features by translation between two views [px].
+        inflation: initial factor on the variance of the evidence, until its scatter has been measured.
     """
 
     enabled: bool = True

@@ -1,13 +1,13 @@
 """The rig's uncertainty in poses and landmarks: how the estimate depends on the rig's parameters (Schmidt, 1966).
 
-A back end takes the rig for exact. What is left of the rig's error acts on all frames alike, so it does not average out
-as pixel noise does. With δ the error of the applied correction and ``Σ`` its covariance, poses and landmarks are
+A back end takes the rig for exact. The rig's remaining error acts on all frames alike, so it does not average out as
+pixel noise does. With δ the error of the applied correction and ``Σ`` its covariance, poses and landmarks are
 
     T_true = T exp(J δ),    y_true = y + L δ,
 
-and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. J and L
-follow from what was measured, by a filter of their own (`slam.calibration.sensitivity`). It follows `_FOLLOWED` of the
-landmarks that were measured lately, chosen by chance, which bounds its cost.
+and their covariances grow by ``J Σ Jᵀ`` and ``L Σ Lᵀ``: δ is considered, but not estimated by the back end. A filter of
+its own computes J and L from the measurements (`slam.calibration.sensitivity`). To bound its cost, it tracks a random
+choice of `_FOLLOWED` recently measured landmarks.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from slam.geometry.arrays import Array, IdArray
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 from slam.models import EstimatorModels
 
-#: Standard deviation of the baseline's length, as a share of it. It scales the whole world, so images never show it:
-#: the squares of a calibration board are known to some tenths of a percent.
+#: Standard deviation of the baseline's length, as a share of it: the squares of a calibration board are known to some
+#: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
 
-_FOLLOWED = 60  # cost: landmarks in the filter at most
-_UNSEEN = 3  # cost: frames after which a landmark that is not measured is followed no more
-_EVERY = 0.08  # cost: time between measurements that the filter takes [s]; frames in between show nearly the same
-_LONGEST = 1.0  # guard: time [s] after which nothing is known of a motion
+_FOLLOWED = 60  # cost: most landmarks in the filter
+_UNSEEN = 3  # cost: frames without a measurement after which a landmark leaves the filter
+_EVERY = 0.08  # cost: least time between the filter's updates [s]; frames in between show nearly the same
+_LONGEST = 1.0  # guard: time [s] after which a motion counts as unknown
 
 
 class RigUncertainty:
     """What the rig's uncertainty adds to the covariances of poses and landmarks.
 
     Columns of all sensitivities are the parameters of `RigModel`, the baseline's length (a share), and one column of
-    unit variance: what earlier corrections, that are known by now, have left in a back end that cannot revise.
+    unit variance: the error that changes of the correction have left in a back end that cannot revise its past.
 
     Args:
         model: the rig's parameters.
@@ -46,7 +46,7 @@ class RigUncertainty:
         applied: the correction (n,) that the path begins with.
 
     Attributes:
-        kept: the correction (n,) that the path was made with, as far as changes of it are in the covariance.
+        kept: the correction (n,) with which the path was made, after all changes told to `path_keeps`.
     """
 
     def __init__(self, model: RigModel, models: EstimatorModels, applied: Array) -> None:
@@ -81,7 +81,7 @@ class RigUncertainty:
         wanted = _chosen(np.concatenate([lately, ids[rows]]))
         now, others = self._exchanged(before, others, wanted)
         rows = rows[_isin(ids[rows], wanted)]
-        if len(rows):  # before the motion, whose error they share with all that is followed
+        if len(rows):  # before the motion, whose error they share with the whole state
             again = np.searchsorted(others.ids, ids[rows])
             now = now.seen_again(others.select(again), transform(inverse(now.T_world), positions[rows]))
             others = others.select(np.delete(np.arange(len(others.ids)), again))
@@ -116,7 +116,7 @@ class RigUncertainty:
         self._followed, self._others = now, others
 
     def see_anew(self, ids: IdArray, positions: Array) -> None:
-        """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones: what they were before counts no more."""
+        """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones, replacing their former state."""
         self.change(ids[:0], positions[:0], ids)
         self.change(ids, positions, ids[:0])
 
@@ -127,16 +127,16 @@ class RigUncertainty:
             self._followed, self._others = self._without(np.setdiff1d(known, ids))
 
     def path_follows(self, applied: Array) -> None:
-        """The correction becomes `applied` (n,), and so does that of the path."""
+        """The correction becomes `applied` (n,), and the path was revised accordingly."""
         self._applied = applied
 
     def path_keeps(self, applied: Array, positions: Callable[[IdArray], Array], landmarks_follow: bool) -> None:
-        """The correction becomes `applied` (n,), but the path stays as it is.
+        """The correction becomes `applied` (n,), but the path was not revised.
 
         Args:
             applied: the parameters.
-            positions: gives the positions (M, 3) [m] of landmarks by their ids (M,).
-            landmarks_follow: the landmarks move to where the new correction sees them from the present pose.
+            positions: returns the positions (M, 3) [m] of landmarks by their ids (M,).
+            landmarks_follow: the landmarks move to where the new correction places them from the present pose.
         """
         step, now, others = applied - self._applied, self._followed, self._others
         if now is not None and step.any():
@@ -169,7 +169,7 @@ class RigUncertainty:
         return replace(estimate, covariance=estimate.covariance + J @ J.T, covariances=positions)
 
     def shared(self, covariance: Array, kept: Array) -> tuple[Array, Array]:
-        """What the errors of this pose and of those of other frames have in common, as factors.
+        """The error that this pose shares with those of other frames, as factors.
 
         The covariance that `added_to` adds to the pose is ``J S Sᵀ Jᵀ``. Poses of several frames have the common errors
         ``J₁ S c``, ``J₂ S c``, …, with the same c of unit variance, where S is of the last frame.
@@ -205,9 +205,9 @@ class RigUncertainty:
         return adjoint(self._model.rig.rectified.T_left_rectified) @ self.pose
 
     def _factor(self, covariance: Array) -> Array:
-        """A root (n + 2, n + 2) of the covariance of the parameters (n, n), of the baseline and of what was kept.
+        """Square root (n + 2, n + 2) of the covariance of parameters (n, n), baseline and unit column.
 
-        It is the symmetric one: so its columns mean the same in all frames.
+        It is the symmetric root, so that its columns mean the same in all frames.
         """
         n = self._columns
         factor = np.zeros((n, n))
@@ -217,12 +217,12 @@ class RigUncertainty:
         return factor
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
-        """Standard deviations of a motion [rad], [m] before anything is measured: the velocity's change, twice."""
+        """Prior standard deviations of a motion [rad], [m]: twice the velocity's change."""
         v, w = np.sqrt(self._motion.velocity_variance(min(abs(dt), _LONGEST)))
         return 2 * float(w) * min(abs(dt), _LONGEST), 2 * float(v) * min(abs(dt), _LONGEST)
 
     def _without(self, erased: IdArray) -> tuple[Followed, Frozen]:
-        """What is followed, and the other landmarks, without some."""
+        """The filter's state and the frozen landmarks, without the erased ones."""
         assert self._followed is not None
         now, others = self._followed, self._others
         if not len(erased):
@@ -230,7 +230,7 @@ class RigUncertainty:
         return now.select(np.flatnonzero(~_isin(now.ids, erased))), others.select(~_isin(others.ids, erased))
 
     def _exchanged(self, now: Followed, others: Frozen, wanted: IdArray) -> tuple[Followed, Frozen]:
-        """Without those that are not wanted any more, which join the others."""
+        """Move landmarks that are not `wanted` any more from the filter's state to the frozen ones."""
         stays = _isin(now.ids, wanted)
         if stays.all():
             return now, others
@@ -242,7 +242,7 @@ class RigUncertainty:
         points = self._pixels(local)
         out = np.zeros((len(local), 3, self._columns))
         out[:, :, :-2] = self._model.field(points)
-        out[:, 2, -2] = -points[:, 2]  # a longer baseline makes the nominal one's disparity smaller
+        out[:, 2, -2] = -points[:, 2]  # with a longer baseline, the nominal one's disparity is smaller
         return out
 
     def _pixels(self, local: Array) -> Array:
@@ -258,15 +258,15 @@ class RigUncertainty:
 
 
 def _chosen(ids: IdArray) -> IdArray:
-    """At most `_FOLLOWED` of some landmarks (N,): by chance, but each time the same ones."""
+    """At most `_FOLLOWED` of some landmarks (N,): a pseudo-random choice, the same each time."""
     if len(ids) <= _FOLLOWED:
         return ids
-    # Knuth's multiplicative hash: as good as chance, and no two ids below 2³² are drawn alike.
+    # Knuth's multiplicative hash, which is injective for ids below 2³².
     drawn = (ids.astype(np.uint64) * np.uint64(2654435761)) % np.uint64(2**32)
     return ids[np.lexsort((ids, drawn))[:_FOLLOWED]]
 
 
 def _isin(ids: IdArray, others: IdArray) -> np.ndarray:
-    """As ``np.isin``, which takes ten times as long for so few."""
+    """Like ``np.isin``, but ten times as fast for small arrays."""
     known = set(others.tolist())
     return np.fromiter((i in known for i in ids.tolist()), bool, len(ids))

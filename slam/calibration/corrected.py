@@ -1,4 +1,4 @@
-"""A rig with its error taken out: cameras and extrinsics of the usual form that measure as the corrected pixels do."""
+"""The corrected rig: cameras and extrinsics of the usual form that reproduce the corrected pixels."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, so3_exp
 
-_GRID = 25, 15  # numerics: pixels at which the cameras are to agree, columns and rows
+_GRID = 25, 15  # numerics: grid of pixels to which the cameras are fitted, columns and rows
 
 
 class CorrectedRig(NamedTuple):
-    """A rig with its error taken out.
+    """A rig corrected by its estimated error.
 
     Attributes:
         rig: in the form of a calibration file.
-        left_off, right_off: how far its pixels are from the corrected ones, root mean square over the image [px].
+        left_off, right_off: deviation of its pixels from the corrected ones, root mean square over the image [px].
     """
 
     rig: StereoRig
@@ -34,9 +34,9 @@ class CorrectedRig(NamedTuple):
 def corrected_rig(model: RigModel, parameters: Array) -> CorrectedRig:
     """The rig as calibrated, corrected by parameters (n,).
 
-    Focal lengths, principal points and distortion of each camera are fitted to where the corrected rays are in its
-    image. A camera without distortion gets k1, k2, p1 and p2. A fisheye's form has no tangential distortion. The left
-    camera's axes stay: the turn of the ideal rig that `RigModel.field` has is left out.
+    Focal lengths, principal point and distortion of each camera are fitted to the pixels of the corrected rays. A
+    camera without distortion gets k1, k2, p1 and p2. A fisheye model has no tangential distortion. The left camera's
+    axes are kept: the rotation of the ideal rig in `RigModel.field` is left out.
 
     Args:
         model: the parameters' meaning, and the rig as calibrated.
@@ -56,13 +56,13 @@ def corrected_rig(model: RigModel, parameters: Array) -> CorrectedRig:
 def _camera(
     camera: PinholeCamera, ideal: PinholeCamera, rectify: Callable[[Array], Array], R: Array, theta: Array
 ) -> tuple[PinholeCamera, float]:
-    """A camera that sees the corrected rays at its pixels, and how well [px].
+    """A camera fitted to the corrected rays, and the root mean square deviation [px].
 
     Args:
         camera: as calibrated.
-        ideal: the camera of the rectified rig that takes its place.
-        rectify: takes its pixels (N, 2) to those of the rectified camera.
-        R: takes its axes to those of the rectified camera (3, 3).
+        ideal: the corresponding camera of the rectified rig.
+        rectify: maps pixels (N, 2) of `camera` to those of the rectified camera.
+        R: rotation from the camera's axes to those of the rectified camera (3, 3).
         theta: the corrections (8,) of `LENS`.
     """
     u, v = np.meshgrid(*(np.linspace(0, n - 1, k) for n, k in zip((camera.width, camera.height), _GRID)))

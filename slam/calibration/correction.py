@@ -1,4 +1,4 @@
-"""Corrections of pixels by a rig's parameters, for whoever holds measurements."""
+"""Corrections of pixels by a rig's parameters."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from slam.calibration.model import RigModel
 from slam.data import StereoFeatures
 from slam.geometry.se3 import Array
 
-_ROUNDS = 4  # numerics: of the fixed point that undoes a correction; each takes off a factor of some 30
+_ROUNDS = 4  # numerics: fixed-point iterations that undo a correction; each reduces the error some 30 times
 
 
 @dataclass(frozen=True)
 class RigCorrection:
-    """Takes measured pixels to those of an ideal rig.
+    """Maps measured pixels to those of an ideal rig.
 
     Attributes:
         model: the parameters' meaning.
@@ -38,7 +38,7 @@ class RigCorrection:
         return self.model.rows(points)
 
     def features(self, features: StereoFeatures) -> StereoFeatures:
-        """Features with both pixels corrected; the right row keeps what is left of the vertical disparity."""
+        """Features with both pixels corrected; the right row keeps the remaining vertical disparity."""
         rectified_rig = self.model.rig.rectified
         left, right = rectified_rig.rectify_left(features.uv_left), rectified_rig.rectify_right(features.uv_right)
         z = np.column_stack([left, right[:, 0]])
@@ -52,7 +52,7 @@ class RigCorrection:
 
 @dataclass(frozen=True)
 class Revision:
-    """A change of the correction in the course of a run, for measurements that were corrected as before.
+    """A change of the correction during a run, for measurements that have the earlier correction.
 
     Attributes:
         before, after: the corrections.

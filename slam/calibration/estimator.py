@@ -28,33 +28,33 @@ from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
-_BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: times over which errors are surely correlated
-_SPACING = 0.5  # cost: a view waits from when the last one has lost this part of what it loses until it is compared
-_FEW = 6  # with fewer pairs, one that is not complete counts meanwhile
-_LATER = 1.25  # cost: after so many times the frames such a pair is solved anew: its parallax has grown as much at most
-_MOST_ROWS = 250  # cost: of a frame: more say little more
+_BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
+_SPACING = 0.5  # cost: a new view is taken when the last one has lost this share of the features it may lose
+_FEW = 6  # with fewer pairs, an incomplete one counts provisionally
+_LATER = 1.25  # cost: an incomplete pair is solved anew after so many times the frames, as its parallax grows no faster
+_MOST_ROWS = 250  # cost: features of a frame whose rows are used: more add little
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
-_KNOWN = 0.5  # of the prior's variance of disparities that may be left when pixels are first corrected
-_LIKELIER = 1.0  # logarithm of how much: what a single parameter that is fitted must gain (Akaike)
-_CONFIGURED = 4  # pairs that the configured noise counts for
-_RARER = 20  # cost: pairs after which every second frame is looked at, and so on: the n-th adds one part in n
-_TURN = 0.05  # but never rarer than once in this turn [rad]: turns are rare, and they alone show the focal length
+_KNOWN = 0.5  # pixels are first corrected once the prior variance of disparities has fallen to this share
+_LIKELIER = 1.0  # least gain in log likelihood by the correction: that of one fitted parameter (Akaike)
+_CONFIGURED = 4  # number of pairs that the configured noise counts for
+_RARER = 20  # cost: after this many pairs every second frame is used, after twice as many every third, and so on
+_TURN = 0.05  # but at least one per rotation by this angle [rad]: turns are rare, and they alone show the focal length
 
 
 class SelfCalibration:
-    """The rig's error: its posterior, and the view that waits for a partner.
+    """Estimates the rig's error: its posterior, and the views that wait for a second one.
 
     Args:
         rig: the cameras.
         config: settings.
-        kept: what earlier recordings of this rig have shown; None for nothing.
+        kept: calibration from earlier recordings of this rig; None without one.
 
     Raises:
         CalibrationError: `kept` is of another rig.
         ConfigurationError: there is one, but self-calibration is switched off.
 
     Attributes:
-        pairs: number of pairs of views that the posterior rests on.
+        pairs: number of pairs of views in the posterior.
         unsolved: number of pairs for which no motion was found.
     """
 
@@ -73,7 +73,7 @@ class SelfCalibration:
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
-        self._fields: Evidence | None = None  # of rows: parameters, and what they leave
+        self._fields: Evidence | None = None  # of rows: parameters and residual fields
         start = self._prior.covariances[-1] if kept is None else self._prior.covariances.mean(axis=0)
         self._far = self.model.field(self.model.far())[:, 2]  # disparities of far points by the parameters
         zoom = focal_sigma(self.model) > 0
@@ -84,34 +84,37 @@ class SelfCalibration:
         self._scattered = _CONFIGURED
         self._waiting: list[View] = []
         self._open: Evidence | None = None  # of a pair that is not complete
-        self._frames, self._solved = 0, 0  # frames that such a pair has had, and had when it was last solved
+        self._frames, self._solved = 0, 0  # frames of the incomplete pair: now, and when last solved
         self._seen = 0
-        self._looked: Array | None = None  # pose of the last frame that was looked at
+        self._looked: Array | None = None  # pose of the last frame that was used
         self.unsolved = 0
         self.applied = RigCorrection(self.model, self._prior.mean.copy())
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of views that the posterior rests on."""
+        """Number of pairs of views in the posterior."""
         return self._motion.count
 
     @property
     def posterior(self) -> RigPosterior:
-        """What is believed of the rig's error now."""
+        """The present posterior of the rig's error."""
         covariance = self._solution.covariance
         if not self._kept:  # else it is in the evidence
             covariance = covariance + np.diag(self._systematic)
         return RigPosterior(self.model.names, self.model.units, self._solution.mean.copy(), covariance)
 
     def apply(self, least: float = 0.0) -> Revision | None:
-        """Correct features by what is known now; returns the change, None where there is none.
+        """Apply the present posterior to features from now on; returns the change, or None.
 
-        Nothing is corrected before motion has taken half of the prior's variance from the disparities, unless there is
-        a kept calibration: rows alone say too little of them, and what they seem to say is then mostly the prior. Nor
-        where the calibration as delivered explains the motion nearly as well: rows have errors of their own, by wrong
-        matches for instance. Where that is no longer so, the calibration as delivered is taken again. Where both the
-        disparities of far points (root mean square over the image) and the focal length, which those do not show, would
-        change by less than `least` standard deviations, features are corrected as before.
+        The calibration as delivered is used
+
+        - until motion has halved the prior variance of the disparities, unless there is a kept calibration: rows alone
+          hardly determine disparities, so that the posterior is mostly the prior;
+        - while it explains the motion nearly as well as the posterior: rows have errors of their own, such as wrong
+          matches.
+
+        The correction is unchanged if both the disparities of far points (root mean square over the image) and the
+        focal length, which far points do not show, would change by less than `least` standard deviations.
         """
         if not self.config.enabled:
             return None
@@ -129,7 +132,7 @@ class SelfCalibration:
         return Revision(before, self.applied)
 
     def _motion_agrees(self) -> bool:
-        """Whether what was seen in motion is likelier with the mean than with the calibration as delivered."""
+        """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
         found, mean = self.evidence(), self._solution.mean
         return found is not None and bool(found.motion.e @ mean - 0.5 * mean @ found.motion.S @ mean > _LIKELIER)
 
@@ -144,7 +147,7 @@ class SelfCalibration:
 
         Args:
             features: of the frame as measured, not corrected.
-            T_world_left: the left camera's pose (4, 4) as the system has it; a first guess.
+            T_world_left: the left camera's pose (4, 4) by the system, an initial guess.
         """
         if not self.config.enabled:
             return
@@ -164,14 +167,14 @@ class SelfCalibration:
             self._update()
 
     def _has_turned(self, T_world_left: Array) -> bool:
-        """Whether the camera looks elsewhere than in the last frame that was looked at."""
+        """Whether the camera has rotated since the last frame that was used."""
         if self._looked is None:
             return True
         cosine = 0.5 * (np.sum(T_world_left[:3, :3] * self._looked[:3, :3]) - 1)
         return bool(cosine < np.cos(_TURN))
 
     def _compare(self, view: View) -> None:
-        """Compare a view with the earlier ones that wait for a partner, the oldest first, until one goes on waiting."""
+        """Compare a view with the earlier ones, oldest first, until one still overlaps too much and keeps waiting."""
         c = self.config
         waiting = self._waiting
         newest = match(waiting[-1], view) if waiting else NO_MATCHES
@@ -196,27 +199,27 @@ class SelfCalibration:
         self._waiting = [*waiting[ended:], view] if apart else waiting[ended:]
 
     def evidence(self) -> RecordingEvidence | None:
-        """What this recording alone says, without any prior; None where no motion was seen."""
+        """The evidence of this recording alone, without any prior; None if no motion was seen."""
         if not self.pairs and self._open is None:
             return None
         rows, *motion = self._parts()
         moved = sum(motion[1:], motion[0])
-        assert self._fields is not None  # as there are rows
+        assert self._fields is not None  # because there are rows
         return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
     def _parts(self) -> list[Evidence]:
-        """What rows and motion say, and the pair that is not complete."""
+        """The evidence of rows, of motion, and of the incomplete pair."""
         parts = [*self._rows.total(), *self._motion.total()]
         if self._open is not None:
             parts.append(self._open.scaled(1 / self._motion.inflation))
         return parts
 
     def kept(self) -> KeptCalibration:
-        """What is known now, to be kept for further recordings of the rig."""
+        """The present posterior, as a prior for further recordings of the rig."""
         return KeptCalibration(self.posterior, RigNumbers.of(self.rig), self._solution.residual)
 
     def summary(self) -> dict[str, Any]:
-        """What has been found, as plain types."""
+        """The result as plain types."""
         return {"pairs": self.pairs, "unsolved_pairs": self.unsolved, **self.kept().to_json()}
 
     @property
@@ -226,12 +229,12 @@ class SelfCalibration:
         return np.diag([pixel, pixel, disparity])
 
     def _ideal(self, pair: Pair) -> Pair:
-        """A pair of views with its points corrected by what is known now."""
+        """A pair of views with its points corrected by the present posterior."""
         first, second = (p + self.model.shift(p, self._solution.mean) for p in (pair.first, pair.second))
         return replace(pair, first=first, second=second)
 
     def _evidence(self, first: View, second: View, matched: Rows) -> Evidence | None:
-        """What a pair of views says, by the features that look alike; None where it is nothing."""
+        """The evidence of a pair of views with matched features; None without a solution."""
         c = self.config
         pair = pair_of(self.model, first, second, self._solution.mean, self._noise, self._seen, matched)
         if len(pair.first) < c.minimum_common:
@@ -247,11 +250,11 @@ class SelfCalibration:
         return evidence
 
     def _update(self) -> None:
-        """Bayes' rule with what all pairs of views and all rows so far say."""
+        """Update the posterior by Bayes' rule from all pairs of views and all rows so far."""
         for part in (self._rows, self._motion):
             part.update_inflation(self._solution.mean, self._solution.inner)
         found = self.evidence()
-        assert found is not None  # as there are pairs
+        assert found is not None  # because there are pairs
         if self._kept:
             self._solution = solve(self._prior, found.residual, [found.whole.with_error(self._systematic)])
         else:

@@ -1,4 +1,4 @@
-"""The likelihood of the parameters, gathered in blocks, so that errors common to neighbouring frames count once."""
+"""The likelihood of the parameters, summed in blocks so that errors shared by neighbouring frames count once."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from slam.geometry.se3 import Array
 
-_MOST_BLOCKS = 32  # cost: blocks of evidence that are kept apart, for their scatter
-_PRIOR_TERMS = 20.0  # degrees of freedom that the inflation known beforehand counts for
+_MOST_BLOCKS = 32  # cost: blocks of evidence kept separately, for their scatter
+_PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 
 class Evidence(NamedTuple):
@@ -30,7 +30,7 @@ class Evidence(NamedTuple):
         return Evidence(*(factor * x for x in self))
 
     def with_error(self, variance: Array) -> Evidence:
-        """The same, where the parameters that a recording shows are off by an error of this variance (n,) in each.
+        """The same with another independent error of this variance (n,) in each parameter.
 
         ``(S⁻¹ + V)⁻¹ = (1 + S V)⁻¹ S``, which needs no inverse of S.
         """
@@ -39,16 +39,17 @@ class Evidence(NamedTuple):
         return Evidence(*(reduced @ x for x in self))
 
     def __add__(self, other: Evidence) -> Evidence:  # type: ignore[override]
-        """What both say together."""
+        """The product of both likelihoods."""
         return Evidence(*(a + b for a, b in zip(self, other)))
 
 
 class RecordingEvidence(NamedTuple):
-    """What one recording says, without any prior.
+    """The evidence of one recording, without any prior.
 
     Attributes:
-        whole: by its rows and its motion.
-        motion: by its motion alone, which says how large the calibration's errors are: rows have errors of their own.
+        whole: of its rows and its motion.
+        motion: of its motion alone, from which the scale of the calibration's errors follows: rows have errors of their
+            own.
         residual: scale of the residual fields by its rows, from 0 to 1.
     """
 
@@ -64,14 +65,14 @@ class RecordingEvidence(NamedTuple):
 class Accumulator:
     """The sum of many likelihoods whose errors may be correlated over time.
 
-    They are gathered in blocks in the order in which they come. Were all errors independent, the blocks' gradients at
-    the common solution would scatter as their information says; how much more they scatter is the factor by which the
-    information is reduced (the blocks' version of a sandwich covariance). When there are too many blocks, neighbours
-    are joined: so the blocks grow with the run, and with them the time over which correlations are counted.
+    They are summed in blocks in the order in which they come. If all errors were independent, the blocks' gradients at
+    the common solution would scatter with covariances equal to their information; the information is divided by the
+    factor by which they scatter more (a block version of the sandwich covariance). When there are too many blocks,
+    neighbours are merged, so that the blocks, and with them the time over which correlations count, grow with the run.
 
     Args:
-        inflation: factor on variances before anything is known of the scatter.
-        length: likelihoods in a block at first.
+        inflation: initial factor on variances, until the scatter has been measured.
+        length: initial number of likelihoods in a block.
     """
 
     def __init__(self, inflation: float, length: int) -> None:
@@ -95,7 +96,7 @@ class Accumulator:
             self._join()
 
     def _join(self) -> None:
-        """Blocks of twice the length."""
+        """Merge neighbours into blocks of twice the length."""
         even, odd = self._blocks[::2], self._blocks[1::2]
         if len(even) == len(odd):
             self._in_last += self._length
@@ -103,7 +104,7 @@ class Accumulator:
         self._length *= 2
 
     def total(self) -> list[Evidence]:
-        """The sum, with its information reduced by the inflation; none where nothing was taken in."""
+        """The sum, with its information divided by the inflation, in a list; empty if there is no likelihood."""
         if not self._blocks:
             return []
         whole = self._blocks[0]

@@ -1,4 +1,4 @@
-"""Several recordings of one rig: what they say together, and whether they agree."""
+"""Joint calibration from several recordings of one rig, and whether the recordings agree."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from slam.calibration.prior import as_delivered, residual_variance, systematic_v
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
-#: Recordings agree in a parameter where they differ by less than so many standard deviations of their difference.
+#: Recordings agree in a parameter if they differ by less than this many standard deviations of the difference.
 AGREES = 2.0
-_SAYS = 1.0  # of the prior's information on a parameter: a recording that adds less says nothing of it
-_DIFFERS = 3.0  # and do not where by more than so many; between the two, chance may do it in one of 21 parameters
+_SAYS = 1.0  # least information of a recording on a parameter, in units of the prior's, for it to be compared
+_DIFFERS = 3.0  # and disagree if by more than this many; differences between the two limits may be chance
 
 
 def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> KeptCalibration:
-    """What recordings say of the rig that they share.
+    """The calibration of a rig from several recordings.
 
-    Each recording has a systematic error of its own, that does not average out within it but does over recordings: what
-    it says is off by that. One alone has its error added in the end, and how large the calibration's errors are follows
-    from its motion, as in its own run.
+    Each recording has a systematic error of its own, which averages out over recordings but not within one, and is
+    added to its evidence. For a single recording that error is added to the posterior instead, and the scale of the
+    calibration's errors follows from its motion, as in its own run.
 
     Args:
         model: the parameters' meaning.
@@ -50,13 +50,13 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far recordings are from each other, by what each says itself.
+    """Differences between recordings, each by its own evidence.
 
     Attributes:
         names: of the parameters (n,).
-        largest: the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN where fewer
-            than two say anything.
-        pairs: the recordings (n, 2) that differ so much; no meaning where there is no difference.
+        largest: the largest difference of two recordings in each parameter (n,) [standard deviations]; NaN if fewer
+            than two determine it.
+        pairs: the recordings (n, 2) that differ most; meaningless where `largest` is NaN.
     """
 
     names: tuple[str, ...]
@@ -81,16 +81,16 @@ class Agreement:
 
 
 def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> Agreement | None:
-    """Differences of each two recordings; None of one alone.
+    """Compare recordings in pairs; None for a single recording.
 
-    What they share, the prior, is no evidence of agreement. So the prior is taken away from each parameter's marginal
-    posterior: the quotient of the two is the likelihood of that parameter by the recording alone, whatever the others
-    are. A recording that says less of a parameter than the prior says nothing.
+    The prior, which they share, is no evidence of agreement. So each parameter's marginal posterior is divided by the
+    prior, which gives that parameter's likelihood by the recording alone, with the others marginalised. A recording
+    with less information on a parameter than the prior is left out.
 
     Args:
         model: the parameters' meaning.
         evidence: of each recording, without any prior.
-        systematic: as `joint_calibration` has it.
+        systematic: see `joint_calibration` [px].
     """
     if len(evidence) < 2:
         return None

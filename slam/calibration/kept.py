@@ -1,4 +1,4 @@
-"""Files of estimated errors of a rig: the result of self-calibration on recordings, as the prior of further ones."""
+"""Files with a rig's estimated errors: the result of self-calibration, as a prior for further recordings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SUMMARY, _KEY = "summary.json", "self_calibration"
 
 @dataclass(frozen=True)
 class RigNumbers:
-    """By what a calibration file knows its rig: the rectified cameras as delivered, which all corrections refer to.
+    """The rectified cameras as delivered, to which all corrections refer; they identify the rig of a calibration file.
 
     Attributes:
         width, height: size of the images [px].
@@ -59,7 +59,7 @@ class RigNumbers:
         """The inverse of `dataclasses.asdict`.
 
         Raises:
-            CalibrationError: a number is missing or none.
+            CalibrationError: a number is missing, or is no number.
         """
         try:
             numbers = cls(**{field.name: float(tree[field.name]) for field in fields(cls)})
@@ -70,7 +70,7 @@ class RigNumbers:
         return numbers
 
     def difference(self, other: RigNumbers) -> str:
-        """The first number that differs, in words; empty where none does."""
+        """The first number that differs, in words; empty if none does."""
         for name, mine, theirs in zip(asdict(self), asdict(self).values(), asdict(other).values()):
             if abs(mine - theirs) > _SAME * max(abs(mine), abs(theirs)):
                 return f"{name} {mine:g} there, {theirs:g} here"

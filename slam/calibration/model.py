@@ -36,8 +36,8 @@ _BEYOND = 1.1  # polynomials are held constant beyond the image, this many half 
 class RigModel:
     """The parameters of a rig's error, and the fields that they make.
 
-    The order is: left camera (`LENS`), right camera (the same), `POSE`. Besides, there are residual fields, of which
-    only the size is known: they are not corrected, but make the parameters less certain.
+    The order is: left camera (`LENS`), right camera (the same), `POSE`. In addition, there are residual fields, of
+    which only the size is known: they are not corrected, but make the parameters less certain.
 
     Args:
         rig: the cameras as calibrated.
@@ -77,9 +77,8 @@ class RigModel:
         With the right camera's true direction ``(x - d, y)`` and the baseline ``(1, down, forward)``, the true d is
         ``x_left - x_right`` plus ``forward · d · x_right``. Rows of x and y are finite where d is not.
 
-        A shift of both principal points looks almost like a turn of the whole rig, and neither is known well. So that
-        the pose does not turn with each revision, the ideal rig is turned such that the left image as a whole stays
-        where it is.
+        A shift of both principal points looks almost like a rotation of the whole rig, and neither is known well. Lest
+        the pose rotate with each revision, the ideal rig is rotated such that the left image as a whole does not move.
         """
         by_turn = _turn(points, self.focal).reshape(-1, 3) @ self._gauge
         return np.asarray(self._unturned(points) + by_turn.reshape(len(points), 3, len(self.names)))
@@ -93,7 +92,7 @@ class RigModel:
 
     @cached_property
     def _gauge(self) -> Array:
-        """Rotation of the ideal rig (3, n) that takes back what the parameters turn the left image by."""
+        """Rotation of the ideal rig (3, n) [rad] that cancels the left image's mean displacement by the parameters."""
         far = self.far()
         turned, moved = (
             rows[:, :2].reshape(2 * len(far), -1) for rows in (_turn(far, self.focal), self._unturned(far))

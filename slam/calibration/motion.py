@@ -1,7 +1,7 @@
 """The likelihood from two views of the same still points: flow and disparity of an ideal rig fit one rigid motion.
 
-In coordinates (x, y, D), D the true disparity, a rigid motion is a homography. What the rig is off by spoils that in a
-way of its own for each parameter, whatever the motion was.
+In coordinates (x, y, D), D the true disparity, a rigid motion is a homography. Each error of the rig violates that in a
+way of its own, whatever the motion was.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from slam.geometry.se3 import Array, so3_exp
 
 _ITERATIONS = 20  # numerics: of Gauss-Newton at most
 _CONVERGED = 1e-3  # numerics: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
-_NEARLY = 3e-3  # numerics: the same after all iterations: single points jump to and fro in some pairs
+_NEARLY = 3e-3  # numerics: the same after the last iteration: in some pairs single points oscillate
 _EXACT = 1e-3  # numerics: least noise of pixels and disparities [px]
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
@@ -46,8 +46,8 @@ class Linear(NamedTuple):
         moved: where the motion takes the points (N, 3) [px].
         J_point, J_motion: derivatives of `moved` (N, 3, 3), (N, 3, 6) by the points and by ``[rotation (left), t]``.
         motion: `J_motion`, whitened.
-        white: what makes unit variances of the residuals (N, 3, 3), lower triangular; NaN where their covariance is
-            none.
+        white: whitening matrices of the residuals (N, 3, 3), lower triangular; NaN where their covariance is not
+            positive definite.
         residual: second view less its prediction from the first (N, 3), whitened.
     """
 
@@ -84,7 +84,7 @@ class Fit:
 
 
 def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Fit | None:
-    """Motion and the first view's true points by Gauss-Newton; None where it does not converge.
+    """Fit the motion and the first view's true points by Gauss-Newton; None if it does not converge.
 
     Points are weighted by Student's t distribution, whose scale is estimated.
 
@@ -143,21 +143,21 @@ def pair_evidence(model: RigModel, pair: Pair, parameters: Array, noise: Array) 
 
 
 def squared_distance(first: Array, second: Array, R: Array, t: Array, focal: float, noise: Array) -> Array:
-    """How far points (N, 3) of two views are from the motion, over the noise of both, squared (N,); NaN for never.
+    """Squared Mahalanobis distances (N,) of points (N, 3) in two views from a motion; NaN if they cannot be tested.
 
-    The error of a near point's disparity grows with the motion. A limit of so many pixels would keep those points alone
-    whose errors happen to be small, and favour what was believed of the motion before.
+    The motion amplifies the disparity errors of near points. A limit in pixels would keep only points whose errors
+    happen to be small, and bias the motion towards its prior guess.
     """
     residual = linearised(first, second, first, R, t, focal, noise).residual
     return np.asarray(np.einsum("ni,ni->n", residual, residual))
 
 
 def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
-    """Variances (2,) [px²] of a pixel and of a disparity, as two views scatter about their motion.
+    """Variances (2,) [px²] of a pixel and of a disparity, from the scatter of two views about their motion.
 
-    A feature's place slides over the surface from view to view, in both images alike: pixels are often less exact than
-    disparities. Which is which has to be known, else the motion and with it the rig's parameters are biased. `noise`
-    (3, 3) [px²] shares the scatter out where it comes from both.
+    A feature shifts over the surface from view to view, equally in both images, so pixels are often less exact than
+    disparities. Both variances are needed, else the motion and with it the rig's parameters are biased. Scatter to
+    which both contribute is divided according to `noise` (3, 3) [px²].
     """
     moved, J, _ = move(pair.first, pair.R, pair.t, focal)
     growth = 1 + np.square(J) @ np.diag(noise) / np.diag(noise)
@@ -168,7 +168,7 @@ def noise_variances(pair: Pair, focal: float, noise: Array) -> Array:
 
 
 def parallax(model: RigModel, pair: Pair) -> float:
-    """Median of what translation moves the points by in the image [px]."""
+    """Median displacement of the points in the image by translation [px]."""
     there = move(pair.first, pair.R, pair.t, model.focal)[0]
     turned = move(pair.first, pair.R, 0 * pair.t, model.focal)[0]
     return float(np.median(np.linalg.norm((there - turned)[:, :2], axis=1)))
@@ -193,7 +193,7 @@ def _eliminated(model: RigModel, fit: Fit, parameters: Array) -> Evidence:
 
 
 def move(points: Array, R: Array, t: Array, focal: float) -> tuple[Array, Array, Array]:
-    """Points ``(x, y, D)`` (N, 3) of one view in another, which ``R, t`` [baselines] take them to.
+    """Transform points ``(x, y, D)`` (N, 3) of one view to another by ``R, t`` [baselines].
 
     In these coordinates a rigid motion is a homography: ``(x, y, f)ᵀ ← R (x, y, f)ᵀ + D t`` up to the scale that
     ``D`` shares, with D the true disparity. It has no singularity at infinity, where D = 0.

@@ -9,7 +9,7 @@ from slam.runtime.compilation import kernel
 
 @kernel
 def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motion, motion, white, residual):
-    """Where a motion takes points, what moves them there, and the second view's residuals whitened by their noise.
+    """Moved points, their Jacobians, and the second view's residuals whitened by their noise.
 
     NaN where the covariance of a residual is not positive definite. See `slam.calibration.motion.Linear` for the
     arguments from `moved` on, which are filled in.

@@ -81,12 +81,12 @@ class RigPosterior:
 
 @dataclass(frozen=True)
 class Solution:
-    """What evidence makes of the prior.
+    """Posterior of the parameters.
 
     Attributes:
         mean: (n,).
-        inner: covariance (n, n), were there no residual fields.
-        covariance: with what the residual fields may have moved the mean by (n, n).
+        inner: covariance (n, n) without residual fields.
+        covariance: including the effect of unknown residual fields on the mean (n, n).
         residual: scale of the residual fields, from 0 to 1.
     """
 
@@ -99,16 +99,16 @@ class Solution:
 def solve(
     prior: Prior, residual: float, evidence: Sequence[Evidence], known: Sequence[Evidence] | None = None
 ) -> Solution:
-    """Posterior, averaged over how large a calibration's errors are.
+    """Posterior, averaged over the unknown scales of the calibration's errors.
 
-    The scales of the prior's errors are not known. Their probabilities follow from the evidence (the marginal
-    likelihood), so a calibration that nothing speaks against is left as it is, instead of following the noise.
+    The scales are weighted by their marginal likelihood, so that a calibration without evidence against it is left
+    unchanged instead of following the noise.
 
     Args:
         prior: of the parameters.
         residual: scale of the residual fields, from 0 to 1 (see `residual_scale`).
         evidence: of the data, from which the prior's scales follow.
-        known: what the parameters follow from; None where that is the same.
+        known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
     whole, covariances, steps, logs = _by_scale(prior, evidence)
     weights = np.exp(logs - logs.max())
@@ -123,11 +123,11 @@ def solve(
 
 
 def residual_scale(prior: Prior, rows: Evidence) -> float:
-    """How large the residual fields are, as a part of what they may be: what the parameters leave of the rows' errors.
+    """Scale of the residual fields, from 0 to 1, by the vertical disparities that the parameters do not explain.
 
-    The root mean square over the scales that may be, weighted by their marginal likelihood. Fields along the rows,
-    which nothing shows so directly, are taken to be as large as those across them. Errors of neighbouring frames are
-    taken for independent: where they are not, the fields seem larger, and the uncertainty does.
+    It is the root mean square of the possible scales, weighted by their marginal likelihood. Fields along the rows,
+    which cannot be observed as directly, are taken to be as large as those across. Errors of neighbouring frames are
+    taken to be independent; where they are not, the fields and so the uncertainty are overestimated.
 
     Args:
         prior: of the parameters.
@@ -147,7 +147,7 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
 
 
 def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:
-    """All evidence together; by scale of the prior (K): covariances, changes of the mean, log marginal likelihoods."""
+    """Total evidence and, per scale of the prior (K): covariances, changes of the mean, log marginal likelihoods."""
     whole = evidence[0]
     for more in evidence[1:]:
         whole += more

@@ -22,32 +22,32 @@ SIGMAS = {
     "pitch": 0.014, "yaw": 0.02, "roll": 0.004, "down": 0.007, "forward": 0.02,
 }  # fmt: skip
 
-#: Root mean square over the image of what no lens model holds [focal lengths]: a fifth of a pixel at 1000 px.
+#: Root mean square over the image of errors that no lens model describes [focal lengths]: a fifth of a pixel at
+#: 1000 px.
 _RESIDUAL = 2e-4
 
-#: Parts of that which a rig's fields may be; equally probable before rows show it.
+#: Possible scales of a rig's fields relative to that, equally probable a priori.
 RESIDUAL_SCALES = np.geomspace(0.05, 1.0, 7)
 
-#: What a chess board does fix: the mean over the image of the disparity of far points, and of the vertical disparity
-#: [focal lengths].
+#: Errors that a chess board does bound: the mean over the image of the disparity of far points, and of the vertical
+#: disparity [focal lengths].
 MEAN_DISPARITY = 7e-4
 MEAN_VERTICAL = 1.4e-3  # the same of the vertical disparity [focal lengths]
 
-#: Cameras that are knocked or warmed up turn by less than a milliradian, with the best calibration: an offset of all
-#: disparities [focal lengths].
+#: Offset of all disparities [focal lengths]: even after the best calibration, shocks and warming turn the cameras by
+#: less than a milliradian.
 OFFSET = 7e-4
 
-#: And it does not leave more than about a pixel of a camera with a focal length of 700 px anywhere: its reprojection
-#: errors would show it. Root mean square over the image of what disparities and rows of far points are off by [focal
-#: lengths]; smooth as they are, such fields have some ten values that are independent of each other.
+#: Root mean square over the image of the errors of far points' disparities and rows [focal lengths]: about a pixel at a
+#: focal length of 700 px, as reprojection errors would show larger ones. Such fields are smooth, so they have some ten
+#: independent values.
 FIELD = 1.4e-3
 _FREEDOM = 10  # independent values of such a field
 
-#: A focal length that is wrong in both cameras alike, where the board's distance or curvature made up for it [share].
+#: Error of the focal length common to both cameras, as the board's distance or curvature may compensate it [share].
 FOCAL = 0.005
 
-#: Scales that are weighed against each other, all equally probable beforehand: of all errors of a calibration, from
-#: none to as large as allowed.
+#: Scales of the prior, equally probable a priori: of all errors of a calibration, from none to as large as allowed.
 _SCALES = (0.02, 0.1, 0.3, 1.0)
 _OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
 _FOCALS = (0.1, 1.0)  # the same of a common error of the focal lengths
@@ -57,7 +57,7 @@ _NEAR = 0.05  # disparity [focal lengths] of points that are near
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed of the parameters before anything is seen: a mean, and several covariances that may be.
+    """Prior of the parameters: a mixture of Gaussians with one mean and several covariances.
 
     Attributes:
         mean: (n,).
@@ -79,7 +79,7 @@ class Prior:
 
 
 def as_delivered(model: RigModel) -> Prior:
-    """Of a calibration of which nothing is known but how calibrations are made."""
+    """Prior of a calibration as delivered, by how calibrations are usually made."""
     spread = np.linalg.inv(prior_information(model))
     drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
     scales, turned, zoomed = np.array(list(product(_SCALES, _OFFSETS, _FOCALS))).T
@@ -88,12 +88,12 @@ def as_delivered(model: RigModel) -> Prior:
 
 
 def as_found(model: RigModel, mean: Array, covariance: Array) -> Prior:
-    """Of a rig whose earlier recordings are known; its cameras may have turned since.
+    """Prior of a rig calibrated by earlier recordings; its cameras may have rotated since.
 
     Args:
         model: the parameters' meaning.
-        mean: what the recordings say (n,).
-        covariance: how well (n, n).
+        mean: of the parameters, by the recordings (n,).
+        covariance: of the mean (n, n).
     """
     sigma = offset_sigma(model)
     turned = np.array(_OFFSETS)
@@ -115,12 +115,12 @@ def prior_information(model: RigModel) -> Array:
 
 
 def offset_sigma(model: RigModel) -> Array:
-    """Standard deviation of the parameters (n,) by an offset of all disparities."""
+    """Standard deviation of the parameters (n,) due to an offset of all disparities."""
     return np.array([OFFSET if name == "right_cx" else 0.0 for name in model.names])
 
 
 def focal_sigma(model: RigModel) -> Array:
-    """Standard deviation of the parameters (n,) by an error of the focal length that both cameras share."""
+    """Standard deviation of the parameters (n,) due to an error of the focal length common to both cameras."""
     return np.array([FOCAL if name in ("left_f", "right_f") else 0.0 for name in model.names])
 
 
@@ -130,11 +130,11 @@ def residual_variance() -> float:
 
 
 def systematic_variance(model: RigModel, error: float) -> Array:
-    """Variances (n,) of the parameters by an error of the matching that all frames of a recording share.
+    """Variances (n,) of the parameters due to a matching bias that all frames of a recording share.
 
-    Each parameter may be off by what moves rows and disparities by `error` [px] (root mean square over the image, of
-    far points and of points at a twentieth of the focal length). Pixels of repeated structure, of slanted surfaces and
-    of moving shadows are matched with such a bias; it does not average out.
+    Each parameter's standard deviation is what moves rows and disparities by `error` [px] (root mean square over the
+    image, of far points and of points with a disparity of a twentieth of the focal length). Repeated structure, slanted
+    surfaces and moving shadows are matched with such a bias; it does not average out.
     """
     far = model.far()
     near = far + np.array([0.0, 0.0, _NEAR * model.focal])

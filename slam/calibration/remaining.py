@@ -1,4 +1,4 @@
-"""The rig's error that is left in what a back end has estimated, while self-calibration goes on learning."""
+"""The rig's error remaining in a back end's estimate while self-calibration continues."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from slam.interfaces import Backend, RevisingBackend
 from slam.models import EstimatorModels
 from slam.rig_error import CommonError
 
-#: Standard deviations of the disparities' error by which a correction must change for a back end to revise the past.
+#: Change of the correction, in standard deviations of the disparities' error, for a back end to revise its past.
 _REVISION = 0.5
 
 
 class RemainingRigError:
-    """Which corrections a back end's measurements and its path were made with, and how uncertain they are.
+    """Tracks the corrections with which a back end's measurements and path were made, and their uncertainty.
 
     Args:
-        calibration: what is known of the rig.
+        calibration: the self-calibration.
         models: noise of the pixels, and of the motion.
 
     Attributes:
         uncertainty: what the rig's uncertainty adds to the covariances of poses and landmarks.
-        given: the correction of all that the back end was given.
+        given: the correction of all measurements given to the back end.
     """
 
     def __init__(self, calibration: SelfCalibration, models: EstimatorModels) -> None:
@@ -32,19 +32,19 @@ class RemainingRigError:
         self.uncertainty = RigUncertainty(calibration.model, models, self.given.parameters)
 
     def apply(self, backend: Backend) -> Revision | None:
-        """Correct features by what is known now; returns the change, None where there is none.
+        """Correct features by the present posterior from now on; returns the change, or None.
 
-        A back end that can revise has to weigh all its measurements anew then: for it, that waits for a change that is
-        significant.
+        For a back end that can revise, a change means processing all its measurements anew, so it waits until the
+        change is significant.
         """
         return self._calibration.apply(_REVISION if isinstance(backend, RevisingBackend) else 0.0)
 
     def revise(self, backend: Backend, restarted: bool) -> Revision | None:
-        """Correct what a back end was given before, if it can do that; returns the change, None where there is none.
+        """Correct a back end's earlier measurements, if it can revise them; returns the change, or None.
 
         Args:
             backend: the present one.
-            restarted: the path has a part of an earlier back end, which stays as it is.
+            restarted: part of the path is an earlier back end's and cannot be revised.
         """
         applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
         if not restarted and isinstance(backend, RevisingBackend) and backend.revises_path:
@@ -59,7 +59,7 @@ class RemainingRigError:
         return revision
 
     def added_to(self, estimate: Estimate) -> Estimate:
-        """The back end's estimate with the rig's uncertainty, which it knows nothing of."""
+        """The back end's estimate with the rig's uncertainty added."""
         if not self._calibration.config.enabled:
             return estimate
         return self.uncertainty.added_to(estimate, self._calibration.posterior.covariance)
@@ -68,8 +68,8 @@ class RemainingRigError:
         """The part of the pose's error that it shares with those of other frames.
 
         Args:
-            as_given: of poses as they were given in each frame, by the correction of that time; else of the path as it
-                is now, in which a back end may have revised earlier poses.
+            as_given: for poses as reported in each frame, with the correction of that time; else for the present path,
+                in which a back end may have revised earlier poses.
         """
         if not self._calibration.config.enabled:
             return CommonError()

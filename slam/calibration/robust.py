@@ -7,22 +7,22 @@ import numpy as np
 from slam.chi_square import chi_square_limit
 from slam.geometry.se3 import Array
 
-_DEGREES = 4.0  # of freedom of Student's t: its tails are those of matches, a few of which are wrong
+_DEGREES = 4.0  # degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
 
 
 def median(values: Array) -> float:
-    """The median of some numbers; NumPy's takes longer to begin than these need."""
+    """The median; for few numbers faster than NumPy's."""
     ordered = np.sort(values, axis=None)
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def student_weights(squared: Array, dof: int, least: float) -> Array:
-    """Weights (N,) of residuals by Student's t distribution, as the information that each is worth.
+    """Weights (N,) of residuals by Student's t distribution, as factors on their information.
 
     Args:
-        squared: squared residuals (N,), in units of a covariance of which the scale is not known.
-        dof: numbers in a residual.
-        least: least scale, as a standard deviation. The scale is the median of `squared` over that of χ².
+        squared: squared residuals (N,), in units of a covariance of unknown scale.
+        dof: dimension of a residual.
+        least: least scale, as a standard deviation. The squared scale is the median of `squared` over that of χ².
     """
     if not len(squared):
         return squared

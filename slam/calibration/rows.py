@@ -1,4 +1,4 @@
-"""The likelihood from the rows of one frame: matched pixels of an ideal rectified pair lie in one row."""
+"""Likelihood from the rows of one frame: in an ideal rectified pair, matched pixels have the same row."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _LEAST_NOISE = 0.03  # of a row [px], the least that is believed
 
 
 def row_evidence(model: RigModel, points: Array, vertical: Array, parameters: Array) -> tuple[Evidence, Evidence]:
-    """The likelihood of the parameters from the vertical disparities of one frame; and that of parameters and fields.
+    """Likelihood of the parameters by one frame's vertical disparities, without and with residual fields.
 
     Args:
         model: the parameters' meaning.
         points: ``(x, y, d)`` (N, 3) [px] of the matches, as measured.
         vertical: right row less left row (N,) [px], as measured.
-        parameters: the values (n,) at which wrong matches are told from right ones.
+        parameters: the values (n,) at which outliers are identified.
 
     Returns:
-        The evidence of the parameters (n), and of them with the right camera's residual fields of y after them (n + k).
-        The left camera's look the same but for their sign.
+        The evidence of the parameters (n), and of them followed by the right camera's residual fields of y (n + k). The
+        left camera's fields have the same effect with opposite sign.
     """
     A, fields = model.vertical(points), model.residual_vertical(points)
     residual = vertical + A @ parameters

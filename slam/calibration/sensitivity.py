@@ -1,13 +1,13 @@
-"""How a pose and landmarks depend on parameters of the measurement: a Kalman filter with a column for each parameter.
+"""Sensitivities of a pose and landmarks to parameters of the measurement, by a Kalman filter with a column for each.
 
 Its state is the error of the pose and, in world axes, the errors of some landmarks relative to the camera:
 
     T_true = T exp(ξ),    h_true = h + Rᵀ l,    ξ = J δ,    l = S δ.
 
 From frame to frame ``ξ ← Ad(M) ξ + ν`` and ``l ← l + R [[h]ₓ, −1] ν``, with M the estimated motion and ν its error
-before anything is measured. The errors themselves are not known; what is filtered is J and S. Pixels that are displaced
-by ``F δ`` make them ``J + K (F − H S)`` and ``S + K (F − H S)``. The gain K is that of a least-squares estimate of all
-poses and landmarks from the same measurements, which every good back end comes close to.
+before anything is measured. The errors themselves are unknown; the filter computes J and S. Pixels displaced by ``F δ``
+update them to ``J + K (F − H S)`` and ``S + K (F − H S)``. The gain K is that of the least-squares estimate of all
+poses and landmarks from the same measurements, to which every good back end is close.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ROUNDING = 1e-12  # numerics: of the trace of a covariance
 
 @dataclass(frozen=True)
 class Frozen:
-    """Landmarks that are not followed, as they were when they last were; rows, ids ascending.
+    """Landmarks outside the filter's state, as they were when they left it; one row each, ids ascending.
 
     Attributes:
         ids: (N,).
@@ -49,7 +49,7 @@ class Frozen:
         return Frozen(self.ids[rows], self.by_rig[rows], self.relative[rows], self.drift[rows])
 
     def joined(self, other: Frozen) -> Frozen:
-        """Both, those of `other` in place of their namesakes."""
+        """Both together; landmarks in `other` replace those with the same id."""
         mine = self.select(~np.isin(self.ids, other.ids))
         pairs = [(getattr(mine, name), getattr(other, name)) for name in ("ids", "by_rig", "relative", "drift")]
         both = Frozen(*(np.concatenate(pair) for pair in pairs))
@@ -58,7 +58,7 @@ class Frozen:
 
 @dataclass(frozen=True)
 class Followed:
-    """The filter's state: the pose and F landmarks that were measured lately, rows of six and of three each.
+    """The filter's state: the pose (six rows) and F recently measured landmarks (three rows each).
 
     Attributes:
         T_world: the estimated pose (4, 4).
@@ -78,17 +78,17 @@ class Followed:
 
     @classmethod
     def start(cls, T_world: Array, columns: int) -> Followed:
-        """At a pose that is known."""
+        """The state at an exactly known pose, without landmarks."""
         none = np.zeros(0, np.int64)
         return cls(T_world, none, np.zeros((0, 3)), none, np.zeros((6, columns)), np.zeros((6, 6)))
 
     def moved(self, T_world: Array, rotation: float, translation: float) -> Followed:
-        """At the next pose, before anything is measured from it.
+        """The state predicted at the next pose.
 
         Args:
-            T_world: the pose as estimated (4, 4).
-            rotation: standard deviation of the motion before anything is measured [rad].
-            translation: the same [m].
+            T_world: the next pose as estimated (4, 4).
+            rotation: prior standard deviation of the motion's rotation [rad].
+            translation: the same of its translation [m].
         """
         M = inverse(T_world) @ self.T_world
         local = transform(M, self.local)
@@ -101,11 +101,11 @@ class Followed:
         return Followed(T_world, self.ids, local, self.unseen + 1, by_rig, covariance)
 
     def measured(self, rows: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Followed:
-        """After landmarks were measured.
+        """The state updated by measurements of landmarks.
 
         Args:
-            rows: theirs (M,).
-            local: their positions as estimated now (M, 3) [m] in the camera's coordinates.
+            rows: of the landmarks (M,).
+            local: their present estimated positions (M, 3) [m] in the camera's coordinates.
             H: ∂z/∂h of the measurements z (M, 3, 3).
             field: F = ∂z/∂δ (M, 3, m).
             noise: covariance of a measurement (3, 3).
@@ -125,13 +125,13 @@ class Followed:
         return replace(seen, by_rig=by_rig, covariance=covariance)
 
     def met(self, rows: IdArray, local: Array) -> Followed:
-        """After landmarks were seen that are not measured: where they are now (M, 3) [m]."""
+        """The state after landmarks `rows` were seen but not used as measurements; `local` are their positions [m]."""
         everywhere, unseen = self.local.copy(), self.unseen.copy()
         everywhere[rows], unseen[rows] = local, 0
         return replace(self, local=everywhere, unseen=unseen)
 
     def select(self, rows: IdArray) -> Followed:
-        """With these landmarks alone."""
+        """The state with these landmarks only."""
         kept = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
         return Followed(
             self.T_world, self.ids[rows], self.local[rows], self.unseen[rows], self.by_rig[kept],
@@ -139,7 +139,7 @@ class Followed:
         )  # fmt: skip
 
     def first_seen(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Followed:
-        """With landmarks (K,) at `local` (K, 3) [m] that this frame was the first to see; the rest as in `measured`."""
+        """The state with landmarks (K,) at `local` (K, 3) [m] first seen in this frame; other arguments: `measured`."""
         by_rig, own = self._by_sight(H, field, noise)
         size, places = 3 * len(ids), np.arange(len(ids))
         blocks = np.zeros((len(ids), 3, len(ids), 3))
@@ -148,16 +148,16 @@ class Followed:
         return self._with(ids, local, by_rig.reshape(size, self.by_rig.shape[1]), across, blocks.reshape(size, size))
 
     def seen_once(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Frozen:
-        """Such landmarks, ids ascending, where they are not followed."""
+        """Landmarks first seen in this frame, ids ascending, that do not enter the state."""
         by_rig, own = self._by_sight(H, field, noise)
         by_world = by_rig - self._by_pose(local) @ self.by_rig[:6]
         return Frozen(ids, by_world, own, np.broadcast_to(self.drift(), (len(ids), 6, 6)))
 
     def seen_again(self, frozen: Frozen, local: Array) -> Followed:
-        """With landmarks (K,) at `local` (K, 3) [m] that were followed before.
+        """The state with landmarks (K,) at `local` (K, 3) [m] that were in it before.
 
-        Relative to the camera, each one's error is that of then, and what the pose has drifted since. The drift's
-        covariance is D = C − C_then; of the present error ξ it is the part ``D C⁻¹ ξ + ε``, with the same ε for all.
+        Relative to the camera, each one's error is its former one plus the pose's drift since. The drift's covariance
+        is D = C − C_then; given the present error ξ, the drift is ``D C⁻¹ ξ + ε``, with the same ε for all.
         """
         to_local = adjoint(inverse(self.T_world))
         now = self.covariance[:6, :6]
@@ -176,7 +176,7 @@ class Followed:
         return self._with(frozen.ids, local, by_rig.reshape(size, -1), across, own)
 
     def frozen(self) -> Frozen:
-        """All landmarks, as they are when they are followed no more; ids ascending."""
+        """All landmarks in the form they have outside the state; ids ascending."""
         order = np.argsort(self.ids, kind="stable")
         count = len(self.ids)
         blocks = self.covariance[6:, 6:].reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count)]
@@ -194,7 +194,7 @@ class Followed:
         return np.asarray(by_world @ self.covariance[:6, :6] @ by_world.T)
 
     def _by_sight(self, H: Array, field: Array, noise: Array) -> tuple[Array, Array]:
-        """Sensitivities (K, 3, m) and covariances (K, 3, 3) of landmarks, from this frame alone."""
+        """Sensitivities (K, 3, m) and covariances (K, 3, 3) of landmarks by this frame alone."""
         back = self.T_world[:3, :3] @ np.linalg.inv(H)
         return back @ field, back @ noise @ np.swapaxes(back, 1, 2)
 
@@ -203,7 +203,7 @@ class Followed:
         return np.asarray(self.T_world[:3, :3] @ points_by_pose(local))
 
     def _with(self, ids: IdArray, local: Array, by_rig: Array, across: Array, own: Array) -> Followed:
-        """With more landmarks: their rows, covariances with all that there was, and between each other."""
+        """The state with more landmarks, given their covariances with the state and with each other."""
         return replace(
             self,
             ids=np.concatenate([self.ids, ids]),
@@ -215,7 +215,7 @@ class Followed:
 
 
 def _positive(D: Array) -> Array:
-    """Covariances (K, 6, 6) without what rounding made negative."""
+    """Covariances (K, 6, 6) with eigenvalues that rounding made negative removed."""
     values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2))
 

@@ -1,4 +1,4 @@
-"""Views of the scene as the self-calibration needs them, and which features are the same in two of them."""
+"""Views of the scene for self-calibration, and matches between them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NEAREST = 1.0  # least disparity of a point that helps to find the motion [px]
 _AGREES = 2.5  # largest reprojection error of a match that agrees with the motion [px]
 _EACH = _AGREES / np.sqrt(2)  # the same of each coordinate in each of the two views, all equally exact
 _FARTHEST = 16.3  # derived: χ²(3) at 99.9 %, largest squared distance of a match that agrees
-_REFITS = 2  # times that motion and matches that agree with it are found anew
+_REFITS = 2  # times that motion and inliers are recomputed
 _HYPOTHESES = 100  # cost: poses tried in the geometric check of a pair of views
 
 
@@ -82,7 +82,7 @@ class View:
 
 
 def match(first: View, second: View) -> Rows:
-    """Rows of features that look alike in two views: each the other's nearest, and clearly nearer than the next."""
+    """Rows of features matched in two views: mutual nearest neighbours that pass the ratio test."""
     if min(len(first), len(second)) < 2 or not first.descriptors.shape[1]:
         return NO_MATCHES
     found = [
@@ -98,14 +98,14 @@ def match(first: View, second: View) -> Rows:
 
 
 def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """`match` of descriptors (N, D) and (M, D), unit vectors that may all be compared."""
+    """`match` of unit descriptors (N, D) and (M, D), with the same sign of the Laplacian."""
     likeness = first @ second.T
     every, best = np.arange(len(first)), likeness.argmax(axis=1)
     nearest, most = likeness[every, best], likeness.max(axis=0)
     likeness[every, best] = -1.0
     clear = 1 - nearest < _RATIO**2 * (1 - likeness.max(axis=1))  # of unit vectors, |a - b|² = 2 (1 - a·b)
     rows = np.flatnonzero((nearest == most[best]) & clear)
-    once = np.unique(best[rows], return_index=True)[1]  # of two that are equally near the first
+    once = np.unique(best[rows], return_index=True)[1]  # of equally near ones, the first
     rows = rows[np.sort(once)]
     return rows, best[rows]
 
@@ -119,9 +119,9 @@ def pair_of(
     seed: int,
     matched: Rows | None = None,
 ) -> Pair:
-    """What two views have in common: matches that agree with one motion, and that motion.
+    """Matches of two views that agree on one motion, and that motion.
 
-    The motion of the system's poses is the first guess; it is the only one where most matches agree with it.
+    The motion of the system's poses is tried first; others are tried only if most matches disagree with it.
 
     Args:
         model: the parameters' meaning.

@@ -1,6 +1,6 @@
-"""Which features become landmarks, which landmarks are erased, and maps in files.
+"""Map management: adding and erasing landmarks (paper A, IV), keyframes and loops, map files.
 
-`mapper` is the step (paper A, IV), `selection` chooses new landmarks, `culling` those to be erased, `monocular` gives
-depth without a right image, `map_io` writes maps and `map_search` finds the camera in one. May import
-`slam.tracking`, `slam.geometry` and the data.
+`mapper` runs once per frame, `selection` chooses new landmarks, `culling` those to erase, `monocular` triangulates
+features without a right image, `map_io` reads and writes maps, `relocalizer` starts back ends in a known map, and
+`atlas` closes loops. May import `slam.tracking`, `slam.geometry` and the data.
 """

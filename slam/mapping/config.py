@@ -13,33 +13,33 @@ class MapConfig:
     """Settings of the map management.
 
     Attributes:
-        target_in_view: number of measured landmarks to keep up in each frame; fewer, and new ones are added.
-        grid: cells (columns, rows) over the image; new landmarks go first where the cell has fewest.
+        target_in_view: number of landmarks to measure in each frame; if there are fewer, new ones are added.
+        grid: cells (columns, rows) over the image; new landmarks go to the emptiest cells first.
         separation: least distance of a new landmark from the landmarks in view [px].
         max_depth_error: largest relative standard deviation of a new landmark's depth.
-        erase_missed: a landmark is erased after so many successive frames in view without being measured ("not
+        erase_missed: a landmark is erased after this many successive frames in view without being measured ("not
             continuously detected"). Frames in which it may be hidden, or lies near the image's border, do not count.
-        erase_share: a landmark is erased where it was measured in less than this share of the frames in view, tested
-            after more than `erase_missed` frames.
-        confirmed: landmarks measured in fewer frames than these do not stay once they are out of view or hidden.
-        spacing: of landmarks that have gone out of view, and lie nearer to each other than this share of the distance
-            that they were first seen from, only the one measured in most frames stays; 0 keeps all, and the map then
-            grows each time the camera sees the same place.
-        forget_after: landmarks not measured for so many frames are erased wherever they are, so that nothing is seen
-            again; 0 for never: the map lasts.
-        view_margin: distance from the border [px] within which a landmark is not sure to be detected.
-        occlusion_radius: a landmark is taken to be hidden where most features so near to it [px] are nearer to the
-            camera; 0 for never.
-        same_distance: landmarks so near to each other [m], or nearer than stereo can tell apart, are one and the same
-            where their descriptors are alike.
-        same_descriptor: largest descriptor distance of two landmarks that are one and the same.
-        descriptor_update: weight of a landmark's newest descriptor against the one kept; 1 keeps the last, 0 the first.
+        erase_share: a landmark is erased if it was measured in less than this share of the frames in which it was in
+            view; tested after more than `erase_missed` frames.
+        confirmed: landmarks measured in fewer frames than this are erased once they are out of view or hidden.
+        spacing: of landmarks out of view that lie closer together than this share of the distance from which they
+            were first seen, only the one measured in most frames is kept; 0 keeps all, and the map then grows each
+            time the camera sees the same place.
+        forget_after: landmarks not measured for this many frames are erased wherever they are, so that no place is
+            ever recognised; 0 for never.
+        view_margin: distance from the image's border [px] within which a landmark may go undetected.
+        occlusion_radius: a landmark is taken to be hidden if most features within this radius of it [px] are nearer
+            to the camera; 0 for never.
+        same_distance: landmarks closer together than this [m], or than stereo can tell apart, are merged if their
+            descriptors are alike.
+        same_descriptor: largest descriptor distance at which landmarks are merged.
+        descriptor_update: weight of the newest descriptor in a landmark's descriptor; 1 keeps the last, 0 the first.
         lost_after: the camera is lost after this many frames without a match, if the predicted pixels are less certain
             than `association.tight_window`.
         restart_after: after this many unmatched frames with enough features to be localised in a known place, a new map
             begins at the predicted pose; again after as many more.
-        max_landmarks: size of the map; beyond it, those measured longest ago are erased.
-        monocular: features without a stereo match become landmarks too, when two views give their depth (paper B, 2.2).
+        max_landmarks: largest size of the map; beyond it, the landmarks measured longest ago are erased.
+        monocular: features without a stereo match become landmarks too, once two views give a depth (paper B, 2.2).
     """
 
     target_in_view: int = 80

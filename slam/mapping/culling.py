@@ -1,4 +1,4 @@
-"""Which landmarks are erased (paper A, IV), and which the map can do without."""
+"""Which landmarks are erased: bad ones (paper A, IV), redundant ones, and the oldest of a full map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from slam.geometry.arrays import Array, BoolArray
 from slam.landmarks import LandmarkRows
 from slam.mapping.config import MapConfig
 
-_BLOCK = 256  # cost: landmarks that are compared with all others at once
+_BLOCK = 256  # cost: landmarks compared with all others at once
 
 
 def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
@@ -17,17 +17,17 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     tested = landmarks.in_view > config.erase_missed
     rare = tested & (landmarks.seen < config.erase_share * landmarks.in_view)
     unconfirmed = (landmarks.seen < config.confirmed) & (landmarks.unseen > config.erase_missed)
-    unconfirmed &= landmarks.last_seen >= 0  # what an earlier run kept stays until this one has seen it
+    unconfirmed &= landmarks.last_seen >= 0  # a loaded map's landmarks stay until this run has seen them
     unseen = landmarks.last_seen.max(initial=0) - landmarks.last_seen
     forgotten = unseen > config.forget_after if config.forget_after else np.zeros(len(landmarks), bool)
     return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
 def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConfig) -> BoolArray:
-    """Which landmarks (N,) at `positions` (N, 3) the map can do without, now that they are out of view; see `spacing`.
+    """Which landmarks (N,) at `positions` (N, 3) [m] are redundant once out of view; see `MapConfig.spacing`.
 
-    Those are compared that have just gone out of view, with each other and with all that did before; those that an
-    earlier run kept and this one has not seen yet have not gone out of view.
+    Landmarks that have just gone out of view are compared with each other and with all others out of view. Those of a
+    loaded map that this run has not seen yet count among the others only.
     """
     out = np.zeros(len(landmarks), bool)
     gone = np.flatnonzero((landmarks.unseen > config.erase_missed) & np.isfinite(landmarks.seen_from[:, 0]))
@@ -35,7 +35,7 @@ def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConf
     if not len(just) or not config.spacing:
         return out
     reach = config.spacing * np.linalg.norm(positions - landmarks.seen_from, axis=1)
-    rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # of equals the older one is the better
+    rank = np.lexsort((-np.arange(len(out)), landmarks.seen)).argsort()  # among equals, the older is better
     for some in np.split(just, range(_BLOCK, len(just), _BLOCK)):
         gap = positions[some][:, None] - positions[gone][None]
         near = np.einsum("ijk,ijk->ij", gap, gap) < np.minimum(reach[some][:, None], reach[gone][None]) ** 2
@@ -46,9 +46,10 @@ def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConf
 
 
 def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
-    """Which landmarks (N,) to erase so that `max_landmarks` remain: those measured longest ago.
+    """Which landmarks (N,) to erase so that `max_landmarks` remain.
 
-    Among those not measured now, the ones that were measured in one frame only go before all others.
+    First those that were measured in a single frame, then the others by their last measurement, oldest first; those
+    measured in the newest frame last.
     """
     out = np.zeros(len(landmarks), bool)
     surplus = len(landmarks) - config.max_landmarks

@@ -1,4 +1,4 @@
-"""Features and landmarks that are the same as a landmark already: by position and by descriptor."""
+"""Duplicates: features and landmarks that have the position and descriptor of an existing landmark."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are no
 
 
 def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, config: MapConfig) -> BoolArray:
-    """Which features (F,) are landmarks although they were not matched: the same position and descriptor.
+    """Which unmatched features (F,) have the position and descriptor of an existing landmark.
 
-    The place is the same within `same_distance`, or within what the depth's uncertainty allows along the line of sight.
+    Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
     """
     out = np.zeros(len(features), bool)
     feature, rows = _near_landmarks(features.uv_left, view, config)
@@ -32,7 +32,7 @@ def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatu
 
 
 def doubled_landmarks(view: MapView, landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
-    """Which landmarks in view (N,) are the same as another that was seen more often (or is older)."""
+    """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
     out = np.zeros(len(landmarks), bool)
     shown = np.flatnonzero(view.in_image)
     one, other = _near_landmarks(view.uv_left[shown], view, config)
@@ -48,7 +48,7 @@ def doubled_landmarks(view: MapView, landmarks: LandmarkRows, config: MapConfig)
 
 
 def _near_landmarks(uv: Array, view: MapView, config: MapConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of pixels (P, 2) and of landmarks in view that lie near each other in the image."""
+    """Pairs of pixels (P, 2) and landmarks in view that are near each other in the image, as rows of both."""
     shown = np.flatnonzero(view.in_image)
     if not len(uv) or not len(shown):
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -63,6 +63,6 @@ def _alike(
     laplacian: NDArray[np.int8],
     config: MapConfig,
 ) -> BoolArray:
-    """Whether landmarks look like these descriptors (P, D) and signs of the Laplacian (P,)."""
+    """Whether landmarks at `rows` (P,) match descriptors (P, D) and signs of the Laplacian (P,), pair by pair."""
     distance = np.linalg.norm(landmarks.descriptors[rows] - descriptors, axis=1)
     return np.asarray((distance < config.same_descriptor) & (landmarks.laplacian[rows] == laplacian))

@@ -1,4 +1,4 @@
-"""Landmarks whose place is known beforehand: what every back end asks of them."""
+"""Checks of landmarks with a known prior position, the same for every back end."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from slam.data import IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
-_LARGEST = 1e18  # guard: variance [m²]; those of a landmark that is hardly known at all are far smaller
+_LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
 
 def require_known(backend: str, ids: IdArray, positions: Array, covariances: Array) -> None:
-    """Check what is handed to `slam.interfaces.MapBackend`.
+    """Check the landmarks handed to `slam.interfaces.MapBackend`.
 
     Args:
         backend: its name, for the message.
@@ -23,7 +23,7 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         covariances: (N, 3, 3) [m²].
 
     Raises:
-        MeasurementError: shapes differ, an id stands twice, a position is not finite or absurdly far, or a covariance
+        MeasurementError: shapes differ, an id occurs twice, a position is not finite or absurdly far, or a covariance
             is not symmetric and positive definite.
     """
     n = len(ids)

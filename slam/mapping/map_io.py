@@ -1,7 +1,7 @@
-"""A map in a file: written by one run, started from by another. The format is described in docs/saved_maps.md.
+"""Map files, written by one run and loaded by another. docs/saved_maps.md describes the format.
 
 A file is two lines of text and a zip archive of a JSON header and NumPy arrays; nothing in it can be executed. The
-second line is the SHA-256 of the archive, so that no altered file is taken for a map.
+second line is the SHA-256 of the archive, which detects altered files.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from slam.showing import count
 
 
 class HasMap(Protocol):
-    """A running system, as far as saving its map goes."""
+    """Whatever has a map to save, such as a running system."""
 
     def snapshot(self) -> SavedMap:
         """The map as it is now; raises SlamError where there is none."""
@@ -40,11 +40,11 @@ class HasMap(Protocol):
 
 
 _MAGIC = "surf-stereo-slam map "
-_VERSION = 4  # fixed: of the file's form
-_WITHOUT_PLACES = "2"  # the version that is read as well; 3 had keyframes without the common errors of their poses
-_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members: the same map is the same file
+_VERSION = 4  # fixed: of the file format
+_WITHOUT_PLACES = "2"  # also read; version 3 had keyframes without the common errors of their poses, and is not
+_DATE = (1980, 1, 1, 0, 0, 0)  # fixed: of all members, so that the same map gives the same bytes
 
-#: World frame of a map that was begun without another one.
+#: World frame of a map that was built from scratch.
 FIRST_FRAME = "left camera at the first frame"
 
 _LARGEST = 2**31  # bytes of a file
@@ -58,7 +58,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class SavedMap:
-    """A map apart from any run, a row per landmark, ids ascending.
+    """A map, independent of any run: one row per landmark, ids ascending.
 
     Attributes:
         ids: landmark ids (N,).
@@ -73,8 +73,8 @@ class SavedMap:
         written_by: name and version of the program.
         seen_from: where the camera was when it saw each first (N, 3) [m] in the map's world frame; NaN where not known.
         source: where it was read from, for messages; not part of the map.
-        keyframes: with their poses as the back end estimated them at the time.
-        keyframe_poses: their poses in the map's world frame (K, 4, 4), corrected by loops; by default the same.
+        keyframes: with the poses that the back end estimated at the time.
+        keyframe_poses: poses in the map's world frame (K, 4, 4), corrected by loops; by default those of `keyframes`.
         loops: between keyframes.
 
     Raises:
@@ -141,7 +141,7 @@ class SavedMap:
 
     @property
     def holds(self) -> str:
-        """What is in it, for people."""
+        """A summary of the contents, for people."""
         numbers = (len(self), "landmark"), (len(self.keyframes), "keyframe"), (len(self.loops), "loop")
         return ", ".join(count(number, name) for number, name in numbers)
 
@@ -152,12 +152,12 @@ class SavedMap:
 
     @property
     def next_id(self) -> int:
-        """The least id that no landmark has had, neither of the map nor of its keyframes."""
+        """The lowest id above all those of the map's landmarks and of its keyframes' landmarks."""
         return 1 + max([int(ids.max(initial=-1)) for ids in (self.ids, *(k.landmarks for k in self.keyframes))])
 
     @property
     def rows(self) -> LandmarkRows:
-        """The map's bookkeeping at the start of a run, in which nothing has been seen yet."""
+        """The landmarks' bookkeeping at the start of a run that has seen none of them yet."""
         none = np.zeros(len(self), np.int64)
         return LandmarkRows(
             self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1, self.seen_from
@@ -173,7 +173,7 @@ class SavedMap:
         version: str,
         atlas: Atlas,
     ) -> SavedMap:
-        """The map of a running system: its rows, its back end's estimate, what they belong to, and its places."""
+        """The map of a running system: landmark rows, the back end's estimate, what both belong to, and keyframes."""
         P = 0.5 * (estimate.covariances + np.swapaxes(estimate.covariances, 1, 2))
         return cls(
             estimate.ids.astype(np.int64), estimate.positions, P, landmarks.descriptors.astype(np.float32),
@@ -201,7 +201,7 @@ class SavedMap:
 
 
 def save_map(path: str | Path, what: HasMap | SavedMap) -> None:
-    """Write a map, or that of a system, to a file: whole or not at all.
+    """Write a map, or a system's map, to a file: completely or not at all.
 
     Raises:
         SlamError: there is no map yet, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""The map after a frame: landmarks are counted, erased and added, in the rows of the system and in the back end."""
+"""Updates the map after a frame: counts, erases and adds landmarks, both in the system's rows and in the back end."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class MapChange:
 
     Attributes:
         landmarks: the map after it.
-        added: new landmarks, and the features that they are from.
+        added: new landmarks, and the features they were made of.
         erased: ids of the landmarks that left the map.
-        returned: landmarks of a place seen again that came back, and the features that they are now.
+        returned: landmarks of a revisited place that rejoined the map, and the features that show them now.
     """
 
     landmarks: LandmarkRows
@@ -47,9 +47,9 @@ class Returned:
 
     Attributes:
         rows: of the present features (M,).
-        ids: of the landmarks that they were (M,), −1 for none.
-        local: in left-camera coordinates (M, 3) [m].
-        covariances: theirs (M, 3, 3) [m²].
+        ids: of the landmarks that the old features belonged to (M,), −1 for none.
+        local: positions in present left-camera coordinates (M, 3) [m].
+        covariances: of the positions (M, 3, 3) [m²].
     """
 
     rows: NDArray[np.intp]
@@ -63,11 +63,11 @@ class KnownPlace:
     """Landmarks of a place whose pose is known.
 
     Attributes:
-        ids: that they had (M,), −1 for none.
-        positions: (M, 3) [m] in the back end's world.
-        covariances: theirs (M, 3, 3) [m²].
-        descriptors: theirs (M, D).
-        laplacian: signs of their Laplacians (M,).
+        ids: landmark ids that they had (M,), −1 for none.
+        positions: (M, 3) [m] in the back end's world frame.
+        covariances: of the positions (M, 3, 3) [m²].
+        descriptors: (M, D).
+        laplacian: signs of the Laplacian (M,).
         seen_from: where the camera was when it saw them (3,) [m].
     """
 
@@ -86,7 +86,7 @@ class Mapper:
         rig: the cameras.
         config: settings.
         localizer: says which landmarks are seen from a similar viewpoint as before.
-        backend: the first one; it must be able to place landmarks where left images alone are to add some.
+        backend: the first one; it must have `place` if `config.monocular` is set.
 
     Raises:
         ConfigurationError: the back end cannot place landmarks.
@@ -120,10 +120,10 @@ class Mapper:
         return MapChange(landmarks, added, erased)
 
     def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned) -> MapChange:
-        """Let landmarks of a place seen again rejoin the map, where the back end can place them.
+        """Let landmarks of a revisited place rejoin the map, if the back end can place them.
 
-        Under their old ids, where they had one. What the back end still had of them, where it had last left them, is
-        erased first. Features that are landmarks of the map already, or that move, are left alone.
+        They keep the ids that they had. If the back end still holds such a landmark, at its old, drifted position, that
+        one is erased first. Features that are landmarks of the map already, or that move, are left out.
         """
         if not isinstance(backend, MapBackend):
             return change
@@ -143,8 +143,8 @@ class Mapper:
         return replace(change, landmarks=landmarks, returned=LandmarkMatches(ids, rows))
 
     def insert(self, backend: Backend, landmarks: LandmarkRows, place: KnownPlace) -> LandmarkRows:
-        """Let landmarks of a known place join the map, as those of a saved map; those that it has stay as they are."""
-        assert isinstance(backend, MapBackend)  # as those are that start in a map
+        """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""
+        assert isinstance(backend, MapBackend)  # only such back ends start in a map
         new = np.flatnonzero(~np.isin(place.ids, landmarks.ids) | (place.ids < 0))
         ids = place.ids[new]
         ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
@@ -157,10 +157,10 @@ class Mapper:
         return landmarks.joined(rows)
 
     def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
-        """Let rows and back end agree after a step that was interrupted; what only one of both has leaves it.
+        """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
 
         Args:
-            backend: as the step left it; it was predicted.
+            backend: as the interrupted step left it, after its prediction.
             landmarks: the rows before the step.
 
         Returns:
@@ -185,7 +185,7 @@ class Mapper:
         return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
     def _count(self, landmarks: LandmarkRows, view: MapView, step: Step) -> LandmarkRows:
-        """Count what was seen and missed; a frame without a measured pose says nothing of single landmarks."""
+        """Count landmarks as seen or missed, unless the frame's pose was not measured."""
         m, matches = self.config, step.matches
         measured = np.isin(matches.ids, np.concatenate([step.report.used, step.spared]))
         expected = landmarks.ids[:0]
@@ -203,9 +203,9 @@ class Mapper:
     def _add(
         self, backend: Backend, landmarks: LandmarkRows, step: Step, known: BoolArray
     ) -> tuple[LandmarkRows, LandmarkMatches]:
-        """Make landmarks of features that are none yet, unless the pose is unknown.
+        """Turn features that are no landmarks yet into landmarks, unless the pose is unknown.
 
-        Moving features are excluded, and those whose motion label is undecided.
+        Features that move, or whose motion label is undecided, are left out.
         """
         if len(landmarks) >= MINIMAL_POINTS and not step.state.may_add(self.config.restart_after):
             return landmarks, LandmarkMatches.nothing()
@@ -231,7 +231,7 @@ class Mapper:
         added: LandmarkMatches,
         free: BoolArray,
     ) -> tuple[LandmarkRows, LandmarkMatches]:
-        """Make landmarks of features without a stereo match that two views give a depth (paper B, 2.2)."""
+        """Turn features without a stereo match into landmarks once two views give their depth (paper B, 2.2)."""
         features, matches = step.features, step.matches
         if len(matches) < MINIMAL_POINTS:
             return landmarks, added

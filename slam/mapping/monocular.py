@@ -1,16 +1,16 @@
 """Depth from two images of one moving camera (paper B, 2.2 and Fig. 2), for features without a stereo match.
 
-Paper B takes two successive images. A hand moves a centimetre between two frames, which shows no depth beyond arm's
-length; so a feature's first view is kept while it is followed from frame to frame, and depth is taken when the view has
-changed enough.
+Paper B takes two successive images. A hand-held camera moves a centimetre between frames, too little to show depth
+beyond arm's length; so a feature's first view is kept while it is tracked from frame to frame, and its depth is
+computed once the parallax is large enough.
 
-How the camera moved between the two views comes from the estimates of both poses, and its uncertainty from theirs,
-taken to be independent. A pose stands to the landmarks as well as its own frame's measurements fix it
-(`frame_covariance`), or better, where the back end is surer of the pose than that: in a map that is known well. So a
-new landmark's covariance holds the noise of both views and of the motion. It does not say that landmarks which come in
-the same frame share the error of that motion, nor that this error is a part of the present pose's.
+The camera's motion between the two views comes from both pose estimates, whose errors are taken to be independent. A
+pose's covariance is that by which its own frame's measurements fix it (`frame_covariance`), or the back end's if that
+is smaller, as in a well-known map. So a new landmark's covariance contains the noise of both views and of the motion.
+Correlations are neglected: landmarks made in the same frame share the error of that motion, and it is part of the
+present pose's error.
 
-What moves along the line on which a still point would be seen gets a wrong depth: one moving camera cannot tell.
+A point that moves along its epipolar line gets a wrong depth: a single moving camera cannot tell.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from slam.tracking.association import match_everywhere, match_in_boxes, pairs_in
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.visibility import MapView
 
-_PARALLAX = np.deg2rad(1.0)  # between the two rays, at least
-_RADIUS = 20.0  # a feature moves no further between two frames than that, besides the camera's turn [px]
+_PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
+_RADIUS = 20.0  # most that a feature moves between two frames, besides the camera's rotation [px]
 _D_MATCH, _RATIO = 0.5, 0.7  # paper: descriptor distance; ratio of the nearest two (paper B, 2.2)
 _KEPT = 45  # cost: frames in which a view is kept at most
-_MISFIT = 6.6  # derived: χ²(1) at 99 %, of the two views with one point
-_STEPS = 4  # numerics: of Gauss-Newton on a point's depth
+_MISFIT = 6.6  # derived: χ²(1) at 99 %, of two views of one point
+_STEPS = 4  # numerics: Gauss-Newton steps on a point's depth
 _VIEWS = 400  # cost: views kept at most
-_CLAIM = 12.0  # a landmark claims features so near to where it is expected [px]
+_CLAIM = 12.0  # a landmark claims features within this distance of its predicted pixel
 
 
 @dataclass(frozen=True)
 class Depths:
-    """Points seen in two views, in the coordinates of the camera at the second (N rows).
+    """Points triangulated from two views, in the camera's coordinates at the second one (N rows).
 
     Attributes:
-        local: positions (N, 3) [m]; NaN where the rays do not meet before both cameras.
+        local: positions (N, 3) [m]; NaN where the rays do not meet in front of both cameras.
         covariances: (N, 3, 3) [m²].
-        misfit: squared distance of the two views from one point (N,), χ² with one degree of freedom.
+        misfit: how far the two views are from showing one point (N,), χ² with one degree of freedom.
         parallax: angle between the rays (N,) [rad].
     """
 
@@ -55,7 +55,7 @@ class Depths:
     parallax: Array
 
     def good(self, depth_error: float) -> BoolArray:
-        """Which are known well enough (N,): the depth to a relative standard deviation of `depth_error`."""
+        """Which are known well enough (N,), `depth_error` being the largest relative standard deviation of depth."""
         with np.errstate(invalid="ignore", divide="ignore"):
             relative = np.sqrt(self.covariances[:, 2, 2]) / self.local[:, 2]
             return np.asarray((self.parallax > _PARALLAX) & (relative < depth_error) & (self.misfit < _MISFIT))
@@ -64,14 +64,14 @@ class Depths:
 def two_view_depth(
     rig: StereoRig, uv_then: Array, uv_now: Array, T_then_now: Array, motion_covariance: Array, sigma: float
 ) -> Depths:
-    """Points from two views of the left camera: linear triangulation, then Gauss-Newton on the reprojection errors.
+    """Triangulate points from two views of the left camera: linearly, then by Gauss-Newton on the reprojection errors.
 
     Args:
         rig: the cameras.
         uv_then: left pixels (N, 2) in the first view.
         uv_now: the same in the second.
-        T_then_now: poses (4, 4) or (N, 4, 4) of the camera now in its coordinates then.
-        motion_covariance: their covariance (6, 6) or (N, 6, 6), of a perturbation ``T exp(ξ)``.
+        T_then_now: poses (4, 4) or (N, 4, 4) of the second camera in the first one's coordinates.
+        motion_covariance: of these poses (6, 6) or (N, 6, 6), for a perturbation ``T exp(ξ)``.
         sigma: pixel noise [px].
     """
     n = len(uv_now)
@@ -97,7 +97,7 @@ def _rays(rig: StereoRig, uv: Array) -> Array:
 
 
 def _depth(then: Array, turned: Array, t: Array) -> Array:
-    """Depth (N,) along the second rays where both rays come nearest to each other; NaN behind a camera."""
+    """Depth (N,) along the second rays at which both rays are closest to each other; NaN behind a camera."""
     a, b, c = (then * then).sum(axis=1), (then * turned).sum(axis=1), (turned * turned).sum(axis=1)
     d, e = (then * t).sum(axis=1), (turned * t).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -110,7 +110,7 @@ def _depth(then: Array, turned: Array, t: Array) -> Array:
 def _step(
     rig: StereoRig, uv_then: Array, uv_now: Array, R: Array, t: Array, P: Array, local: Array, sigma: float
 ) -> tuple[Array, Array, Array]:
-    """A Gauss-Newton step (N, 3), the covariance (N, 3, 3) there, and the misfit (N,)."""
+    """A Gauss-Newton step (N, 3), the covariance (N, 3, 3) at its start, and the misfit (N,)."""
     z_now, J_now = rig.left.project_with_jacobian(local)
     z_then, J_then = rig.left.project_with_jacobian((R @ local[:, :, None])[:, :, 0] + t)
     J_then = J_then @ R  # by the point in the second camera
@@ -140,9 +140,9 @@ def _adjoints(T: Array) -> Array:
 
 
 def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma: float) -> Array:
-    """How well a frame's measurements of landmarks at `local` (M, 3) fix the camera before them: covariance (6, 6).
+    """Covariance (6, 6) of the pose that a frame's measurements of landmarks at `local` (M, 3) [m] give by themselves.
 
-    Of a perturbation ``T exp(ξ)``; landmarks are held where they are. Infinite where they do not fix it.
+    For a perturbation ``T exp(ξ)``, with the landmarks held fixed. Infinite if they do not determine a pose.
     """
     _, J = rig.project_stereo(local)
     by_pose = J @ points_by_pose(local)
@@ -152,7 +152,7 @@ def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma:
 
 
 def unclaimed(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, rows: NDArray) -> NDArray[np.intp]:
-    """Those features of `rows` (K,) that no landmark in view could be: none so near in the image looks alike."""
+    """Those of the features `rows` (K,) that no landmark in view claims: none nearby in the image looks alike."""
     shown = np.flatnonzero(view.in_image)
     if not len(rows) or not len(shown):
         return np.asarray(rows)
@@ -165,12 +165,12 @@ def unclaimed(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, 
 
 @dataclass(frozen=True)
 class _Views:
-    """First views of features that are followed, a row each."""
+    """First views of the features being tracked, one row each."""
 
     uv_first: Array
     uv_last: Array
-    T_first: Array  # pose of the camera then
-    covariance: Array  # how well that pose was fixed then, see `frame_covariance`
+    T_first: Array  # camera pose in the first view
+    covariance: Array  # of that pose, see `frame_covariance`
     T_last: Array
     frame: IdArray
     descriptors: NDArray[np.float32]
@@ -198,7 +198,7 @@ class _Views:
 
 @dataclass(frozen=True)
 class NewPoints:
-    """Features that have got a depth.
+    """Features whose depth has become known.
 
     Attributes:
         rows: of the features (N,).
@@ -212,7 +212,7 @@ class NewPoints:
 
 
 class MonocularDepth:
-    """Follows features that have no depth until two views give it.
+    """Tracks features without depth until two views give it.
 
     Args:
         rig: the cameras.
@@ -234,7 +234,7 @@ class MonocularDepth:
         features: StereoFeatures,
         found: LandmarkMatches,
     ) -> Array:
-        """How well the pose is known (6, 6): by this frame alone, or by the back end, whichever is better."""
+        """Covariance (6, 6) of the pose: by this frame alone or by the back end, whichever is smaller."""
         there = np.isin(found.ids, landmarks.ids)
         local, stereo = view.local[landmarks.rows(found.ids[there])], features.has_stereo[found.rows[there]]
         alone = frame_covariance(self._rig, local, stereo, self._sigma)
@@ -247,10 +247,10 @@ class MonocularDepth:
 
         Args:
             features: of the frame.
-            rows: those without depth that could become landmarks (K,).
+            rows: features without depth that could become landmarks (K,).
             T_world_left: pose (4, 4) after the update.
-            covariance: how well the frame fixes it, see `frame_covariance`.
-            frame: its number.
+            covariance: of the pose by this frame, see `frame_covariance`.
+            frame: the frame's number.
         """
         views = self._views or _Views.of(features, rows[:0], T_world_left, covariance, frame)
         row, view = self._followed(views, features, rows, T_world_left)
@@ -277,7 +277,7 @@ class MonocularDepth:
     def _followed(
         self, views: _Views, features: StereoFeatures, rows: NDArray[np.intp], T: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Features that are views seen again: rows of features and rows of views, each at most once."""
+        """Matches of features and kept views: rows of features and rows of views, each at most once."""
         turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T[:3, :3]
         expected = self._rig.left.project((_rays(self._rig, views.uv_last)[:, None, :] @ turn)[:, 0])
         found = match_in_boxes(
@@ -289,14 +289,14 @@ class MonocularDepth:
 def find_pose(
     rig: StereoRig, landmarks: LandmarkRows, positions: Array, features: StereoFeatures, localizer: Localizer, seed: int
 ) -> Array | None:
-    """The camera's pose (4, 4) in a map from left pixels alone: three points at a time, the pose most agree with.
+    """The camera's pose (4, 4) in a map from left pixels alone, by P3P and RANSAC.
 
     Args:
         rig: the cameras.
         landmarks: the map (N rows).
-        positions: theirs (N, 3) [m].
+        positions: of its landmarks (N, 3) [m].
         features: of the frame.
-        localizer: its settings are used.
+        localizer: whose settings are used.
         seed: of the random choice of points.
 
     Returns:

@@ -1,6 +1,6 @@
-"""Starting a back end in a map: where a kidnapped camera was found, or where the camera is in a map from a file.
+"""Starts a back end in a known map: for a kidnapped camera that was found again, or in a map from a file.
 
-Until the camera has been found in a map from a file, no estimator runs.
+With a map from a file, no estimator runs until the camera has been found in it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from slam.models import EstimatorModels
 from slam.tracking.localizer import Localizer
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
-#: back end itself measures the landmarks that give that pose: a narrow prior would count them twice.
+#: back end measures the landmarks that gave that pose once more: a narrow prior would count them twice.
 POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
 
 REASON = "the camera has not been found in the map yet"
@@ -43,14 +43,14 @@ class Relocalizer:
 
     Args:
         rig: the cameras.
-        models: what the back ends assume.
-        backend: their name; None where none can be made, as the first one was given as an object.
-        options: theirs.
+        models: the back ends' noise and motion models.
+        backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
+        options: of the back ends.
         localizer: finds landmarks in frames.
 
     Attributes:
         search: looks for the camera in the map that the system was started with; None without one, or once it is found.
-        past: the paths that back ends before the present one have left.
+        past: the paths of all back ends before the present one.
         restarted: indices of the frames in which another back end took over.
     """
 
@@ -75,7 +75,7 @@ class Relocalizer:
         """Look for the camera in a map before any back end starts.
 
         Raises:
-            ConfigurationError: the back end was not given by its name, or cannot start in a prior map.
+            ConfigurationError: the back end was not given by name, or cannot start in a prior map.
             SlamError: the map is empty, or too large for the back end.
         """
         if self._backend is None:
@@ -90,12 +90,12 @@ class Relocalizer:
         return self._backend is not None and isinstance(old, MapBackend)
 
     def restart(self, old: Backend, T_world_left: Array) -> tuple[Backend, Trajectory]:
-        """A new back end at a pose (4, 4) in the map of an old one: the old one would take the displacement for motion.
+        """A new back end at a pose (4, 4) in an old one's map; the old one would take the displacement for motion.
 
         Correlations between the landmarks are lost, as with a map from a file.
 
         Returns:
-            the new back end, and the path that the old one leaves, but for its newest pose.
+            the new back end, and the old one's path without its newest pose.
         """
         new = self.start(T_world_left)
         assert isinstance(new, MapBackend)
@@ -116,13 +116,13 @@ class Relocalizer:
         return self._new(models)
 
     def begin_anew(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory]:
-        """A new back end without landmarks where an old one says that the camera is, which defines its coordinates.
+        """A new back end without landmarks at the old one's pose, which is exact for it: it defines its coordinates.
 
-        An estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen from
-        there: its linear equations do not hold over such angles, and make it sure of a pose that is wrong.
+        A single estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen
+        from there: linearisation fails over such angles and makes it overconfident in a wrong pose.
 
         Returns:
-            the new back end at the time `stamp`, and the path that the old one leaves, but for its newest pose.
+            the new back end at the time `stamp` [s], and the old one's path without its newest pose.
         """
         T = old.estimate(landmarks=False).T_world_left
         new = self._new(replace(self._models, T_world_left=T.tolist()))
@@ -144,7 +144,7 @@ class MapSearch:
         known: the map.
         rig: the cameras.
         localizer: finds landmarks in frames.
-        T_world_left: where the camera is said to be (4, 4): tried first, no more.
+        T_world_left: an initial guess of the camera's pose (4, 4), tried first.
     """
 
     def __init__(self, known: SavedMap, rig: StereoRig, localizer: Localizer, T_world_left: Array) -> None:
@@ -154,10 +154,10 @@ class MapSearch:
         self._guess = T_world_left
 
     def locate(self, features: StereoFeatures, seed: int) -> Array | None:
-        """The pose (4, 4) in the map on which landmarks agree, or None.
+        """The pose (4, 4) in the map on which enough landmarks agree, or None.
 
         Raises:
-            SlamError: the descriptors are not of the length of the map's.
+            SlamError: the descriptors have another length than the map's.
         """
         self.known.require_fits("", features.descriptors.shape[1])
         guess = self._guess
@@ -191,7 +191,7 @@ class MapSearch:
         backend.insert(self.known.ids, self.known.positions, self.known.covariances)
 
     def estimate(self, stamp: float) -> Estimate:
-        """What is known without a pose: the map. The pose is the guess, its covariance says that it means nothing."""
+        """The map, with the guess as the pose; its covariance is so large that the pose means nothing."""
         none = nowhere(stamp, self._guess)
         k = self.known
         return Estimate(stamp, none.T_world_left, none.covariance, k.ids, k.positions, k.covariances)
@@ -220,6 +220,6 @@ class MapSearch:
 
 
 def nowhere(stamp: float, T_world_left: Array) -> Prediction:
-    """A prediction that says nothing: no landmark is expected anywhere."""
+    """An uninformative prediction: an unknown pose, and no landmark expected anywhere."""
     none, P = np.zeros((0, 2)), np.diag(np.repeat([np.pi**2, 1e6], 3))
     return Prediction(stamp, T_world_left, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))

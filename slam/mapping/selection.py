@@ -1,4 +1,4 @@
-"""Which features become landmarks (paper A, IV): well spread, with a depth that is known."""
+"""Selects features that become landmarks (paper A, IV): evenly spread, with a well-known depth."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def new_landmarks(
 
     Args:
         features: of the frame.
-        free: which of them are no landmark (N,).
-        occupied: pixels of the landmarks in view (M, 2), measured ones first of all.
+        free: which features belong to no landmark (N,).
+        occupied: pixels of the landmarks in view (M, 2), the measured ones first.
         rig: the cameras, for the depth's uncertainty.
         pixel_sigma: noise of uL, vL, uR [px].
         config: settings.
@@ -62,14 +62,14 @@ def _spread(
         return c[:, 1] * columns + c[:, 0]
 
     load = np.bincount(cell(occupied), minlength=columns * lines)
-    # Each feature's rank in its cell plus what the cell holds already: features of empty cells come first.
+    # Queue by each feature's rank in its cell plus the cell's landmarks: features of empty cells come first.
     cells = cell(uv[rows])
     order = np.argsort(cells, kind="stable")
     starts = np.searchsorted(cells[order], np.arange(columns * lines))
     rank = np.empty(len(rows), int)
     rank[order] = np.arange(len(rows)) - starts[cells[order]]
     queue = rows[np.argsort(rank + load[cells], kind="stable")]
-    # Those near each other, by ascending place in the queue.
+    # Pairs of features closer than the separation, ordered by place in the queue.
     first, second = pairs_in_boxes(uv[queue], np.full((len(queue), 2), config.separation), uv[queue])
     gap = uv[queue[first]] - uv[queue[second]]
     near = np.einsum("ij,ij->i", gap, gap) < config.separation**2

@@ -1,4 +1,4 @@
-"""What a frame brings before it changes the map, and what completed steps leave for the next one."""
+"""Data of a step: a frame's result before the map changes, and the state carried to the next step."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Associated:
     """A frame whose features are matched with landmarks.
 
     Attributes:
-        aligned: the features as they were measured, and the patches that they were aligned to.
-        features: the same, corrected by the calibration.
+        aligned: the features as measured, and the patches that they were aligned to.
+        features: the same features, corrected by the calibration.
         landmarks: the map.
         prediction: of the back end.
-        matches: landmarks that were matched, but for those held.
-        held: ids of landmarks that are not given to the back end's update, because they may move.
-        held_rows: features that were matched with some of these.
+        matches: matched landmarks, without the held ones.
+        held: ids of landmarks withheld from the back end's update, because they may move.
+        held_rows: features matched with held landmarks.
     """
 
     aligned: Aligned
@@ -47,22 +47,22 @@ class Associated:
 
 @dataclass(frozen=True)
 class Step:
-    """What a frame brought before the map was changed.
+    """A frame's result before the map is changed.
 
     Attributes:
         index: of the frame.
         features: all of them, corrected by the calibration.
         prediction: of the back end.
-        matches: landmarks that were matched.
-        held: ids of landmarks that were not given to the back end's update, because they may move.
-        held_rows: features that were matched with some of these.
-        spared: ids of those of the matches that were not given to the update, because others tell more.
+        matches: matched landmarks, without the held ones.
+        held: ids of landmarks withheld from the back end's update, because they may move.
+        held_rows: features matched with held landmarks.
+        spared: ids of matched landmarks left out of the update, because others are more informative.
         report: of the update.
         state: whether the pose is known.
         estimate: the camera's pose after the update.
         labels: which features move.
-        common: what the pose's error has in common with those of other frames; part of `estimate` once that is known.
-        correction: that the features were corrected with.
+        common: the part of the pose's error that other frames share; included in the covariance of `estimate`.
+        correction: of the calibration, with which the features were corrected.
     """
 
     index: int
@@ -82,15 +82,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Completed:
-    """What completed steps leave for the next one, besides the map.
+    """State carried from completed steps to the next one, besides the map.
 
     Attributes:
         index: of the last frame.
         state: how localization has gone.
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
-        anchors: what landmarks looked like at first sight.
-        measured_at: time of the last frame whose pose was measured, or at which a map begins [s].
+        anchors: image patches of landmarks at first sight.
+        measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
     """
 
     index: int = -1
@@ -101,7 +101,7 @@ class Completed:
     measured_at: float = -np.inf
 
     def after(self, step: Step, added: int, anchors: Anchors, begun_anew: bool) -> Completed:
-        """The same after one more step, in which so many landmarks joined the map, or one of its own has begun."""
+        """The state after one more step, in which `added` landmarks joined the map, or a new map was begun."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
         known = not step.state.unmatched or not self.mapped or begun_anew
         measured_at = step.features.stamp if known else self.measured_at

@@ -1,4 +1,4 @@
-"""What both back ends do where most observations contradict the prediction: then the prediction itself is wrong."""
+"""What both back ends do if most observations contradict the prediction, which then must be wrong itself."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-ENOUGH = 6  #: observations whose agreement can be tested
-HEEDED = 3  #: one in so many observations is enough to agree with a prediction
-CONFIRMED = 5  #: observations that agree on a pose by more than chance: three fix it
-INFLATION = (3.0, 10.0)  #: process noise that is tried where they disagree, in standard deviations of the usual one
-_HYPOTHESES = 200  # cost: poses that are tried in the search for that on which the observations agree
-_AS_NEW = 2.0  # variance of an innovation, in that of the pixels, where the landmark is as uncertain as a new one
+ENOUGH = 6  #: fewest observations whose agreement is tested
+HEEDED = 3  #: a prediction holds if at least one in so many observations agrees with it
+CONFIRMED = 5  #: fewest observations that agree on a pose by more than chance; three determine it
+INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tried if observations disagree
+_HYPOTHESES = 200  # cost: poses tried in the search for one on which the observations agree
+_AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
 
 
 def landmarks_pose(
     rig: StereoRig, points: Array, z: Array, models: EstimatorModels, T_world_left: Array, seed: int
 ) -> Array | None:
-    """The pose (4, 4) on which most landmarks agree, and at least five; None where there is none.
+    """The pose (4, 4) on which most landmarks agree; None if fewer than five agree.
 
     Args:
         rig: the cameras.
         points: the landmarks (M, 3) in the world [m].
         z: measurements (M, 3) = (uL, vL, uR) in the rig's own pixels.
         models: pixel noise and gate.
-        T_world_left: pose (4, 4) to begin with.
+        T_world_left: initial guess of the pose (4, 4).
         seed: of the random choice.
     """
     threshold = models.pixel_sigma * np.sqrt(_AS_NEW * chi_square_limit(3, models.gate_probability))
@@ -39,9 +39,9 @@ def landmarks_pose(
 
 
 def share_by_chance(rejected: Array, limit: float) -> float:
-    """The share of wrong observations that passes a gate.
+    """The share of wrong observations that pass a gate by chance.
 
-    Wrong observations are taken to be spread about their predictions as those that are rejected.
+    The rejected observations show how widely wrong ones scatter about their predictions.
 
     Args:
         rejected: squared Mahalanobis distances (R,) of the rejected observations, χ² with three degrees of freedom.

@@ -1,4 +1,4 @@
-"""Checks of what a back end or a front end from elsewhere gives back, so that nonsense ends a step with one line."""
+"""Checks of what third-party back ends and front ends return, so that an error ends a step with one clear line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _REPORT = {"status": UpdateStatus, "reason": str, "used": np.ndarray, "rejected"
 
 
 def require_prediction(prediction: Any, owner: object) -> None:
-    """Check what `Backend.predict` of `owner` gave.
+    """Check what `Backend.predict` of `owner` returned.
 
     Raises:
         SlamError: it is no `Prediction`, shapes differ from the documented ones, or pose or covariance are not finite.
@@ -31,7 +31,7 @@ def require_prediction(prediction: Any, owner: object) -> None:
 
 
 def require_report(report: Any, owner: object) -> None:
-    """Check what `Backend.update` of `owner` gave.
+    """Check what `Backend.update` of `owner` returned.
 
     Raises:
         SlamError: it is no `UpdateReport`, or one of its values is of another type than documented.
@@ -47,7 +47,7 @@ def require_report(report: Any, owner: object) -> None:
 
 
 def require_estimate(estimate: Any, owner: object) -> Estimate:
-    """What `Backend.estimate` of `owner` gave.
+    """What `Backend.estimate` of `owner` returned, checked.
 
     Raises:
         SlamError: it is no `Estimate`, or pose, landmarks or covariances are of another shape or not finite.
@@ -64,7 +64,7 @@ def require_estimate(estimate: Any, owner: object) -> Estimate:
 
 
 def require_positions(positions: Any, ids: IdArray, owner: object) -> Array:
-    """What `Backend.positions` of `owner` gave for `ids`.
+    """What `Backend.positions` of `owner` returned for `ids`, checked.
 
     Raises:
         SlamError: not (N, 3), or not finite.
@@ -77,10 +77,10 @@ def require_positions(positions: Any, ids: IdArray, owner: object) -> Array:
 
 
 def require_patches(patches: Any, count: int, known: Patches, owner: object) -> None:
-    """Check what `AligningFrontend.patches` of `owner` gave for so many pixels.
+    """Check what `AligningFrontend.patches` of `owner` returned for `count` pixels.
 
     Raises:
-        SlamError: no `Patches` of that many rows, or of another size than the `known` ones.
+        SlamError: it is no `Patches` with `count` rows, or their size differs from that of the `known` ones.
     """
     what = f"{type(owner).__name__}.patches"
     _require_kind(patches, Patches, what)
@@ -93,10 +93,10 @@ def require_patches(patches: Any, count: int, known: Patches, owner: object) -> 
 
 
 def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array]:
-    """Left and right pixels that `AligningFrontend.align` of `owner` gave for so many patches.
+    """Left and right pixels that `AligningFrontend.align` of `owner` returned for `count` patches, checked.
 
     Raises:
-        SlamError: not two arrays (N, 2).
+        SlamError: they are not two arrays (N, 2).
     """
     what = f"{type(owner).__name__}.align"
     if not isinstance(found, tuple) or len(found) != 2:
@@ -107,7 +107,7 @@ def require_aligned(found: Any, count: int, owner: object) -> tuple[Array, Array
 
 
 def _require_belief(belief: Prediction | Estimate, what: str) -> None:
-    """A stamp, ids, a pose and its covariance."""
+    """Check stamp, ids, pose and its covariance."""
     _require_kind(belief.stamp, Real, f"{what}: the stamp")
     if not abs(belief.stamp) <= LATEST_STAMP:
         raise SlamError(f"{what}: the stamp must be within {LATEST_STAMP:g} s")
@@ -124,7 +124,7 @@ def _require_kind(value: Any, kind: type, what: str) -> None:
 
 
 def _require_shape(value: Any, shape: tuple[int, ...], what: str) -> None:
-    """An array of numbers of this shape."""
+    """Check that a value is a numeric array of this shape."""
     if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in "fiu":
         got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
         raise SlamError(f"{what}: must be an array {shape} of numbers, got {got}")

@@ -1,8 +1,8 @@
-"""Which feature is which landmark: size-variable search windows and descriptor distance (paper A, III and IV).
+"""Data association: size-variable search windows and descriptor distance (paper A, III and IV).
 
-Landmarks in the angle of view are looked for around their predicted pixels: in the smallest window first, and, where
-nothing is found, in larger windows under a stricter descriptor distance (paper A, Fig. 4 and Eq. 12). Every landmark's
-best candidate is found before any feature is taken, so that no landmark steals the feature of another.
+Landmarks in the angle of view are searched for around their predicted pixels: in the smallest window first and, if
+nothing is found, in larger windows with a stricter descriptor distance (paper A, Fig. 4 and Eq. 12). All landmarks'
+best candidates are found before any feature is assigned, so that no landmark takes the feature of another.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from slam.models import FORBID_UNKNOWN, require_not_negative
 Descriptors = NDArray[np.float32]
 
 _NONE = np.float32(np.inf)
-_LARGE = 0.03  # cost: where windows fill more than this share of the image, all descriptors are compared first
+_LARGE = 0.03  # cost: if windows fill more than this share of the image, all descriptors are compared first
 
-_POSES = (0, 100_000)  # guard: tried in a frame
+_POSES = (0, 100_000)  # guard: bounds of the number of poses tried in a frame
 _RANGES = {
     "hypotheses": _POSES,
     "wide_hypotheses": _POSES,
@@ -47,30 +47,29 @@ class AssociationConfig:
         d_match: largest descriptor distance in each window (paper A, Eq. 12); falls as the window grows.
         ratio: largest ratio of the best to the second best distance in a window (paper B, 2.2).
         wide_d_match, wide_ratio: as `d_match` and `ratio`, for matching against the whole map without windows.
-        wide_share: where nothing was matched in the last frame, a pose found by matching against the whole map must
-            show again at least this share of the landmarks (or of the features, if fewer) in view from there.
-        minimum_consistent: with fewer matches after the geometric check, the whole map is tried.
-        consistency_sigmas: reprojection error up to which a match agrees with a pose, in units of the pixel noise.
-        hypotheses, wide_hypotheses: number of poses tried in the geometric check, of matches in windows and of matches
-            against the whole map.
-        tight_window: where the median deviation of the innovations is below this [px], the prediction is trusted: few
-            matches suffice, and no second search is made.
+        wide_share: if nothing was matched in the last frame, a pose found by matching against the whole map must match
+            at least this share of the landmarks (or of the features, if fewer) in view from there.
+        minimum_consistent: with fewer matches than this after the geometric check, the whole map is tried.
+        consistency_sigmas: largest reprojection error of a match that agrees with a pose, in units of the pixel noise.
+        hypotheses, wide_hypotheses: number of poses tried in the geometric check, for matches in windows and for
+            matches against the whole map.
+        tight_window: if the median standard deviation of the innovations is below this [px], the prediction is trusted:
+            few matches suffice, and no second search is made.
         max_jump, lost_jump: a pose farther than this from the prediction, in its standard deviations, must be
-            confirmed by `kidnapped_after` frames. `lost_jump` holds after a frame without matches.
-        kidnapped_after: where poses beyond `max_jump` or `lost_jump` agree with each other in so many successive
-            frames, the camera was kidnapped (moved while it saw nothing), and a new back end starts at that place in
-            the map.
-        view_angle: landmarks are looked for where the line of sight has turned by no more than this since they were
-            first seen [degrees]: beyond, what is found is not the same point any more. 180 for any angle.
-        view_ratio: the same for the distance, which may have changed by no more than this factor.
-        rematch_after: landmarks that were outside of the image for so many frames are looked for from any view angle
-            and ratio: what they tell about the drift meanwhile is worth more than what the point may have slid. Found,
-            they count as first seen from there.
-        align: features of landmarks are moved to where the image around them is as at the landmark's first sight (see
-            `slam.tracking.patch_alignment`), where the front end can do that.
-        measured: matches that a back end gets in a frame at most, those that tell most of the camera's motion (see
-            `slam.tracking.informative`); 0 for all.
-        refined_window: deviation [px] assumed in the second search, around the pose on which matches agreed.
+            confirmed by `kidnapped_after` frames. `lost_jump` is used after a frame without matches.
+        kidnapped_after: if poses beyond `max_jump` or `lost_jump` agree with each other in this many successive frames,
+            the camera was kidnapped (moved while it saw nothing), and a new back end starts there in the map.
+        view_angle: landmarks are searched for only if their line of sight has turned by no more than this since they
+            were first seen [degrees]; beyond, a feature is no longer at the same point. 180 for any angle.
+        view_ratio: likewise, largest factor by which the distance may have changed.
+        rematch_after: landmarks that were out of the image for this many frames are searched for at any view angle and
+            distance: they correct the drift meanwhile by more than the feature may have shifted. Once found, they count
+            as first seen from there.
+        align: shift landmarks' features to where the surrounding image matches that at the landmark's first sight (see
+            `slam.tracking.patch_alignment`), if the front end can do that.
+        measured: largest number of matches given to the back end in a frame: those most informative of the camera's
+            motion (see `slam.tracking.informative`); 0 for all.
+        refined_window: standard deviation [px] assumed in the second search, around the pose on which matches agreed.
     """
 
     windows: str = "covariance"
@@ -129,7 +128,7 @@ class Matches:
     """Pairs of a landmark and a feature.
 
     Attributes:
-        landmarks: rows of the landmark list that was given (K,).
+        landmarks: rows of the landmarks (K,).
         features: rows of the features (K,).
     """
 
@@ -156,11 +155,11 @@ def match_in_windows(
 
     Args:
         prediction: landmarks in the angle of view, their pixels and innovation covariances.
-        descriptors: of those landmarks (M, D), or of more of which they are the rows `among` (M,).
-        laplacian: signs of their Laplacians, likewise.
+        descriptors: of those landmarks (M, D), or of a longer list of which they are the rows `among`.
+        laplacian: signs of the Laplacian, likewise.
         features: of the frame.
         config: settings.
-        among: see `descriptors`.
+        among: rows (M,) of the landmarks in `descriptors`; None if these are the landmarks'.
     """
     if not len(prediction.ids) or not len(features):
         return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
@@ -168,7 +167,7 @@ def match_in_windows(
         among = np.arange(len(prediction.ids))
     windows = search_windows(prediction, config)
     if windows.are_large(features.uv_left):
-        limit = max(config.d_match) / config.ratio  # beyond that no feature is the nearest, nor near enough to doubt it
+        limit = max(config.d_match) / config.ratio  # farther features affect neither best nor ratio
         rows, columns = _alike(descriptors[among], laplacian[among], features, limit)
     else:
         rows, columns = pairs_in_boxes(prediction.uv_left, windows.reach, features.uv_left)
@@ -198,13 +197,13 @@ def match_in_boxes(
     centres: Array, reach: float, descriptors: Descriptors, laplacian: NDArray[np.int8], features: StereoFeatures,
     rows: NDArray[np.intp], d_match: float, ratio: float,
 ) -> Matches:  # fmt: skip
-    """Match what is expected at pixels (M, 2), with descriptors (M, D), to features `rows` (K,) of a frame.
+    """Match points expected at pixels (M, 2), with descriptors (M, D), to features `rows` (K,) of a frame.
 
     Args:
-        centres: the pixels; without a match where they are not finite.
-        reach: half size of the square boxes around them [px].
-        descriptors: what is expected to be seen (M, D).
-        laplacian: its signs of the Laplacian (M,).
+        centres: the expected pixels; points whose pixels are not finite are not matched.
+        reach: half size of the square boxes around the pixels [px].
+        descriptors: of the points (M, D).
+        laplacian: signs of their Laplacian (M,).
         features: of the frame.
         rows: the features that may be matched.
         d_match: largest descriptor distance.
@@ -225,13 +224,12 @@ def match_in_boxes(
 
 @dataclass(frozen=True)
 class SearchWindows:
-    """Where landmarks (M) are looked for: nested windows around their predicted pixels.
+    """Nested search windows around the predicted pixels of landmarks (M).
 
     Attributes:
-        sizes: of the windows, smallest first: in the unit of `shape`.
+        sizes: half sizes of the windows, smallest first: of ellipses in standard deviations, of squares in pixels.
         reach: half sizes (M, 2) [px] of the boxes around the largest windows.
-        shape: ellipses' information matrices (M, 3) as (uu, uv, vv) [1/px²] where the windows are ellipses, whose
-            `sizes` are in standard deviations; None where they are squares of half `sizes` [px].
+        shape: information matrices (M, 3) of elliptic windows, as (uu, uv, vv) [1/px²]; None for square windows.
     """
 
     sizes: tuple[float, ...]
@@ -239,7 +237,7 @@ class SearchWindows:
     shape: NDArray[np.float32] | None
 
     def are_large(self, uv: Array) -> bool:
-        """Whether the boxes around the largest windows hold a good part of the pixels (N, 2), on average."""
+        """Whether the boxes around the largest windows hold a large share of the pixels (N, 2), on average."""
         width, height = (1.0 + np.ptp(uv[:, i]) for i in (0, 1))
         area = np.dot(np.minimum(2 * self.reach[:, 0], width), np.minimum(2 * self.reach[:, 1], height))
         return bool(area > _LARGE * len(self.reach) * width * height)
@@ -254,7 +252,7 @@ class SearchWindows:
 
 
 def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchWindows:
-    """The windows of the predicted landmarks, of the kind that `config.windows` names."""
+    """Search windows of the predicted landmarks, of the kind `config.windows`."""
     if config.windows == "fixed":
         sizes = config.window_sizes
         return SearchWindows(sizes, np.full((len(prediction.ids), 2), sizes[-1]), None)
@@ -274,9 +272,9 @@ def search_windows(prediction: Prediction, config: AssociationConfig) -> SearchW
 
 
 def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending row of the centres.
+    """Pairs of rows of centres (M, 2) and of pixels (N, 2) within `reach` (M, 2) of them, by ascending centre.
 
-    Pixels are sorted by column, so that few pairs have to be looked at.
+    Pixels are sorted by column, so that few pairs have to be tested.
     """
     order = np.argsort(uv[:, 0], kind="stable")
     x, y = uv[:, 0].take(order), uv[:, 1].take(order)
@@ -287,7 +285,7 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
 
 
 def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which range and which number: all numbers of the ranges [first, last) (M,), one range after the other."""
+    """All integers of the ranges [first, last) (M,), one range after the other: the range's row, and the integer."""
     count = np.maximum(last - first, 0)
     which = np.repeat(np.arange(len(count)), count)
     return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
@@ -347,7 +345,7 @@ class _Pairs:
 
 
 def _by_levels(pairs: _Pairs, level: NDArray[np.intp], size: tuple[int, int], config: AssociationConfig) -> Matches:
-    """Matches in the smallest windows first, then in larger ones, of what is free still (paper A, Fig. 4)."""
+    """Match in the smallest windows first, then what is left in larger ones (paper A, Fig. 4)."""
     free_landmarks, free_features = np.ones(size[0], bool), np.ones(size[1], bool)
     landmarks, taken = [], []
     for number, d_match in enumerate(config.d_match):

@@ -27,18 +27,18 @@ _COLUMNS: dict[str, tuple[int, str, type]] = {
 
 
 def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, after: float) -> StereoFeatures:
-    """The features with the documented dtypes; a frame without any has descriptors of `dimensions` numbers.
+    """The features with the documented dtypes; a frame without features gets descriptors (0, `dimensions`).
 
     Args:
         features: of a frame.
         rig: the cameras.
-        dimensions: length of the descriptors so far; None where there were none.
+        dimensions: length of the descriptors so far; None if there were none.
         after: stamp of the frame before [s].
 
     Raises:
         MeasurementError: they are not as `StereoFeatures` says: a wrong type, shape or number of dimensions, a value
-            that is not finite (but for NaN in `uv_right`), a pixel farther outside of the image than that is wide or
-            high, a stamp that is no number or not later than the one before, or images of another type or size.
+            that is not finite (except NaN in `uv_right`), a pixel farther outside the image than its width or height,
+            a stamp that is no number or not later than the one before, or images of another type or size.
     """
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
@@ -82,7 +82,7 @@ def _column(name: str, array: Any) -> Array:
         )
     if array.dtype == dtype:
         return np.asarray(array)
-    with np.errstate(over="ignore"):  # found out as not finite
+    with np.errstate(over="ignore"):  # reported as not finite
         return (np.sign(array) if "i" in kinds else np.asarray(array)).astype(dtype)
 
 
@@ -95,7 +95,7 @@ def _require_rows(columns: dict[str, Any]) -> None:
 
 
 def _require_pixels(left: Array, right: Array, rig: StereoRig) -> None:
-    """Left pixels are finite, right pixels finite or NaN, and none lies far outside of its image."""
+    """Check that left pixels are finite, right pixels finite or NaN, and none far outside its image."""
     if not np.isfinite(left).all():
         raise MeasurementError("features: a left pixel is not finite")
     if np.isinf(right).any():
@@ -107,7 +107,7 @@ def _require_pixels(left: Array, right: Array, rig: StereoRig) -> None:
 
 
 def _require_images(images: Any, rig: StereoRig) -> None:
-    """Images, where there are any, are a pair of the rectified rig, whose size is the rig's own."""
+    """Check that images, if there are any, are a pair of the rectified rig, of the rig's own size."""
     if images is None:
         return
     if not isinstance(images, ImagePair):
@@ -122,7 +122,7 @@ def _require_images(images: Any, rig: StereoRig) -> None:
 
 
 def _of_length(descriptors: Array, dimensions: int | None) -> Array:
-    """Descriptors (N, D) of the length of those before; where there are none, of that length too."""
+    """Descriptors (N, D), checked to be as long as those before; an empty array gets that length too."""
     if dimensions is None or descriptors.shape[1] == dimensions:
         return descriptors
     if len(descriptors):

@@ -18,7 +18,7 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
     A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):  # what is not positive definite becomes NaN here
+    with np.errstate(invalid="ignore", divide="ignore"):  # NaN if S is not positive definite
         l00, l10, l11, l20, l21, l22 = _cholesky(covariances)
         y0 = residuals[:, 0] / l00
         y1 = (residuals[:, 1] - l10 * y0) / l11
@@ -62,9 +62,10 @@ def chi_square_gate(residuals: Array, innovation_covariances: Array, probability
     """Which observations (M,) lie inside the χ² quantile `probability` of their own innovation covariance.
 
     Args:
-        residuals: measured less predicted (uL, vL, uR), (M, 3) [px]; NaN uR for a left pixel alone (two degrees).
+        residuals: measured less predicted (uL, vL, uR), (M, 3) [px]; uR NaN for a left pixel alone (two degrees of
+            freedom).
         innovation_covariances: (M, 3, 3) [px²], measurement noise included.
-        probability: share of right measurements that pass where the covariances are right, in (0, 1).
+        probability: share of correct measurements that pass if the covariances are right, in (0, 1).
     """
     dof = np.where(np.isnan(residuals[:, 2]), 2, 3)
     return np.asarray(squared_distances(residuals, innovation_covariances) <= chi_square_limits(dof, probability))

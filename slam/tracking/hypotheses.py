@@ -1,4 +1,4 @@
-"""Poses far from the prediction on which landmarks agree: is the camera kidnapped (moved while it saw nothing)?"""
+"""Detects a kidnapped camera (moved while it saw nothing) by poses far from the prediction that agree."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from slam.chi_square import SIGMAS
 from slam.geometry.se3 import Array, inverse, log
 from slam.models import EstimatorModels
 
-_SLACK = 0.05  # between two poses found one by one [m], [rad]
+_SLACK = 0.05  # error of two poses found independently [m], [rad]
 
 
 @dataclass(frozen=True)
 class PoseHypotheses:
-    """Poses, all far from the predicted ones, on which landmarks agreed in frame after frame.
+    """Poses far from the predictions, on which landmarks agreed in successive frames.
 
     Attributes:
-        count: how many in a row agree with each other.
+        count: number of successive poses that agree with each other.
         stamp: of the last one [s].
         T_world_left: the last one (4, 4).
     """
@@ -28,7 +28,7 @@ class PoseHypotheses:
     T_world_left: Array | None = None
 
     def after(self, T_world_left: Array, stamp: float, models: EstimatorModels) -> PoseHypotheses:
-        """With one more pose, which agrees with the last one if a camera may have moved so far meanwhile."""
+        """A copy with one more pose, which agrees with the last one if the camera may have moved that far meanwhile."""
         if self.T_world_left is None:
             return PoseHypotheses(1, stamp, T_world_left)
         step, dt = log(inverse(self.T_world_left) @ T_world_left), stamp - self.stamp

@@ -1,10 +1,10 @@
-"""Which of the matched landmarks tell most about the camera's motion, where not all of them shall be measured.
+"""Selects the matched landmarks most informative of the camera's motion, if not all are to be measured.
 
-A measurement of landmark i brings ``A_iᵀ A_i`` to the information Λ of the camera's motion since the last frame, with
-``A_i = R_i^{-1/2} J_i``: J by the pose, R the noise of the pixels and of the landmark itself. All measurements cost the
-same, so those with the largest gain ``log det(I + A_i Λ⁻¹ A_iᵀ)`` are taken, a tenth of the number at a time: in each
-round the gains are those given the ones taken before. The greedy choice reaches at least 63 % of the largest possible
-sum of gains (Nemhauser, Wolsey and Fisher, 1978, for choices one by one).
+A measurement of landmark i adds ``A_iᵀ A_i`` to the information Λ of the camera's motion since the last frame, with
+``A_i = R_i^{-1/2} J_i``: J the Jacobian by the pose, R the noise of the pixels and of the landmark. All measurements
+cost the same, so those with the largest gain ``log det(I + A_i Λ⁻¹ A_iᵀ)`` are chosen greedily, a tenth of the number
+per round, with gains conditioned on the earlier rounds. Chosen one by one, they would reach at least 63 % of the
+largest possible total gain (Nemhauser, Wolsey and Fisher, 1978).
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.models import EstimatorModels
 
-_ROUNDS = 10  # cost: in which they are chosen: between one by one and all at once
+_ROUNDS = 10  # cost: rounds of the choice; more are closer to one by one
 
 
 def most_informative(
     rig: StereoRig, models: EstimatorModels, prediction: Prediction, ids: NDArray[np.int64], positions: Array,
     dt: float, most: int,
 ) -> NDArray[np.intp]:  # fmt: skip
-    """Rows of the `most` landmarks that tell most of the motion, ascending; all where there are no more.
+    """Rows of the `most` landmarks most informative of the motion, ascending; all if there are no more.
 
     Args:
         rig: the cameras.
         models: noise of the pixels and of the motion.
-        prediction: of the back end, for the landmarks' own uncertainty; those that it does not name count as exact.
+        prediction: of the back end, for the landmarks' uncertainty; landmarks not in it count as exact.
         ids: of the matched landmarks (K,).
-        positions: theirs (K, 3) in the world [m].
+        positions: of the landmarks (K, 3) in the world [m].
         dt: time since the last frame [s].
         most: how many to choose.
     """
@@ -58,7 +58,7 @@ def _own_variance(prediction: Prediction, ids: NDArray[np.int64], J: Array, moti
 
 
 def _greedy(A: Array, information: Array, most: int) -> NDArray[np.intp]:
-    """Rows of A (K, 3, 6) that add most to the logarithm of the determinant of the information (6, 6)."""
+    """Rows of A (K, 3, 6) that increase the log determinant of the information (6, 6) most."""
     free, chosen = np.ones(len(A), bool), np.zeros(len(A), bool)
     at_once = -(-most // _ROUNDS)
     while (missing := most - int(chosen.sum())) > 0:

@@ -1,4 +1,4 @@
-"""What looks wrong with the images, their times and the baseline, said once each with what to do."""
+"""Warnings about suspicious images, time stamps and baselines, each given once, with what to do."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from slam.tracking.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 
-#: guard: Times between frames that cameras have [s]: a thousand frames a second to one in ten seconds.
+#: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
 
-#: guard: Baselines that rigs have [m]; others are more often a length in another unit.
+#: guard: plausible baselines [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
 
-#: guard: How far a principal point may be from the middle of an image, in parts of its width or height. That of a
-#: calibration for images half or twice as large is off by a quarter or a half.
+#: guard: largest distance of a principal point from the middle of an image, as a share of its width or height. That
+#: of a calibration for images half or twice as large is off by a quarter or a half.
 _OFF_MIDDLE = 0.2
 
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
-_POOR = 5  # guard: frames in a row that must show too little before it is said
-_LAST_LOOK = 64  # guard: frame at which the pair is looked at for the last time
+_POOR = 5  # guard: successive frames that must show too little before a warning
+_LAST_LOOK = 64  # guard: last frame at which the stereo pair is checked
 _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 
 
 class InputWarnings:
-    """Looks at what the front end is given, and warns once of each thing that looks wrong.
+    """Checks the front end's input, and warns once of each thing that looks wrong.
 
     Args:
         rig: the cameras.
         models: the motion that is expected.
-        rows: how far from its row the front end looks for a feature's partner [px].
+        rows: largest row difference at which the front end matches left and right features [px].
 
     Attributes:
         lines: the warnings so far.
@@ -55,7 +55,7 @@ class InputWarnings:
             self._warn(unlikely)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
-        """Look at a frame and what the front end found in it; what is no frame is for others to refuse."""
+        """Check a frame and the features found in it; invalid frames are refused elsewhere."""
         try:
             features = usable(features, self._rig, None, -np.inf)
         except MeasurementError:
@@ -76,7 +76,7 @@ class InputWarnings:
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
-        """Stamps in another unit, and frames between which a camera moves anywhere."""
+        """Warn of stamps in another unit, and of frames too far apart in time to predict the motion between."""
         if not 0 < interval < float("inf"):
             return  # a step refuses them
         if not SHORTEST <= interval <= LONGEST:
@@ -90,7 +90,7 @@ class InputWarnings:
             )
 
     def _check_texture(self, features: int) -> None:
-        """Images that show nothing for several frames."""
+        """Warn if images show nothing for several frames."""
         self._poor = self._poor + 1 if features < ENOUGH_FEATURES else 0
         if self._poor >= _POOR:
             self._texture_is_known = True
@@ -100,7 +100,7 @@ class InputWarnings:
             )
 
     def _check_partners(self, features: int, stereo: int) -> None:
-        """Images of which hardly any feature is found in the other one, for several frames."""
+        """Warn if hardly any left feature has a right match, for several frames."""
         self._unpaired = self._unpaired + 1 if features >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
         if self._unpaired >= _POOR:
             self._partners_are_known = True
@@ -110,12 +110,12 @@ class InputWarnings:
             )
 
     def _check_pair(self, left: np.ndarray, right: np.ndarray) -> None:
-        """Cameras that look swapped, and rows that do not agree."""
+        """Warn if left and right image look swapped, or rows do not match."""
         if not (_is_image(left, self._rig) and _is_image(right, self._rig)):
-            return  # a front end refuses them, or takes what others do not
+            return  # the front end refuses such images, or has a format of its own
         try:
             found = pair_geometry(self._rig, _eight_bits(left), _eight_bits(right), self._rows)
-        except CalibrationError:  # no rectified rig is left: a front end may do without
+        except CalibrationError:  # the rig cannot be rectified: a front end may not need that
             self._pair_is_known = True
             return
         self._pair_is_known = found.conclusive
@@ -144,7 +144,7 @@ class InputWarnings:
 
 
 def baseline_doubt(rig: StereoRig) -> str:
-    """What is wrong with a baseline that no rig has; empty where it is likely."""
+    """What is wrong with an implausible baseline; empty if it is plausible."""
     if SHORTEST_BASELINE <= rig.baseline <= LONGEST_BASELINE:
         return ""
     return (
@@ -154,7 +154,7 @@ def baseline_doubt(rig: StereoRig) -> str:
 
 
 def size_doubt(rig: StereoRig) -> str:
-    """What is wrong with a principal point far from the middle of the images; empty where it is near."""
+    """What is wrong with a principal point far from the middle of the images; empty if it is near."""
     middle = np.array([rig.width, rig.height]) / 2
     for side, camera in (("left", rig.left), ("right", rig.right)):
         point = np.array([camera.u0, camera.v0])
@@ -168,9 +168,9 @@ def size_doubt(rig: StereoRig) -> str:
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:
-    """Time between frames [s] in which the expected turn moves a feature by half an image, one standard deviation.
+    """Time between frames [s] after which the prediction's rotation error (1σ) moves a feature by half an image.
 
-    The angular velocity changes by ``density · √Δt`` in Δt, and the turn by that times Δt.
+    The angular velocity changes by ``density · √Δt`` in Δt, and the rotation by that times Δt.
     """
     half_view = float(np.arctan(0.5 * rig.width / rig.left.fu))
     return float((half_view / models.motion.angular_acceleration) ** (2 / 3))
@@ -187,7 +187,7 @@ def _is_image(image: object, rig: StereoRig) -> bool:
 
 
 def _eight_bits(image: np.ndarray) -> np.ndarray:
-    """A grey image (H, W) uint8 of any image that a front end takes."""
+    """Any image that a front end takes, as grey (H, W) uint8."""
     import cv2
 
     if image.ndim == 3:

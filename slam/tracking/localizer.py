@@ -1,6 +1,6 @@
-"""Which landmarks are in this frame: search windows, agreement on one camera pose, and the whole map as a last resort.
+"""Matches landmarks with a frame: by search windows, agreement on one camera pose, and the whole map as a last resort.
 
-The same for every back end: it gives predictions and positions, and gets matches that agree with each other.
+The same for every back end, which supplies predictions and positions, and is given matches that agree with each other.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class LandmarkMatches:
     Attributes:
         ids: landmark ids (K,), ascending.
         rows: rows of their features (K,).
-        T_world_left: the pose (4, 4) on which they agree; None where there is none.
-        kidnapped: that pose cannot be reached by a motion that the prediction allows, but several frames agree on it:
-            the camera was moved while it saw nothing.
+        T_world_left: the pose (4, 4) on which they agree, if there is one.
+        kidnapped: the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was
+            moved while it saw nothing.
     """
 
     ids: IdArray
@@ -45,12 +45,12 @@ class LandmarkMatches:
         return len(self.ids)
 
     def without(self, ids: IdArray) -> LandmarkMatches:
-        """The same but for some landmarks."""
+        """A copy without some landmarks."""
         keep = ~np.isin(self.ids, ids)
         return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left)
 
     def landmark_of(self, features: int) -> IdArray:
-        """Id of the landmark that each of so many features was matched with (N,), −1 for none."""
+        """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
         ids = np.full(features, -1, np.int64)
         ids[self.rows] = self.ids
         return ids
@@ -66,7 +66,7 @@ class LandmarkMatches:
 
 
 class Localizer:
-    """Finds landmarks in frames, and says whether the pose that they give can be believed.
+    """Finds landmarks in frames, and decides whether the pose that they give is credible.
 
     Args:
         rig: the cameras.
@@ -93,11 +93,11 @@ class Localizer:
         seed: int,
         elsewhere: Callable[[], Array | None] = lambda: None,
     ) -> LandmarkMatches:
-        """`match`, but poses farther from the prediction than it allows are not believed before several frames agree.
+        """`match`, but a pose farther from the prediction than its uncertainty allows needs several frames that agree.
 
-        None match meanwhile; then the matches have no landmarks but the pose, and are marked as `kidnapped`. So it is
-        with a pose from the places of the atlas, which is asked for where nothing matches; but where the prediction
-        allows it and enough landmarks are found around it, it is believed at once.
+        Until then nothing counts as matched; in the last of these frames the matches have a pose, no landmarks, and the
+        mark `kidnapped`. If nothing matches, the atlas is asked for a pose, which is treated likewise, but is accepted
+        at once if the prediction allows it and enough landmarks match around it.
         """
         doubtful = state.unmatched > 0
         matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
@@ -118,7 +118,7 @@ class Localizer:
     def informative(
         self, prediction: Prediction, matches: LandmarkMatches, positions: Array, dt: float
     ) -> tuple[LandmarkMatches, IdArray]:
-        """The matches at `positions` (K, 3) that a back end shall get, and the ids of the others."""
+        """The matches at `positions` (K, 3) [m] to give to the back end, and the ids of the others."""
         most = self.config.measured
         if not most or len(matches) <= most or not np.isfinite(dt):
             return matches, matches.ids[:0]
@@ -134,11 +134,11 @@ class Localizer:
         matches: LandmarkMatches,
         report: UpdateReport,
     ) -> TrackingState:
-        """Whether the pose was measured; a lost camera must match more landmarks than a tracked one.
+        """The tracking state after a frame, by whether its pose was measured.
 
-        It was not where the back end uses less than half of the landmarks that agree with each other. A frame that
-        gives a pose as the one before did, and waits for a third one, counts as one with too few features: its place
-        is known.
+        It was not measured if the back end used less than half of the landmarks that agree with each other; a lost
+        camera must match more landmarks than a tracked one. A frame whose pose agrees with the last frame's, but
+        awaits a third one, does not count as showing an unknown place.
         """
         least = self.config.minimum_consistent if state.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
@@ -157,9 +157,9 @@ class Localizer:
     ) -> LandmarkMatches:
         """Landmarks whose features agree with one camera pose.
 
-        In windows around the predictions first. Where these are wide, or too few matches agree, the pose on which the
-        matches agree (from the windows, or from the whole map without windows) predicts anew, and small windows around
-        that find the rest.
+        First in windows around the predictions. If these are wide, or too few matches agree, a pose is computed by
+        consensus from the matches in windows or, without windows, against the whole map; the other landmarks are then
+        searched for in small windows around the pixels that this pose predicts.
 
         Args:
             prediction: of the back end.
@@ -167,7 +167,8 @@ class Localizer:
             positions: the landmarks' positions (N, 3) in world coordinates.
             features: of the frame.
             seed: of the random choice in the geometric check.
-            doubtful: nothing was matched in the last frame: a pose from the whole map must show more, see `wide_share`.
+            doubtful: nothing was matched in the last frame, so that a pose from the whole map needs more matches, see
+                `AssociationConfig.wide_share`.
         """
         if not len(landmarks) or not len(features):
             return LandmarkMatches.nothing()
@@ -201,7 +202,7 @@ class Localizer:
         features: StereoFeatures,
         seed: int,
     ) -> LandmarkMatches:
-        """Landmarks that agree on a pose near a known one (4, 4), looked for in small windows; nothing where few do."""
+        """Match landmarks in small windows around a known pose (4, 4); nothing if too few of them agree."""
         expected = self._expected(T_world_left, prediction, landmarks, positions)
         matches = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
         consensus = self._consensus(matches, positions, features, T_world_left, seed)
@@ -210,12 +211,12 @@ class Localizer:
         return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
 
     def similar_view(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
-        """Which landmarks (N,) at `positions` look from this pose (4, 4) as they did at first sight."""
+        """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as they were at first sight."""
         limits = self.config.view_angle, self.config.view_ratio
         return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
 
     def _looked_for(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
-        """Which landmarks (N,) are looked for in windows: those that look as they did, and those long away."""
+        """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
         alike = self.similar_view(T_world_left, landmarks, positions)
         return alike | landmarks.long_out_of_view(self.config.rematch_after)
 
@@ -240,7 +241,7 @@ class Localizer:
     def _expected(
         self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkRows, positions: Array
     ) -> Prediction:
-        """What would be seen from another pose, in small windows."""
+        """The prediction for another pose, with small windows."""
         left, right = self.rig.project(transform(inverse(T_world_left), positions))
         looked_for = self._looked_for(T_world_left, landmarks, positions)
         view = np.flatnonzero(self.rig.left.in_image(left) & looked_for)
@@ -264,7 +265,7 @@ class Localizer:
         features: StereoFeatures,
         seed: int,
     ) -> tuple[Matches, PoseConsensus]:
-        """Search once more in small windows around what the consensus pose predicts; the better of both comes back."""
+        """Search again in small windows around the consensus pose's predictions; returns the better matches of both."""
         matches_anew = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
         consensus_anew = self._consensus(matches_anew, positions, features, consensus.T_world_left, seed)
         if consensus_anew.inliers.sum() < consensus.inliers.sum():
@@ -281,7 +282,7 @@ def _select(prediction: Prediction, keep: BoolArray) -> Prediction:
 
 
 def jump(prediction: Prediction, T_world_left: Array) -> float:
-    """How far a pose (4, 4) lies from the predicted one, in standard deviations of the prediction."""
+    """Mahalanobis distance of a pose (4, 4) from the predicted one."""
     step = log(inverse(prediction.T_world_left) @ T_world_left)
     squared = step @ np.linalg.solve(prediction.covariance + LEAST_VARIANCE * np.eye(6), step)
     return float(np.sqrt(max(float(squared), 0.0)))

@@ -1,7 +1,7 @@
-"""Whether two images are a stereo pair of their rig: which camera is the left one, whether rows agree, and depth shows.
+"""Checks that two images are a stereo pair of their rig: not swapped, rows aligned, and disparities not all zero.
 
-The front end looks for a feature's partner in the same row and to the left alone, so it cannot tell. Here features are
-matched wherever they lie; those that agree with one another (a fundamental matrix, by RANSAC) are held against the rig.
+The front end cannot tell, as it looks for a feature's match in the same row and to the left only. Here features are
+matched anywhere in the image; those that agree on a fundamental matrix (RANSAC) are compared with the rig.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
-_FEATURES = 1000  # guard: of an image that are matched
+_FEATURES = 1000  # guard: features of an image that are matched
 _TOLERANCE = 2.0  # guard: [px] from an epipolar line: ORB places features to a pixel or two
 
-#: Disparities below this are none [px].
+#: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
 
 _SAMPLE = 8  # fixed: matches that any fundamental matrix can be made to fit
@@ -26,16 +26,16 @@ _SIGMAS = 5.0  # guard: a chance of 3e-7 to be wrong
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """How the features of two images lie to each other in the rectified rig.
+    """How the matches of two images fit the rectified rig.
 
     Attributes:
         matches: number of matches that agree with one another.
         conclusive: there are more than wrong matches would give by chance; else the other numbers are zero.
-        as_given: number of them in their rows, and farther right in the left image, as they must be.
-        as_swapped: the same if the left image is the right camera's, and the other way round.
-        without_disparity: number of them in their rows at the same place in both images.
-        off_rows: number of matches farther from their row than the front end looks.
-        row_offset: median distance of their rows [px].
+        as_given: number of matches in the same row and with positive disparity, as they must be.
+        as_swapped: likewise with left and right image exchanged.
+        without_disparity: number of matches in the same row without disparity.
+        off_rows: number of matches whose rows differ by more than the front end allows.
+        row_offset: median difference of their rows [px].
     """
 
     matches: int
@@ -58,18 +58,18 @@ class PairGeometry:
 
     @property
     def rows_differ(self) -> bool:
-        """Most matches lie outside of the rows where it is looked for."""
+        """The rows of most matches differ by more than the front end allows."""
         return self.conclusive and _most(self.off_rows, self.matches - self.off_rows)
 
 
 def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
-    """How two images lie to each other.
+    """How the matches of two images fit the rig.
 
     Args:
         rig: the cameras.
         left: grey image (H, W), uint8.
         right: the same of the right camera.
-        rows: how far from its row a partner is looked for [px].
+        rows: largest row difference that the front end allows [px].
     """
     import cv2
 
@@ -103,13 +103,13 @@ def _offsets(rig: StereoRig, uv_left: Array, uv_right: Array) -> tuple[Array, Ar
 
 
 def _by_chance(matches: int, rig: StereoRig) -> float:
-    """Most wrong matches that agree with some fundamental matrix: each lies in a strip around its epipolar line."""
+    """Largest plausible number of wrong matches that agree with a fundamental matrix by chance."""
     share = min(1.0, 2 * _TOLERANCE / min(rig.width, rig.height))
     return _SAMPLE + matches * share + _SIGMAS * float(np.sqrt(matches * share))
 
 
 def _most(some: int, others: int) -> bool:
-    """Whether there are more of some than of the others, beyond chance."""
+    """Whether there are significantly more of some than of the others."""
     return some - others > _SIGMAS * np.sqrt(some + others)
 
 

@@ -1,9 +1,8 @@
-"""Features that slide: the image around a landmark's first sight, aligned in this frame to sub-pixel accuracy.
+"""Corrects drifting features: aligns the image patch of a landmark's first sight with this frame, to sub-pixels.
 
-A detector finds a feature at another place of the surface as the view changes. The place is therefore corrected: what
-was seen there first, warped as a small surface that faces the camera would be, is aligned to what is seen now. It is
-taken anew, at the place to which it was aligned, where it is seen larger or smaller by a fifth; and where it fits no
-more.
+As the view changes, a detector finds a feature at another point of the surface. So the patch seen at first, warped as a
+small surface that faces the camera, is aligned with the present image, and the feature moved there. The patch is taken
+anew, at the aligned position, once its size has changed by a fifth or it no longer fits.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ from slam.landmarks import LandmarkRows
 from slam.tracking.answer_check import require_aligned, require_patches
 from slam.tracking.localizer import LandmarkMatches
 
-_LARGEST = 1.5  # factor by which a patch may have grown or shrunk at most: `Patches` hold no more
-_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew: a second change like it stays below the largest
-_FORGOTTEN = 10  # frames without a measurement after which a patch is given up
+_LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
+_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew, so that another such change stays below the largest
+_FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """What landmarks looked like where their patches were taken, a row each, ids ascending.
+    """Landmarks' image patches and the poses from which they were taken: one row per landmark, ids ascending.
 
     Attributes:
         ids: landmark ids (N,).
-        patches: the images around them.
-        poses: of the left camera in the world (N, 4, 4).
+        patches: the images around the landmarks.
+        poses: of the left camera in the world when they were taken (N, 4, 4).
     """
 
     ids: IdArray
@@ -54,14 +53,14 @@ class Anchors:
         return Anchors(self.ids[keep], self.patches.select(keep), self.poses[keep])
 
     def with_new(self, ids: IdArray, patches: Patches, T_world_left: Array) -> Anchors:
-        """These and new ones; a landmark's own are replaced."""
+        """These and new ones, which replace earlier ones of the same landmark."""
         old = self.select(~np.isin(self.ids, ids))
         ids = np.concatenate([old.ids, ids])
         poses = np.concatenate([old.poses, np.tile(T_world_left, (len(patches), 1, 1))])
         return Anchors(ids, old.patches.joined(patches), poses).select(np.argsort(ids, kind="stable"))
 
     def known(self, landmarks: LandmarkRows) -> Anchors:
-        """Those of landmarks that are in the map and were measured lately."""
+        """Those of landmarks that are in the map and were measured recently."""
         rows = np.minimum(landmarks.rows(self.ids), max(len(landmarks) - 1, 0))
         if not len(landmarks):
             return Anchors.none()
@@ -74,8 +73,8 @@ class Aligned:
     """A frame whose features were aligned.
 
     Attributes:
-        features: the same, as measured; those of landmarks whose patch was found have moved there.
-        anchors: those that hold.
+        features: as measured, but those of landmarks whose patch was found have been moved there.
+        anchors: those still valid.
     """
 
     features: StereoFeatures
@@ -83,11 +82,11 @@ class Aligned:
 
 
 class Aligner:
-    """Moves features of landmarks to where the landmarks were seen first, where the front end can do that.
+    """Moves landmarks' features to the surface points first seen, if the front end can align patches.
 
     Args:
         rig: the cameras.
-        enabled: see `slam.tracking.association.AssociationConfig.align`; else features stay.
+        enabled: see `slam.tracking.association.AssociationConfig.align`; if False, features are left unchanged.
     """
 
     def __init__(self, rig: StereoRig, enabled: bool) -> None:
@@ -103,18 +102,18 @@ class Aligner:
         landmarks: LandmarkRows,
         positions: Callable[[IdArray], Array],
     ) -> Aligned:
-        """Move the features of landmarks to where the landmarks' patches are; without a patch they stay.
+        """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
 
         Args:
-            frontend: that the features are from.
+            frontend: which made the features.
             anchors: of the landmarks.
             features: of the frame, as measured.
-            matches: landmarks that were found, and the pose on which they agree; without one nothing is aligned.
+            matches: landmarks that were found, and the pose on which they agree; without a pose nothing is aligned.
             landmarks: the map.
-            positions: gives the positions (M, 3) in the world of landmarks by their ids (M,).
+            positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
 
         Raises:
-            SlamError: the front end gives something else than pixels.
+            SlamError: the front end does not return pixels.
         """
         if not self._enabled or not isinstance(frontend, AligningFrontend):
             return Aligned(features, Anchors.none())
@@ -150,17 +149,17 @@ class Aligner:
         added: LandmarkMatches,
         T_world_left: Array,
     ) -> Anchors:
-        """The anchors that hold after a frame, with new ones for its landmarks that have none.
+        """The anchors valid after a frame, with new ones for its landmarks that have none.
 
         Args:
-            frontend: that the features are from.
+            frontend: which made the features.
             aligned: the frame.
-            matches: landmarks that were found in it.
-            added: those that are new.
-            T_world_left: its pose (4, 4).
+            matches: landmarks found in the frame.
+            added: new landmarks.
+            T_world_left: the frame's pose (4, 4).
 
         Raises:
-            SlamError: the front end gives no patches, or not one for each.
+            SlamError: the front end returns no patches, or not one for each landmark.
         """
         anchors, features = aligned.anchors, aligned.features
         if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
@@ -176,7 +175,7 @@ class Aligner:
 
 
 def warps_of(rectified: RectifiedRig, poses: Array, T_world_left: Array, positions: Array) -> Array:
-    """Matrices (N, 2, 2) from pixel offsets now to those in the image of an earlier pose (N, 4, 4), for points (N, 3).
+    """Matrices (N, 2, 2) from present pixel offsets to those seen from earlier poses (N, 4, 4), at points (N, 3) [m].
 
     The surface around a point is taken to face the camera.
     """

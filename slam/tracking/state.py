@@ -1,22 +1,22 @@
-"""Whether the camera's pose is known: tracked, predicted, lost, or in a place that the map does not show."""
+"""Whether the camera is tracked, predicted, lost, or in a place that is not in the map."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Stereo features with which the camera would be localised in a known place.
+#: Number of stereo features with which the camera would be localised in a mapped place.
 ENOUGH_FEATURES = 20
 
 
 @dataclass(frozen=True)
 class TrackingState:
-    """How localization has gone of late.
+    """How localization has gone recently.
 
     Attributes:
         unmatched: frames since the pose was last measured.
-        unknown: how many of these showed enough features to be localised in a known place.
-        lost: for so long, and the prediction is so uncertain, that the camera's pose is not known.
-        showed_enough: the last frame showed enough features to be localised in a known place.
+        unknown: how many of these had enough features to be localised in a mapped place.
+        lost: the pose has not been measured for so long, and the prediction is so uncertain, that it is not known.
+        showed_enough: the last frame had enough features to be localised in a mapped place.
     """
 
     unmatched: int = 0
@@ -29,7 +29,7 @@ class TrackingState:
 
         Args:
             measured: the pose was measured.
-            uncertain: the prediction does not tell where in the image landmarks are.
+            uncertain: the prediction is too uncertain to say where in the image landmarks are.
             stereo_features: number of features with depth in the frame.
             lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
         """
@@ -41,9 +41,9 @@ class TrackingState:
         return TrackingState(unmatched, self.unknown + enough, lost, enough)
 
     def in_unknown_place(self, restart_after: int) -> bool:
-        """Whether the camera has just shown `restart_after` frames of a place that the map does not know."""
+        """Whether the camera has just seen `restart_after` frames of a place that is not in the map."""
         return self.showed_enough and self.unknown % restart_after == 0
 
     def may_add(self, restart_after: int) -> bool:
-        """Whether new landmarks may join the map: not while the pose is unknown, unless the place is so, too."""
+        """Whether new landmarks may join the map: not while the pose is unknown, unless the place is not in the map."""
         return not self.unmatched or self.in_unknown_place(restart_after)

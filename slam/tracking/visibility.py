@@ -1,4 +1,4 @@
-"""Which landmarks a frame should have shown, and which lie behind something (paper A, IV: the angle of view)."""
+"""Which landmarks a frame should show, and which are hidden (paper A, IV: the angle of view)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class MapView:
         T_world_left: the pose (4, 4).
         positions: of the landmarks (N, 3) in world coordinates [m].
         local: the same in left-camera coordinates (N, 3).
-        uv_left: their left pixels (N, 2), NaN behind the camera.
-        in_image: which of them lie in front of the camera and inside the left image (N,).
+        uv_left: the landmarks' left pixels (N, 2), NaN behind the camera.
+        in_image: which landmarks are in front of the camera and inside the left image (N,).
         points: the features in left-camera coordinates (F, 3), NaN without depth.
         depth_sigma: standard deviations of the features' depths (F,) [m].
     """
@@ -51,14 +51,14 @@ class MapView:
 
 
 def similar_view(positions: Array, seen_from: Array, camera: Array, angle: float, ratio: float) -> BoolArray:
-    """Which landmarks (N,) look from `camera` (3,) as they did when they were first seen.
+    """Which landmarks (N,) are seen from `camera` (3,) in a view similar to that of their first sight.
 
-    What a descriptor describes slides over the surface, and then changes, as it is seen from elsewhere.
+    From another viewpoint, the point that a descriptor describes shifts over the surface, and then changes.
 
     Args:
         positions: of the landmarks (N, 3) [m].
-        seen_from: where the camera was then (N, 3); NaN for unknown: then nothing is ruled out.
-        camera: where it is now, in the same world.
+        seen_from: the camera's position at first sight (N, 3) [m]; NaN if unknown, and then nothing is ruled out.
+        camera: the camera's present position, in the same world.
         angle: largest angle between both lines of sight [degrees].
         ratio: largest ratio of both distances.
     """
@@ -77,7 +77,7 @@ def expected_landmarks(
         view: the map from the pose after the update.
         features: of the frame.
         size: width and height of the image [px].
-        margin: distance from the border [px] within which nothing is sure to be detected.
+        margin: distance from the border [px] within which detection is not certain.
         radius: see `hidden_landmarks`.
     """
     with np.errstate(invalid="ignore"):
@@ -89,9 +89,9 @@ def expected_landmarks(
 
 
 def hidden_landmarks(view: MapView, rows: NDArray[np.intp], features: StereoFeatures, radius: float) -> BoolArray:
-    """Which landmarks of `rows` (M,) lie behind what is measured around them.
+    """Which landmarks of `rows` (M,) are hidden behind a nearer surface.
 
-    A landmark counts as hidden where most of the features within `radius` [px] are clearly nearer than it is.
+    A landmark counts as hidden if most of the features within `radius` [px] are clearly nearer than it is.
     """
     stereo = np.flatnonzero(np.isfinite(view.depth_sigma))
     if not len(rows) or not len(stereo) or radius <= 0:

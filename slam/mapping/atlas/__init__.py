@@ -1,6 +1,7 @@
-"""Places that the camera has left: keyframes, how they are recognised, and the pose graph that a return corrects.
+"""Keyframes of places that the camera has left, place recognition, and the pose graph that loops correct.
 
-The layer above the back end, the same for every back end: a back end estimates the camera and the landmarks around it,
-the atlas holds what lies behind. `keyframes` says what is kept, `places` which keyframe shows the same place, `loops`
-whether that is so, `pose_graph` where all keyframes then are; `atlas` puts them together.
+A layer above the back end, the same for every back end: the back end estimates the camera and the landmarks around it,
+the atlas keeps the rest. `keyframes` holds a place's features, `places` proposes keyframes of the same place,
+`verification` tests them by geometry, `loop_closer` decides on loops, `pose_graph` computes the keyframes' poses, and
+`atlas` puts them together.
 """

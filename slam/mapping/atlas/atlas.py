@@ -1,8 +1,8 @@
-"""The atlas: keyframes and loops of a run, and where the map stands to the frame that the back end estimates in.
+"""The atlas: keyframes and loops of a run, and the pose of the back end's frame in the map.
 
-The back end goes on in its own frame, *odom*, which drifts but never jumps. A loop moves the keyframes; the pose of
-odom in the map, ``T_map_odom``, is then such that the newest keyframe is where the pose graph has it. All poses that
-the system reports are in the map.
+The back end keeps estimating in its own frame, *odom*, which drifts but never jumps. A loop moves the keyframes in the
+map; ``T_map_odom``, the pose of odom in the map, then takes the newest keyframe to its pose in the pose graph. All
+poses that the system reports are in the map.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ from slam.rig_error import CommonError
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import Solution
 
-_UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an angle of which nothing is known [rad]
+_UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """How well a pose is known in the map, from which later ones follow.
+    """A pose with its uncertainty in the map, from which those of later poses are propagated.
 
-    That of the last keyframe when a loop was closed last; or the one at which another back end has begun anew since.
+    It is the newest keyframe's at the last loop closure, or that at which a new back end has begun since.
 
     Attributes:
-        T_odom_left: the pose (4, 4), as the back end had it then.
-        noise: its covariance (6, 6) in the back end, by noise alone.
-        covariance: in the map: of the pose, perturbing on the right, and of the common errors (6 + n, 6 + n).
-        common: the common errors (n,), where their variance was one.
-        rig: what they stand for, and what they do to the pose, see `slam.rig_error.CommonError`.
+        T_odom_left: the pose (4, 4), as the back end estimated it then.
+        noise: its covariance (6, 6) in the back end, without the common errors.
+        covariance: in the map: joint covariance (6 + n, 6 + n) of the pose, perturbing on the right, and of the common
+            errors.
+        common: estimate of the common errors (n,), in units of their prior standard deviations.
+        rig: what the common errors stand for and how they move the pose, see `slam.rig_error.CommonError`.
     """
 
     T_odom_left: Array
@@ -51,13 +52,13 @@ class Anchor:
     rig: CommonError
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
-        """The common errors (n,) and their covariance (n, n); where they are others by now, as before any loop."""
+        """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
         if rig.scale.shape != self.rig.scale.shape:
             return np.zeros(rig.scale.shape[1]), np.eye(rig.scale.shape[1])
         return self.common_as(rig), self.covariance[6:, 6:]
 
     def common_as(self, rig: CommonError) -> Array:
-        """The common errors (n,), where they stand for what they do now: the rig's posterior changes meanwhile."""
+        """The common errors (n,) in units of `rig`, as the rig's posterior has changed since; zero if others by now."""
         if rig.scale.shape != self.rig.scale.shape:
             return np.zeros(rig.scale.shape[1])
         return np.asarray(np.linalg.lstsq(rig.scale, self.rig.scale @ self.common, rcond=None)[0])
@@ -65,11 +66,11 @@ class Anchor:
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
 
-        Its path goes on with the common errors uncorrected: what they were found to be counts as an error too.
+        The path since the anchor is not corrected by the common errors, so their estimate counts as an error too.
 
         Args:
-            back: adjoint (6, 6) of the keyframe's pose seen from the later one.
-            shares: derivative (6, m) of the motion since by the common errors.
+            back: adjoint (6, 6) of the anchor's pose in the later one's coordinates.
+            shares: derivative (6, m) of the motion since by the rig's errors.
         """
         J = np.concatenate([back, shares @ self.rig.scale], axis=1)
         found = shares @ self.rig.scale @ self.common
@@ -78,14 +79,14 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Gap:
-    """A time in which the camera was moved unseen, after which another back end has taken over.
+    """A time in which the camera moved without being tracked, and after which a new back end took over.
 
     Attributes:
         since: time of the last measured pose before it [s].
         until: time of the first pose after it [s].
-        covariance: of that pose (6, 6), perturbing on the right, see `moved_unseen`; None where the camera was found
-            elsewhere, so that nothing is known of how it came there.
-        anchor: that pose, where a map of its own begins with it that no loop has tied to the rest so far.
+        covariance: of that pose (6, 6), perturbing on the right, see `moved_unseen`; None if the camera was found
+            elsewhere, so that nothing is known of its motion.
+        anchor: the first pose after it, if a new map begins there that no loop has tied to the rest so far.
     """
 
     since: float
@@ -96,25 +97,25 @@ class Gap:
 
 @dataclass(frozen=True)
 class Atlas:
-    """What a run keeps of the places that it has been to.
+    """What a run keeps of the places that it has visited.
 
     Attributes:
         keyframes: in order of time.
-        rows: their poses and what else the pose graph needs of them.
-        index: which of them look alike.
-        loops: those that the pose graph holds.
-        spare: verified loops that it does not hold: refused, unconfirmed, or such that tell nothing new; the last ones.
-        dropped: number of loops of this run that it holds no more, to save time.
-        refused: loops that contradict the path, as the numbers of both keyframes.
-        corrected: poses T_map_left (C, 4, 4) of the first keyframes, as the last loop put them.
-        solved: how well the last of these is known; None without a loop.
-        anchor: from which the present pose follows: that one, or where a map of its own has begun since.
+        rows: their poses and whatever else the pose graph needs of them.
+        index: of their appearance, for place recognition.
+        loops: those in the pose graph.
+        spare: the latest verified loops outside the pose graph: refused, unconfirmed, or with no new information.
+        dropped: number of this run's loops taken out of the pose graph to save time.
+        refused: loops that contradict the path, as pairs of keyframe numbers.
+        corrected: poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure.
+        solved: the anchor at the last of these; None without a loop.
+        anchor: from which the present pose's covariance is propagated: `solved`, or where a new map has begun since.
         T_map_odom: pose (4, 4) of the back end's frame in the map.
-        pending: the last loop that was seen, whether the pose graph holds it or not.
-        confirmed: whether a keyframe just before it had seen the same return.
+        pending: the last loop that passed the gate, whether in the pose graph or not.
+        confirmed: whether another keyframe shortly before agreed with `pending`.
         gaps: one before each back end but the first.
-        restarts: how many of these were before the last keyframe.
-        known: number of keyframes that are from an earlier run: the first ones, in the map that this run started in.
+        restarts: number of gaps before the last keyframe.
+        known: number of keyframes of the prior map that this run started in; they come first.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
@@ -142,9 +143,9 @@ class Atlas:
         """The places of a saved map.
 
         Args:
-            keyframes: their poses are in the frame of the back end that saw them.
-            poses: theirs in the map (K, 4, 4).
-            loops: that led to these.
+            keyframes: with poses in the frame of the back end that estimated them.
+            poses: of the keyframes in the map (K, 4, 4).
+            loops: that gave these poses.
         """
         atlas = cls()
         for keyframe in keyframes:
@@ -152,7 +153,7 @@ class Atlas:
         return replace(atlas, loops=tuple(loops), corrected=poses, known=len(atlas))
 
     def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
-        """With one more keyframe, of descriptors (F, D)."""
+        """A copy with one more keyframe, which has descriptors (F, D)."""
         rows, index = self.rows.with_new(keyframe), self.index.with_new(descriptors)
         return replace(self, keyframes=(*self.keyframes, keyframe), rows=rows, index=index)
 
@@ -161,16 +162,16 @@ class Atlas:
         return self._in_map(self.rows.poses)
 
     def summary(self) -> dict[str, int]:
-        """Numbers of keyframes, of loops closed in this run, and of loops refused as they contradict the path.
+        """Numbers of keyframes, of loops closed in this run, and of loops refused because they contradict the path.
 
-        In a prior map, its keyframes are counted too, and apart as ``known``.
+        Keyframes of a prior map are included, and also counted separately as ``known``.
         """
         closed = sum(loop.second >= self.known for loop in self.loops)
         known = {"known": self.known} if self.known else {}
         return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
 
     def with_loop(self, loop: Loop, most: int) -> Atlas:
-        """With one loop more; of more than `most`, those are dropped whose neighbours on the path are nearest."""
+        """A copy with one more loop; beyond `most`, the loop whose neighbours on the path are closest is dropped."""
         loops, dropped = (*self.loops, loop), self.dropped
         while len(loops) > most:
             at = np.array([self.keyframes[k.second].travelled for k in loops])
@@ -180,13 +181,13 @@ class Atlas:
         return replace(self, loops=loops, dropped=dropped)
 
     def with_spare(self, loop: Loop, most: int) -> Atlas:
-        """With one loop more that the pose graph does not hold; the last `most` are kept."""
+        """A copy with one more loop outside the pose graph; the last `most` are kept."""
         return replace(self, spare=(*self.spare, loop)[-most:])
 
     def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop], most: int) -> Atlas:
-        """With other loops in the pose graph; those that it held, and that are not `believed` any more, are refused.
+        """A copy with other loops in the pose graph; previous ones that are not `believed` any more become refused.
 
-        The numbers of loops dropped before stay. Both are in order of their second keyframes.
+        `dropped` keeps counting. `held` and `believed` are in order of their second keyframes.
         """
         good, kept = {x.pair for x in believed}, {x.pair for x in held}
         out = [x for x in self.loops if x.pair not in kept]
@@ -199,7 +200,7 @@ class Atlas:
         return replace(atlas, pending=held[-1], confirmed=True)
 
     def solved_by(self, solution: Solution, rig: CommonError) -> Atlas:
-        """With the keyframes where the pose graph has them; `rig` says what its common errors stand for."""
+        """A copy with the keyframes' poses by the pose graph; `rig` says what its common errors stand for."""
         last = self.keyframes[-1]
         shared = replace(rig, shares=last.shares)
         anchor = Anchor(last.T_odom_left, last.covariance, solution.covariance, solution.common, shared)
@@ -213,11 +214,11 @@ class Atlas:
         )
 
     def found_again(self, gap: Gap, place: float | None) -> Atlas:
-        """With a gap after which the camera was found in the map.
+        """A copy with a gap after which the camera was found in the map.
 
         Args:
             gap: which has just ended.
-            place: time of the keyframe in whose place it was found [s]; None where it was by landmarks it has.
+            place: time of the keyframe by which it was found [s]; None if it was found by the back end's landmarks.
         """
         anchor = self.anchor
         if place is not None:
@@ -228,14 +229,14 @@ class Atlas:
     def begun_anew(
         self, since: float, before: Estimate, after: Estimate, common: CommonError, models: EstimatorModels
     ) -> Atlas:
-        """With another back end from here on, which takes the pose of the last one for exact: the map does not.
+        """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
 
         Args:
             since: time of the last measured pose [s].
-            before: the last estimate of the earlier one, with the rig's uncertainty.
-            after: the first one of the other, at the same pose.
-            common: what the pose's error has in common with those of other frames.
-            models: say how fast a camera moves.
+            before: the earlier back end's last estimate, with the rig's uncertainty.
+            after: the new back end's first estimate, at the same pose.
+            common: the part of the pose's error that other frames share.
+            models: motion model, with the speeds of a camera of this kind.
         """
         n = common.scale.shape[1]
         error, known = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
@@ -244,40 +245,40 @@ class Atlas:
         return replace(self, gaps=(*self.gaps, Gap(since, after.stamp, P, anchor)), anchor=anchor)
 
     def closed_in(self, frame: int) -> int | None:
-        """Index of the frame whose place `frame` showed again, where it closed a loop."""
+        """Index of the earlier frame with which `frame` closed a loop; None if it closed none."""
         if not self.loops or self.keyframes[self.loops[-1].second].frame != frame:
             return None
         return self.keyframes[self.loops[-1].first].frame
 
     def refused_in(self, frame: int) -> int | None:
-        """Index of the frame whose place `frame` seemed to show again, where that was refused."""
+        """Index of the earlier frame with which `frame` formed a loop that was refused; None if there was none."""
         if not self.refused or self.keyframes[self.refused[-1][1]].frame != frame:
             return None
         return self.keyframes[self.refused[-1][0]].frame
 
     def chain(self, rig: CommonError, path: Trajectory | None = None) -> Chain:
-        """The keyframes' path in odom: as it was estimated at the time, or as `path` has it now.
+        """The keyframes' path in odom: as estimated at the time, or as revised in `path`.
 
         Args:
-            rig: what common errors stand for now.
-            path: the path so far.
+            rig: what the common errors stand for now.
+            path: the present estimate of the whole path; None for the poses as they were estimated at the time.
         """
         poses, count, m = self.rows.poses.copy(), len(self), len(rig.scale)
         if path is not None:
             poses[self.known :] = path.poses[np.searchsorted(path.stamps, self.rows.stamps[self.known :])]
         shares = self.rows.shares
-        if shares.shape[2] != m:  # all are of a prior map that was made without them
+        if shares.shape[2] != m:  # all keyframes are from a prior map that was made without common errors
             shares = np.zeros((count, 6, m))
         common = (shares.reshape(6 * count, m) @ rig.scale).reshape(count, 6, rig.scale.shape[1])
         common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
         return Chain(poses, self.rows.steps, common)
 
     def in_map(self, chain: Chain) -> Array:
-        """Poses T_map_left (K, 4, 4) of all keyframes, those since the last loop by `T_map_odom`."""
+        """Poses T_map_left (K, 4, 4) of all keyframes; those since the last loop are computed by `T_map_odom`."""
         return self._in_map(chain.poses)
 
     def _in_map(self, poses: Array) -> Array:
-        """Poses (K, 4, 4) of all keyframes in odom, taken to the map."""
+        """All keyframes' poses (K, 4, 4) in odom, transformed to the map."""
         return np.concatenate([self.corrected, self.T_map_odom @ poses[len(self.corrected) :]])
 
     def pose_in_map(self, number: int) -> Array:
@@ -287,12 +288,12 @@ class Atlas:
         return self.T_map_odom @ self.keyframes[number].T_odom_left
 
     def estimate(self, estimate: Estimate, common: CommonError, gaps: bool = True) -> Estimate:
-        """An estimate in odom, taken to the map; after a loop or a restart it is as certain as its anchor says.
+        """An estimate in odom, transformed to the map; its covariance is propagated from the anchor, if there is one.
 
         Args:
-            estimate: with covariances by noise and by the common error.
-            common: what the pose's error has in common with those of other frames.
-            gaps: whether landmarks are also as uncertain as where their map begins, which is the same for all of them.
+            estimate: with covariances by noise and by the common errors.
+            common: the part of the pose's error that other frames share.
+            gaps: whether landmarks also get the uncertainty of the pose at which their map begins, which all share.
         """
         if self.anchor is None:
             return estimate
@@ -310,7 +311,7 @@ class Atlas:
         )
 
     def path(self, path: Trajectory) -> Trajectory:
-        """A path in odom, taken to the map; what loops move two keyframes by is shared out evenly in time between."""
+        """A path in odom, transformed to the map; between keyframes the loops' corrections are interpolated in time."""
         if self.solved is None or not len(path):
             return path
         from slam.mapping.atlas.pose_graph import solve
@@ -321,22 +322,23 @@ class Atlas:
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :], self._unseen_time))
 
     def _unseen_time(self, stamps: Array) -> Array:
-        """Time (N,) [s] before `stamps` in which back ends had been moved unseen."""
+        """Total duration (N,) [s] of gaps before each of `stamps` (N,) [s]."""
         times = np.array([(gap.since, gap.until) for gap in self.gaps]).reshape(-1, 2)
         lasted = np.clip(stamps[:, None], times[:, 0], times[:, 1]) - times[:, 0]
         return np.asarray(lasted.sum(axis=1))
 
 
 def moved_unseen(covariance: Array, duration: float, models: EstimatorModels) -> Array:
-    """Covariance (6, 6) of a predicted pose after a gap, in which a camera may have moved as cameras of its kind do.
+    """Covariance (6, 6) of a predicted pose after a gap, in which the camera may have moved at any usual velocity.
 
-    The prediction takes changes of velocity for noise. Over a gap, a bend or a stop is none: the velocity after it is
-    that of a camera of which nothing is known. Nor can a direction or a place be more uncertain than unknown ones.
+    The motion model takes changes of velocity for white noise, which bends and stops in a long gap are not. So the
+    motion model's initial velocity uncertainty acts throughout the gap as well, up to a wholly unknown direction and
+    position.
 
     Args:
         covariance: by the motion model (6, 6).
         duration: of the gap [s].
-        models: velocities of a camera of this kind.
+        models: motion model, with the speeds of a camera of this kind.
     """
     speeds = np.array([models.initial_angular_velocity_sigma, models.initial_velocity_sigma])
     most = np.array([_UNKNOWN_DIRECTION, ANYWHERE])
@@ -347,11 +349,11 @@ def moved_unseen(covariance: Array, duration: float, models: EstimatorModels) ->
 
 
 def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = False) -> Array:
-    """Covariances (N, 3, 3) of landmarks after the camera's pose, from which they are seen, has got another one (6, 6).
+    """Covariances (N, 3, 3) of landmarks when the camera pose they are seen from has another covariance (6, 6).
 
-    What a landmark's covariance has more than the pose's at its place is its own, and stays. A landmark that was surer
-    in the estimate keeps its covariance: its place does not depend on where the camera is now. Not so where they
-    `may_grow`: in a back end that was begun anew, all landmarks are as uncertain as where it was begun.
+    The pose's part of each landmark's covariance is exchanged for the new one; the rest, the landmark's own, stays. A
+    landmark whose covariance would grow keeps its old one, as its position does not depend on the present pose. With
+    `may_grow` it grows: in a new back end, all landmarks share the uncertainty of the pose at which it began.
     """
     T, P = estimate.T_world_left, estimate.covariances
     J = T[:3, :3] @ points_by_pose(transform(inverse(T), estimate.positions))
@@ -362,10 +364,10 @@ def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = Fa
 
 
 def _between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_time: Callable[[Array], Array]) -> Array:
-    """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,), are moved to other poses (K, 4, 4).
+    """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,) [s], are moved to other poses (K, 4, 4).
 
-    Between two keyframes the change is shared out evenly in time; where the camera was moved unseen between them, over
-    that time alone, which `unseen_time` gives.
+    Between two keyframes the change is interpolated in time; if there was a gap between them, see `Gap`, all of it is
+    put into the gap, of which `unseen_time` gives the duration.
     """
     rows = np.searchsorted(path.stamps, stamps)
     odom = path.poses[rows]

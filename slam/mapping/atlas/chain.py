@@ -1,7 +1,7 @@
-"""The path of the keyframes, step by step with covariances, and how a change of its ends moves what lies between.
+"""The keyframes' path as relative motions with covariances, and how moving its ends moves the poses between.
 
-A step is uncertain in two ways: by noise of its own, and by what all steps share, the rig's error. The latter adds up
-along the path, where noise averages out, so the two are kept apart: with T the estimated motion,
+Each motion has two errors: noise of its own, and the rig's error, which all motions share. Along the path the shared
+error adds up, while noise averages out, so the two are kept apart: with T the estimated motion,
 
     T_true = T exp(noise + C c),
 
@@ -25,9 +25,10 @@ class Chain:
 
     Attributes:
         poses: T_odom_left (K, 4, 4).
-        steps: covariance (K, 6, 6) of the motion from the keyframe before by noise, perturbing on the right; the first
+        steps: covariance (K, 6, 6) by noise of the motion from the keyframe before, perturbing on the right; the first
             has no meaning.
-        common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; none by default.
+        common: derivative (K, 6, m) of the same motion by the common errors, which have unit variance; m is 0 by
+            default.
     """
 
     poses: Array
@@ -39,10 +40,10 @@ class Chain:
             object.__setattr__(self, "common", np.zeros((len(self.poses), 6, 0)))
 
     def propagated(self, ends: NDArray[np.intp]) -> Propagated:
-        """Error that each stretch has propagated to its keyframes, perturbing the pose at which it ends.
+        """Error accumulated from the begin of its stretch to each keyframe, perturbing the pose at the stretch's end.
 
         Args:
-            ends: the keyframes that bound stretches, ascending, the first and the last one among them.
+            ends: the keyframes that bound the stretches, ascending, including the first and the last one.
         """
         number = np.arange(len(self.poses))
         end = ends[np.searchsorted(ends, number)]
@@ -71,7 +72,7 @@ class Chain:
 
 
 class Propagated(NamedTuple):
-    """What each keyframe's stretch has propagated to it.
+    """Error accumulated from the begin of its stretch to each keyframe.
 
     Attributes:
         noise: covariance (K, 6, 6).
@@ -83,9 +84,9 @@ class Propagated(NamedTuple):
 
 
 def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: Array, common: Array) -> Array:
-    """Poses (K, 4, 4) of all keyframes, from those of some: each stretch's change is shared out.
+    """Poses (K, 4, 4) of all keyframes, from those that bound stretches: each stretch's change is distributed.
 
-    What the common errors say of each step goes to that step, the rest in proportion to the noise.
+    Each motion gets its part by the common errors; the rest is distributed in proportion to the noise.
 
     Args:
         chain: the path.
@@ -114,9 +115,9 @@ def shared_out(begin: Array, motion: Array, rest: Array, change: Array) -> Array
 
     Args:
         begin: the moved poses (N, 4, 4) at which their stretches begin.
-        motion: from there to the poses (N, 4, 4), as it was estimated.
-        rest: from the poses to where their stretches end (N, 4, 4).
-        change: of the motions (N, 6), perturbing on the right the poses at which the stretches end.
+        motion: estimated motion from there to the poses (N, 4, 4).
+        rest: estimated motion from the poses to the ends of their stretches (N, 4, 4).
+        change: of the motions (N, 6), perturbing the poses at the stretches' ends on the right.
     """
     return np.asarray(begin @ motion @ exp((adjoints(rest) @ change[:, :, None])[:, :, 0]))
 

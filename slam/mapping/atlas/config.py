@@ -21,24 +21,25 @@ class AtlasConfig:
     """Settings of keyframes and of loops.
 
     Attributes:
-        enabled: keep keyframes, and close loops where one of them is seen again.
-        keyframe_share: a frame becomes a keyframe where less than this share of what the last keyframe saw is in view.
-        keyframe_distance: or where the camera has gone this share of the median depth of what that one saw.
+        enabled: keep keyframes, and close loops when one of them is seen again.
+        keyframe_share: a frame becomes a keyframe if less than this share of the last keyframe's features is in view.
+        keyframe_distance: or if the camera has moved by this share of the median depth of those features.
         features: most features that a keyframe keeps.
         return_depths: a place counts as left once the camera has gone this many times the median depth of what it saw.
-        view_depths: a place is seen again from no farther than this many times that depth.
-        drift: share of its length by which a path may be wrong, besides what its covariance says: places farther off
-            are not compared.
+        view_depths: a place is seen again only from within this many times that depth.
+        drift: drift of the path as a share of its length, besides its covariance; places farther off than that are not
+            compared.
         candidates: number of keyframes that are compared in detail with a new one.
-        inliers: features that must agree on a pose for two keyframes to show the same place.
-        spread: least standard deviation of their pixels, in the direction in which they are spread most, as a share of
-            the image's width.
-        agreeing: keyframes that must see the same return, at once or within three, before it is believed: 1 or 2.
-        gate_sigmas: a return is refused where it contradicts the path by more than this many standard deviations.
-        most_loops: loops that the pose graph holds at most, as each makes the next one dearer; of more, those stay that
-            are spread evenly along the path.
-        give_back: landmarks of a place seen again return to the back end, where it can place landmarks.
-        on_disk: features of keyframes are kept in a temporary file; some 6 kB of a keyframe stay in memory.
+        inliers: number of features that must agree on a pose for two keyframes to show the same place.
+        spread: least standard deviation of their pixels, along the direction of largest spread, as a share of the
+            image's width.
+        agreeing: number of keyframes, 1 or 2, that must see the same loop before it is closed; the second at most three
+            keyframes after the first.
+        gate_sigmas: a loop is refused if it contradicts the path by more than this many standard deviations.
+        most_loops: largest number of loops in the pose graph, as each makes the next one slower; beyond it, those
+            spread most evenly along the path are kept.
+        give_back: landmarks of a revisited place return to the back end, if it can place landmarks.
+        on_disk: keep the keyframes' features in a temporary file; some 6 kB of each keyframe stay in memory.
     """
 
     enabled: bool = True

@@ -1,4 +1,4 @@
-"""Which loops are believed where some contradict others: those of the largest set that agrees with the path."""
+"""Which of several contradictory loops are kept: the largest set that agrees with the path."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from slam.mapping.atlas.pose_graph import PoseGraph
 
 
 def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limit: float) -> list[Loop]:
-    """The loops that agree with the path, with one of them and with each other, by their second keyframes; maybe none.
+    """Loops that agree with the path, with the seed and with each other, in order of their second keyframes.
 
-    The set grows from the seed: loops nearest to it on the path are tried first, then twice as many as the set was
-    asked before. What joins sharpens the path's covariance, against which the next ones are tested.
+    The set grows from the seed: the loops nearest to it on the path are tested first, then each time twice as many.
+    Loops that join shrink the path's covariance, against which the next ones are tested. It is empty if the seed
+    contradicts the path.
 
     Args:
         chain: the path.
-        loops: the others.
-        seed: the one that must be among them.
-        start: poses (K, 4, 4) of all keyframes to linearise at first.
-        limit: largest squared Mahalanobis distance of a pose from what path and loops say of it.
+        loops: to choose from.
+        seed: the loop that must be in the set.
+        start: poses (K, 4, 4) of all keyframes, at which the graph is first linearised.
+        limit: largest squared Mahalanobis distance of a loop from the pose graph.
     """
     others = sorted((x for x in loops if x is not seed), key=lambda x: (abs(x.second - seed.second), x.first))
     also = [k for x in others for k in (x.first, x.second)]
@@ -46,21 +47,20 @@ def agreeing(chain: Chain, loops: Sequence[Loop], seed: Loop, start: Array, limi
 
 
 def disagreement(graph: PoseGraph, loop: Loop) -> float:
-    """Squared Mahalanobis distance of a loop, which the graph does not hold, from what it says of both keyframes."""
+    """Squared Mahalanobis distance of a loop that is not in the graph from the graph's relative pose."""
     T, P = graph.relative_pose(loop.first, loop.second)
     return distance(T, loop.T_first_second, P + loop.covariance)
 
 
 def spaced(loops: Sequence[Loop], travelled: Array, apart: Array) -> list[Loop]:
-    """Those loops, in order of their second keyframes, that show another place than the last one did.
+    """One loop of each place, in order of the second keyframes.
 
-    Keyframes of one place see the same things, be it the same houses again or others that look like them: together
-    they are one witness.
+    Loops at one place are not independent evidence: they see the same things, or the same lookalikes.
 
     Args:
         loops: all of them.
         travelled: length of the path up to each keyframe (K,) [m].
-        apart: way from each keyframe (K,) [m] after which its place is left.
+        apart: distance from each keyframe (K,) [m], along the path, beyond which its place is left.
     """
     chosen: list[Loop] = []
     for loop in sorted(loops, key=lambda x: x.second):

@@ -16,9 +16,9 @@ _ALIGNMENT = 8  # fixed: bytes
 
 
 class FeatureFile:
-    """Puts features of keyframes into a file that goes with this object; the system reads them where they are needed.
+    """Keeps the features of keyframes in a temporary file, memory-mapped, that is deleted with this object.
 
-    A copy is empty: what it holds so far belongs to the keyframes, whose copies are in memory.
+    A copy of this object is empty, as copied keyframes hold their features in memory.
     """
 
     def __init__(self) -> None:
@@ -28,12 +28,12 @@ class FeatureFile:
         return {"_file": None}
 
     def put(self, keyframe: Keyframe) -> Keyframe:
-        """The same keyframe, its features in the file.
+        """The same keyframe, with its features in the file.
 
         Raises:
             SlamError: the file cannot be written.
         """
-        k = keyframe  # from large to small numbers, so that all are aligned
+        k = keyframe  # the widest types first, so that all are aligned
         arrays = [np.ascontiguousarray(a) for a in (k.landmarks, k.points, k.descriptors, k.laplacian)]
         data = b"".join(a.tobytes() for a in arrays)
         try:

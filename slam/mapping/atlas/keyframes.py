@@ -1,4 +1,4 @@
-"""Keyframes: what the camera saw, in its own coordinates, how it got there from the one before; loops between them."""
+"""Keyframes: features in camera coordinates and the motion since the keyframe before; loops between keyframes."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from slam.geometry.se3 import Array, adjoint, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.rig_error import Correction
 
-_ROUNDING = 1e-14  # numerics: of the largest variance: what is below is none
+_ROUNDING = 1e-14  # numerics: variances below this share of the largest are rounding
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One frame that is kept.
+    """A frame that is kept.
 
     Attributes:
         frame: index of the step.
         stamp: [s].
         T_odom_left: pose (4, 4) that the back end estimated then.
-        covariance: its covariance (6, 6) then, by noise alone.
+        covariance: of that pose (6, 6), without the common errors.
         step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
             right.
         shares: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
         travelled: length of the path up to here [m].
         depth: median depth of the features [m].
         points: features in coordinates of the rectified left camera (F, 3) [m].
-        descriptors: theirs (F, D).
-        laplacian: signs of their Laplacians (F,).
-        landmarks: ids of the landmarks that they were in the back end's map (F,), −1 for none.
-        correction: of the rig's error, that the points were made with; None in a map of an earlier run.
+        descriptors: (F, D).
+        laplacian: signs of the Laplacian (F,).
+        landmarks: ids of the landmarks that the features showed (F,), −1 for none.
+        correction: of the rig's error, with which the points were triangulated; None in a map of an earlier run.
     """
 
     frame: int
@@ -55,7 +55,7 @@ class Keyframe:
         return len(self.points)
 
     def corrected(self, correction: Correction | None, rig: StereoRig) -> Keyframe:
-        """The same keyframe, its points by what is known of the rectified rig's error now."""
+        """The same keyframe, its points triangulated anew with the present correction of the rectified rig's error."""
         if self.correction is None or correction is None or self.correction is correction:
             return self
         pixels, _ = rig.project_stereo(self.points.astype(float), jacobian=False)
@@ -95,7 +95,7 @@ def distance(expected: Array, found: Array, covariance: Array) -> float:
 
 
 def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: AtlasConfig) -> bool:
-    """Whether a camera sees other things than a keyframe, or the same ones from elsewhere.
+    """Whether a camera's view differs enough from a keyframe's for a new one: other features, or another viewpoint.
 
     Args:
         keyframe: the earlier one.
@@ -110,13 +110,13 @@ def view_has_changed(keyframe: Keyframe, motion: Array, rig: StereoRig, config: 
 
 
 def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, max_error: float) -> NDArray[np.intp]:
-    """Rows of the features whose depth is known, to a relative standard deviation of `max_error`.
+    """Rows of the features whose depth is known well enough.
 
     Args:
         rig: the cameras.
         features: of a frame.
         sigma: noise of uL, vL, uR [px].
-        max_error: largest relative standard deviation.
+        max_error: largest relative standard deviation of the depth.
     """
     points = rig.triangulate(features.uv_left, features.uv_right)
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -127,14 +127,14 @@ def features_with_depth(rig: StereoRig, features: StereoFeatures, sigma: float, 
 def kept_features(
     rows: NDArray[np.intp], response: Array, landmark_of: IdArray, moving: NDArray[np.intp], most: int
 ) -> NDArray[np.intp]:
-    """Those rows of features that a keyframe keeps: none that move; landmarks first, then the strongest.
+    """Rows of the features that a keyframe keeps: landmarks first, then the strongest; none that move.
 
     Args:
         rows: of features with a depth.
         response: of all features (N,).
-        landmark_of: id of the landmark that each feature is (N,), −1 for none.
+        landmark_of: id of the landmark that each feature shows (N,), −1 for none.
         moving: rows of features that move.
-        most: how many are kept at most.
+        most: largest number of rows.
     """
     rows = rows[~np.isin(rows, moving)]
     order = np.lexsort((-response[rows], landmark_of[rows] < 0))[:most]
@@ -145,11 +145,11 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
     """Covariance (6, 6) by noise of the motion since a keyframe, from the covariances of both poses.
 
     The motion's error is taken to be independent of the first pose's: then ``P = Ad P₀ Adᵀ + Q`` with the adjoint of
-    the motion's inverse, and Q is what has been added. Where a back end becomes surer meanwhile, as it sees landmarks
-    of before again, Q has no positive part.
+    the motion's inverse, and Q is the motion's covariance. If the back end has become more certain meanwhile, because
+    it saw earlier landmarks again, Q has no positive part and is set to zero.
 
-    A pose is off by what the path has drifted, and by what its own frame adds, which is forgotten in the next one. Q
-    holds the drift alone, so that steps can be added; what frames add belongs to the loops that end at them.
+    A pose's error has two parts: the path's drift, and an error of its own frame, which the next frame forgets. Q
+    holds the drift alone, so that Q of successive steps can be added; loops carry the error of the frames they end at.
 
     Args:
         before: the earlier keyframe.
@@ -161,9 +161,9 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
 
 
 def what_was_added(after: Array, before: Array) -> Array:
-    """The positive part (…, n, n) of what covariances have more than others.
+    """The positive semidefinite part (…, n, n) of the difference `after` − `before` of covariances (…, n, n).
 
-    Rotations and metres are brought to one scale by the deviations of `after`.
+    Rotations and translations are made comparable by dividing by the standard deviations of `after`.
     """
     variances = np.diagonal(after, axis1=-2, axis2=-1)
     least = np.maximum(_ROUNDING * variances.max(axis=-1, keepdims=True), np.finfo(float).tiny)

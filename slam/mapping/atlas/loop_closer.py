@@ -1,4 +1,4 @@
-"""From a frame to a new keyframe, and from a keyframe to a closed loop."""
+"""Makes keyframes of frames, and closes loops between keyframes."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph
 
-_NEARBY = 4  # cost: keyframes that are compared as the path is near them, besides those that look alike
+_NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
 _CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
 _VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
-_PATIENCE = 3  # keyframes within which another one must see the same return
-_MINIMAL = 6  # features that give a pose with a covariance
-_UNKNOWN_WAY = 1000.0  # [m] between the end of an earlier run and this one, or where the camera was kidnapped
-_UNKNOWN_MOTION = 1.0, 100.0  # standard deviations of the motion there [rad], [m]: it says nothing
-_LARGEST = 6e4  # guard: number that a keyframe's descriptors hold
-_HYPOTHESES = 300  # cost: poses tried: one in a hundred places is missed where a quarter of its matches are right
+_PATIENCE = 3  # keyframes within which another one must confirm a loop
+_MINIMAL = 6  # least number of features of a keyframe: enough for a pose with a covariance
+_UNKNOWN_WAY = 1000.0  # path length assumed between an earlier run and this one, or of a kidnapping [m]
+_UNKNOWN_MOTION = 1.0, 100.0  # standard deviations of that unknown motion [rad], [m]
+_LARGEST = 6e4  # guard: largest number in a keyframe's descriptors, which are half floats
+_HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches right one place in a hundred is missed
 
 
 @dataclass(frozen=True)
 class Found:
-    """Where a camera is that may have been anywhere.
+    """Pose and place of a camera found without a prior.
 
     Attributes:
-        T_odom_left: its pose (4, 4) in the back end's frame.
+        T_odom_left: the camera's pose (4, 4) in the back end's frame.
         place: landmarks of the place.
-        stamp: when that place was seen [s]; −inf in an earlier run.
+        stamp: time of the keyframe that shows the place [s]; −inf for one of an earlier run.
     """
 
     T_odom_left: Array
@@ -69,14 +69,14 @@ class Found:
 class LoopCloser:
     """Adds keyframes to an atlas and closes loops.
 
-    Inside, all is in pixels and coordinates of the rectified rig.
+    Internally, pixels and coordinates are those of the rectified rig.
 
     Args:
         rig: the cameras.
         config: settings.
         association: settings of the search by descriptor.
-        models: noise of uL, vL, uR [px].
-        max_depth_error: largest relative standard deviation of a kept feature's depth, as of a new landmark's.
+        models: with the noise of uL, vL, uR [px].
+        max_depth_error: largest relative standard deviation of a kept feature's depth, the same as a new landmark's.
     """
 
     def __init__(
@@ -100,13 +100,13 @@ class LoopCloser:
     def update(
         self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
-        """The atlas after a frame, and what it shows again where a loop was closed.
+        """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
 
         Args:
-            atlas: before.
-            step: what the frame brought.
+            atlas: before the frame.
+            step: the frame's result.
             added: landmarks that joined the map in it.
-            path: gives the path in odom so far.
+            path: returns the path in odom so far.
         """
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
         wanted = begins or (not step.state.unmatched and self._is_keyframe(atlas, step))
@@ -128,12 +128,12 @@ class LoopCloser:
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
-        """The keyframe whose place a camera sees that may be anywhere; None where no place is clear.
+        """Find a camera that may be anywhere by the keyframes; None if no place fits or several do.
 
         Args:
             atlas: the places.
             features: of the frame.
-            correction: that they were corrected with.
+            correction: with which the features were corrected.
             seed: of the random choice in the geometric check.
         """
         if not self._config.enabled or len(features) < self._config.inliers:
@@ -153,7 +153,7 @@ class LoopCloser:
         return Found(T_odom_keyframe @ loop.T_first_second, place, stamp)
 
     def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
-        """A keyframe's features as landmarks, where its pose is (4, 4)."""
+        """A keyframe's features as landmarks, given its pose (4, 4)."""
         points, T = keyframe.points.astype(float), T_odom_left @ self._rectified.T_left_rectified
         P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
         descriptors = keyframe.descriptors.astype(np.float32)
@@ -174,7 +174,7 @@ class LoopCloser:
         return replace(features, uv_left=r.rectify_left(features.uv_left), uv_right=r.rectify_right(features.uv_right))
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
-        """Whether the camera sees other things, or from elsewhere, than in the last keyframe."""
+        """Whether the view differs enough from the last keyframe's, or a loop waits for confirmation."""
         if len(atlas) == atlas.known or self._in_doubt(atlas):
             return True
         last = atlas.keyframes[-1]
@@ -183,7 +183,7 @@ class LoopCloser:
         return view_has_changed(last, motion, self._rig, self._config)
 
     def _in_doubt(self, atlas: Atlas) -> bool:
-        """Whether the last keyframe has seen a return that is to be confirmed: the next frame can do that."""
+        """Whether the last keyframe has a loop that is not confirmed yet; the next frame may confirm it."""
         pending = atlas.pending
         return pending is not None and pending.second == len(atlas) - 1 and not atlas.confirmed
 
@@ -225,10 +225,10 @@ class LoopCloser:
         )
 
     def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray) -> NDArray[np.intp]:
-        """Numbers of keyframes that may show this place again, the likeliest first.
+        """Numbers of old keyframes that may show this place, the likeliest first.
 
-        Not those that the camera has not left yet, nor those whose landmarks the back end still measures: their place
-        it knows by itself.
+        Keyframes of a place that the camera has not left yet are excluded, and those whose landmarks the back end still
+        measures: it knows their position by itself.
         """
         poses, here = atlas.poses_in_map(), atlas.T_map_odom @ new.T_odom_left
         covariance = atlas.estimate(step.estimate, step.common).covariance
@@ -242,20 +242,20 @@ class LoopCloser:
         return self._ranked(atlas, np.array(rows, np.intp), step.features)
 
     def _most_alike(self, atlas: Atlas, descriptors: Vectors, possible: BoolArray) -> NDArray[np.intp]:
-        """Numbers of the possible keyframes (K,) whose descriptors as a whole are most similar."""
+        """Numbers of those `possible` keyframes (K,) whose descriptors as a whole are most similar, best first."""
         similarity = atlas.index.similarity(descriptors)
         similarity[~possible] = -np.inf
         best = np.argsort(-similarity, kind="stable")[: self._config.candidates]
         return np.asarray(best[np.isfinite(similarity[best])])
 
     def _ranked(self, atlas: Atlas, likely: NDArray[np.intp], features: StereoFeatures) -> NDArray[np.intp]:
-        """Those keyframes that most features match, enough of them, the best first."""
+        """The keyframes with most matches by descriptor, if there are enough of them, best first."""
         number = np.array([alike(atlas.keyframes[k], features, self._localizer.config) for k in likely], int)
         order = np.argsort(-number, kind="stable")[:_VERIFIED]
         return likely[order[number[order] >= self._config.inliers]]
 
     def _within_reach(self, atlas: Atlas, new: Keyframe, poses: Array, here: Array, covariance: Array) -> BoolArray:
-        """Which keyframes (K,), at poses (K, 4, 4), the camera has left, but may be back at by what its path says."""
+        """Which keyframes (K,), at poses (K, 4, 4), the camera has left but may, given its uncertainty, see again."""
         c, length = self._config, new.travelled - atlas.rows.travelled
         far = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
@@ -270,9 +270,9 @@ class LoopCloser:
         correction: Correction | None,
         seed: int,
     ) -> list[tuple[Loop, Verified]]:
-        """The candidates with which enough features agree on a pose, as loops that end at the present camera.
+        """The candidates that geometry confirms, as loops that end at the present camera.
 
-        Their second number is that of the newest keyframe, which the camera is unless it is lost.
+        Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
         """
         X = self._rectified.T_left_rectified
         A, found = adjoint(X), []
@@ -280,20 +280,20 @@ class LoopCloser:
             keyframe = atlas.keyframes[k].corrected(correction, self._rig)
             seen = verify(keyframe, features, self._rig, self._localizer, self._config, seed)
             if seen is not None:
-                # Both poses have what their frames add, which is no more than what such measurements are off by.
+                # Each of both poses has an error of its own frame too, at most as large as such a measurement's noise.
                 T, P = X @ seen.T_keyframe_left @ inverse(X), A @ (seen.covariance + seen.noise) @ A.T
                 found.append((Loop(k, len(atlas) - 1, T, P, len(seen.matches)), seen))
         return found
 
     def _same_place(self, atlas: Atlas, one: Loop, other: Loop) -> bool:
-        """Whether two verified loops put the camera at places nearer to each other than what it sees there."""
+        """Whether two verified loops put the camera at positions closer together than the scene's depth."""
         T, U = (atlas.pose_in_map(loop.first) @ loop.T_first_second for loop in (one, other))
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
         self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
-        """Close a loop where the path allows it and a keyframe just before has seen the same return."""
+        """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop."""
         from slam.mapping.atlas.consensus import disagreement
         from slam.mapping.atlas.pose_graph import PoseGraph
 
@@ -318,7 +318,7 @@ class LoopCloser:
     def _refuse(
         self, atlas: Atlas, chain: Chain, loop: Loop, seen: Verified, rig: CommonError
     ) -> tuple[Atlas, Returned | None]:
-        """Refuse a loop that contradicts the others; these instead, where fewer places speak for them."""
+        """Refuse a loop that contradicts the others, or refuse the others if fewer places support them."""
         from slam.mapping.atlas.consensus import agreeing, spaced
         from slam.mapping.atlas.pose_graph import PoseGraph
 
@@ -342,7 +342,7 @@ class LoopCloser:
         return atlas.solved_by(solution, rig), self._returned(seen) if self._config.give_back else None
 
     def _agree(self, chain: Chain, before: Loop, loop: Loop) -> bool:
-        """Whether two loops, a few keyframes one after the other, tell of the same return."""
+        """Whether two loops, seen by keyframes shortly after each other, are consistent with each other."""
         if loop.second - before.second > _PATIENCE:
             return False
         T_old, P_old = chain.motion(before.first, loop.first)
@@ -353,7 +353,7 @@ class LoopCloser:
         return distance(expected, loop.T_first_second, P) < self._config.gate_sigmas**2
 
     def _returned(self, seen: Verified) -> Returned:
-        """The old keyframe's features that agree, in the coordinates of the present left camera."""
+        """The old keyframe's inliers, in coordinates of the present left camera."""
         keyframe, m, X, back = (
             seen.keyframe,
             seen.matches,
@@ -370,22 +370,22 @@ class LoopCloser:
 
 
 def says_more(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
-    """Whether a loop tells more of where the camera is, in any direction, than the path since the last one does.
+    """Whether a loop is more certain than the path since the last loop, in any direction.
 
-    The path's common errors are as uncertain as the loops so far have left them: in a place that is seen again and
-    again they are soon known, and most loops tell nothing new.
+    The path's uncertainty includes that of the common errors after the loops so far: in a place that is seen again and
+    again these are soon known, and most loops add nothing.
     """
     _, P = graph.relative_pose(last.second, loop.second)
     return bool(eigvalsh(P, loop.covariance)[-1] > 1.0)
 
 
 def _inliers(one: tuple[Loop, Verified]) -> int:
-    """Number of features that agree."""
+    """Number of inliers."""
     return one[0].inliers
 
 
 def _nearest(poses: Array, here: Array, depth: float, possible: BoolArray) -> NDArray[np.intp]:
-    """Numbers of the possible keyframes (K,) that the path has nearest: their places, and what they look at.
+    """Numbers of the possible keyframes nearest by the path, in the camera's position and in what it looks at.
 
     Args:
         poses: of the keyframes (K, 4, 4).

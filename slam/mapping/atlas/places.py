@@ -1,9 +1,9 @@
-"""Which keyframe shows a place like this one: vectors of locally aggregated descriptors (VLAD; Jégou et al., 2010).
+"""Place recognition by vectors of locally aggregated descriptors (VLAD; Jégou et al., 2010).
 
-A keyframe's descriptors are shared out to the nearest of some words, and their differences from it are added up: a
-vector of fixed length. The words are learnt by k-means from all keyframes so far, again and again at first: words
-learnt from a few places lie in the middle of their descriptors, whose differences then say nothing, so that just those
-places would not be known again. For the same reason vectors are compared by what they differ by from their mean.
+Each descriptor of a keyframe is assigned to the nearest visual word, and the differences from each word are summed: a
+vector of fixed length. The words are learnt by k-means from all keyframes so far, several times at first: words learnt
+from few places lie at the means of their descriptors, whose differences then cancel, so that just those places would
+not be recognised. For the same reason the vectors' mean is subtracted before they are compared.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
-_TRAINING = 50  # cost: descriptors for each word, of which the words are learnt
+_TRAINING = 50  # cost: descriptors per word from which the words are learnt
 _LEARN_AT = (8, 16, 32, 64, 128)  # cost: numbers of keyframes at which the words are learnt
 _ROUNDS = 10  # numerics: of k-means
-_NONE = 1e-12  # numerics: length of a vector that says nothing
+_NONE = 1e-12  # numerics: length below which a vector counts as zero
 
 
 @dataclass(frozen=True)
 class PlaceIndex:
-    """Vectors of keyframes, and the words that they are made with.
+    """VLAD vectors of keyframes, and the visual words they are made with.
 
     Attributes:
         words: (W, D); None before they have been learnt.
-        early: descriptors (F, D) of the keyframes so far, as long as words will be learnt from them.
+        early: descriptors (F, D) of the keyframes so far, kept as long as words are still to be learnt.
         count: number of keyframes.
-        vectors: theirs, in the first `count` rows; none without words.
+        vectors: of the keyframes, in the first `count` rows; none without words.
     """
 
     words: Vectors | None = None
@@ -39,7 +39,7 @@ class PlaceIndex:
     vectors: Vectors = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def with_new(self, descriptors: Vectors) -> PlaceIndex:
-        """With one more keyframe, of descriptors (F, D)."""
+        """A copy with one more keyframe, which has descriptors (F, D)."""
         count = self.count + 1
         early = (*self.early, descriptors.astype(np.float16)) if count <= _LEARN_AT[-1] else ()
         if count not in _LEARN_AT:
@@ -64,7 +64,7 @@ class PlaceIndex:
         return np.asarray((products[:, 0] - mean @ wanted) / np.maximum(lengths, _NONE), np.float32)
 
     def _appended(self, descriptors: Vectors) -> PlaceIndex:
-        """With one more keyframe. Rows beyond `count` are nobody's, so earlier indices keep theirs."""
+        """A copy with one more keyframe; both share the array, but this index's first `count` rows stay unchanged."""
         if self.words is None:
             return replace(self, count=self.count + 1)
         vector, vectors = aggregate(descriptors, self.words), self.vectors
@@ -77,7 +77,7 @@ class PlaceIndex:
 
 
 def learn_words(descriptors: Vectors, number: int) -> Vectors:
-    """Centres (number, D) of descriptors (F, D), by k-means of evenly chosen ones."""
+    """Centres (number, D) of descriptors (F, D), by k-means on an evenly spaced subset."""
     some = min(number * _TRAINING, len(descriptors))
     descriptors = descriptors[np.linspace(0, len(descriptors) - 1, some).astype(int)]
     words = descriptors[np.linspace(0, some - 1, number).astype(int)].copy()
@@ -91,7 +91,7 @@ def learn_words(descriptors: Vectors, number: int) -> Vectors:
 
 
 def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
-    """The vector (W · D,) of descriptors (F, D), of length 1: each word's part is normalised first, then the whole."""
+    """VLAD vector (W · D,) of descriptors (F, D): each word's part is normalised, then the whole, to unit length."""
     parts = np.zeros_like(words)
     if len(descriptors):
         nearest = _nearest(descriptors, words)
@@ -102,6 +102,6 @@ def aggregate(descriptors: Vectors, words: Vectors) -> NDArray[np.float32]:
 
 
 def _nearest(descriptors: Vectors, words: Vectors) -> NDArray[np.intp]:
-    """Row of the nearest word (F,)."""
+    """Row of each descriptor's nearest word (F,)."""
     squares = np.einsum("wd,wd->w", words, words)
     return np.asarray(np.argmin(squares[None, :] - 2 * descriptors @ words.T, axis=1))

@@ -1,10 +1,11 @@
-"""Where all keyframes are: the path between them, and what the loops say about it, by least squares.
+"""Pose graph: all keyframes' poses from the path and the loops, by least squares.
 
-Only keyframes at which a loop ends, the first and the last one are variables, besides the common errors of all steps
-(see `slam.mapping.atlas.chain`); the stretches between them are one equation each. What a stretch is moved by is then
-shared out among its keyframes, which is what the whole problem would give, to first order.
+Variables are the poses of keyframes at which a loop ends, of the first and of the last one, and the common errors of
+all motions (see `slam.mapping.atlas.chain`). The stretch of path between two of these keyframes is one factor; its
+correction is then distributed among the keyframes within, which to first order is the solution of the full problem.
 
-Gauss-Newton. The normal equations of the poses are sparse (SciPy's SuperLU); the common errors are a dense border.
+It is solved by Gauss-Newton. The normal equations of the poses are sparse (SciPy's SuperLU), bordered by dense ones of
+the common errors.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from slam.mapping.atlas.keyframes import Loop
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
 
-_ROUNDS = 30  # numerics: of least squares, at most
-_CONVERGED = 1e-3  # numerics: decrease of χ² that is none any more
-_FAST = 0.1  # numerics: of the decrease of χ² in the step before, below which the normal equations are good enough
-_HALVINGS = 8  # numerics: of a step that makes χ² larger
+_ROUNDS = 30  # numerics: most iterations
+_CONVERGED = 1e-3  # numerics: decrease of χ² at which iteration ends
+_FAST = 0.1  # numerics: the normal equations are kept while χ² decreases by less than this share of its last decrease
+_HALVINGS = 8  # numerics: most halvings of a step that increases χ²
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class Solution:
 
     Attributes:
         poses: T_map_left (K, 4, 4).
-        covariance: of the last one, perturbing on the right, and of the common errors (6 + m, 6 + m).
+        covariance: joint covariance (6 + m, 6 + m) of the last pose, perturbing on the right, and the common errors.
         common: the common errors (m,).
-        disagreement: of each loop with the whole, as a χ² of 6 degrees of freedom (L,).
+        disagreement: of each loop with the graph (L,), χ² with 6 degrees of freedom.
     """
 
     poses: Array
@@ -48,14 +49,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Path and loops, and the poses and common errors of least χ².
+    """Path and loops, with the poses and common errors that minimise χ².
 
     Attributes:
         chain: the path.
         problem: the equations.
         poses: of the keyframes that are variables (M, 4, 4).
         common: the common errors (m,).
-        normal: the normal equations there, to first order.
+        normal: the normal equations near the solution.
     """
 
     chain: Chain
@@ -68,13 +69,13 @@ class PoseGraph:
     def solved(
         cls, chain: Chain, loops: Sequence[Loop], start: Array, also: Sequence[int] = (), common: Array | None = None
     ) -> PoseGraph:
-        """Of a path and of loops.
+        """The graph of a path and loops, solved.
 
         Args:
             chain: the path.
-            loops: what is known already.
-            start: poses (K, 4, 4) of all keyframes to linearise at first.
-            also: keyframes whose poses are variables too, besides those at which loops end.
+            loops: in the graph.
+            start: poses (K, 4, 4) of all keyframes, at which the graph is first linearised.
+            also: further keyframes whose poses are variables, besides those at which loops end.
             common: the common errors (m,) to start from; zero by default.
         """
         problem = _Problem.of(chain, loops, also)
@@ -82,17 +83,17 @@ class PoseGraph:
         return cls(chain, problem, *problem.optimised(start[problem.ends], common))
 
     def with_loop(self, loop: Loop) -> PoseGraph:
-        """With one loop more, between keyframes that are variables."""
+        """The solved graph with one more loop, between keyframes that are variables."""
         problem = self.problem.with_loop(loop)
         starts = self.poses, self._bent(loop)
         start = min(starts, key=lambda poses: problem.cost(poses, self.common))
         return PoseGraph(self.chain, problem, *problem.optimised(start, self.common))
 
     def _bent(self, loop: Loop) -> Array:
-        """Poses (M, 4, 4) of the variables that put both ends of a loop where it says; what it changes is shared out.
+        """Poses (M, 4, 4) of the variables that satisfy a loop, its correction distributed along the path.
 
-        A stretch that is hardly known takes nearly all of it, and what follows moves as a whole, however far that is.
-        Linear equations of single poses would bend it.
+        A stretch that is hardly known takes nearly all of the correction, and the path after it moves rigidly, however
+        far that is. A linear step in the single poses would bend that part.
         """
         p, last = self.problem, len(self.poses) - 1
         noise, common = (each[p.ends] for each in p.propagated)
@@ -113,12 +114,12 @@ class PoseGraph:
         return T, J @ P @ J.T
 
     def disagreement(self) -> Array:
-        """Of each loop with the whole, as a χ² of 6 degrees of freedom (L,)."""
+        """Disagreement of each loop with the graph (L,), χ² with 6 degrees of freedom."""
         p = self.problem
         return np.square(p.whitened(p.residuals(self.poses, self.common))).sum(axis=1)[len(p.ends) - 1 :]
 
     def solution(self) -> Solution:
-        """What it says of all keyframes."""
+        """The poses of all keyframes."""
         p, P = self.problem, self.normal.covariance([len(self.poses) - 1])
         moved = spread(self.chain, p.ends, p.propagated, self.poses, self.common)
         return Solution(moved, P, self.common, self.disagreement())
@@ -135,11 +136,11 @@ class _Problem:
 
     Attributes:
         ends: keyframes (M,) whose poses are variables; the first one is fixed and defines the map.
-        a, b: rows of `ends` (E,): motion b is seen from a.
+        a, b: rows of `ends` (E,): the motion is the pose of b in the coordinates of a.
         motions: measured (E, 4, 4).
-        roots: of their information (E, 6, 6): a residual r weighs |root r|².
+        roots: square roots of their information (E, 6, 6): a residual r costs |root r|².
         common: derivative of the motions by the common errors (E, 6, m).
-        propagated: of all keyframes, see `slam.mapping.atlas.chain.Chain.propagated`.
+        propagated: errors within the stretches, see `slam.mapping.atlas.chain.Chain.propagated`.
     """
 
     ends: NDArray[np.intp]
@@ -170,7 +171,7 @@ class _Problem:
         )
 
     def with_loop(self, loop: Loop) -> _Problem:
-        """With one equation more, for a loop between keyframes that are variables."""
+        """A copy with one more factor, for a loop between keyframes that are variables."""
         return _Problem(
             self.ends,
             np.append(self.a, np.searchsorted(self.ends, loop.first)),
@@ -182,15 +183,15 @@ class _Problem:
         )
 
     def expected(self, common: Array) -> Array:
-        """By what the motions (E, 6) are off, as far as the common errors (m,) say it."""
+        """Errors of the motions (E, 6) due to the common errors (m,)."""
         return np.asarray(self.common @ common)
 
     def residuals(self, poses: Array, common: Array) -> Array:
-        """What the motions (E, 6) of poses (M, 4, 4) differ by from the measured ones."""
+        """Residuals (E, 6): motions of poses (M, 4, 4) against the measured ones corrected by the common errors."""
         return log(inverse(self.motions) @ inverse(poses[self.a]) @ poses[self.b]) - self.expected(common)
 
     def whitened(self, r: Array) -> Array:
-        """Residuals (E, 6) of unit variance."""
+        """Residuals (E, 6) scaled to unit variance."""
         return np.asarray((self.roots @ r[:, :, None])[:, :, 0])
 
     def cost(self, poses: Array, common: Array) -> float:
@@ -198,13 +199,13 @@ class _Problem:
         return float(np.square(self.whitened(self.residuals(poses, common))).sum() + common @ common)
 
     def derivatives(self, poses: Array, common: Array) -> tuple[Array, Array, Array]:
-        """Residuals (E, 6) at poses (M, 4, 4) and common errors (m,); derivatives (E, 6, 6) by the poses of a and b."""
+        """Residuals (E, 6) at poses (M, 4, 4) and common errors (m,), and Jacobians (E, 6, 6) by poses a and b."""
         r = self.residuals(poses, common)
         back = _by_perturbation(r + self.expected(common))
         return r, -back @ adjoints(inverse(poses[self.b]) @ poses[self.a]), back
 
     def gradient(self, poses: Array, common: Array) -> tuple[Array, Array]:
-        """Right sides of the normal equations: of the poses but the first (6 (M − 1),), of the common errors (m,)."""
+        """Right-hand sides of the normal equations: poses without the first (6 (M − 1),), and common errors (m,)."""
         r, A, B = self.derivatives(poses, common)
         Wr = np.swapaxes(self.roots, 1, 2) @ (self.roots @ r[:, :, None])
         right = np.zeros((len(poses), 6))
@@ -219,10 +220,10 @@ class _Problem:
         return _Normal.of(len(poses), self.a, self.b, A, B, -self.common, W)
 
     def optimised(self, poses: Array, common: Array) -> tuple[Array, Array, _Normal]:
-        """Poses (M, 4, 4) and common errors (m,) of least χ², and normal equations near there.
+        """Poses (M, 4, 4) and common errors (m,) that minimise χ², and normal equations near there.
 
-        Steps use the normal equations of earlier ones while they converge fast: the gradient alone is made anew. They
-        are made anew, too, where such a step gains nothing.
+        While steps converge fast, they reuse the previous normal equations and recompute the gradient alone. The normal
+        equations are also recomputed when such a step gains nothing.
         """
         cost, gain = self.cost(poses, common), np.inf
         normal, fresh = self.normal(poses, common), True
@@ -236,7 +237,7 @@ class _Problem:
                     poses, common, gain, cost = moved, common + half * change, cost - less, less
                     break
             worse, whole = less > cost, half == 1
-            if (gain < _CONVERGED and whole) or (worse and fresh):  # a part of a step may gain little anywhere
+            if (gain < _CONVERGED and whole) or (worse and fresh):  # a halved step may gain little anywhere
                 break
             fresh = worse or not whole or gain > _FAST * before
             normal = self.normal(poses, common) if fresh else normal
@@ -270,9 +271,9 @@ class _Normal:
         C: Array,
         W: Array,
     ) -> _Normal:
-        """Of residuals (E, 6) with information W, by poses a and b (E,) of `count`, and by the common errors.
+        """From residuals (E, 6) with information W that depend on poses a and b (E,) and on the common errors.
 
-        The common errors have unit information of their own.
+        The common errors have a prior of unit information.
 
         Args:
             count: number of poses, the fixed first one included.
@@ -302,19 +303,19 @@ class _Normal:
         flat = border[1:].reshape(size, m)
         through = solver.solve(flat) if m else flat
         follow = np.concatenate([np.zeros((1, 6, m)), through.reshape(count - 1, 6, m)])
-        rest = C - A @ follow[a] - B @ follow[b]  # squares of what poses cannot follow; no difference of large squares
+        rest = C - A @ follow[a] - B @ follow[b]  # Schur complement as a square, not as a difference of large squares
         # Part of a covariance, and used in every step; m is small.
         inner = np.linalg.inv(np.eye(m) + np.tensordot(rest, W @ rest, axes=((0, 1), (0, 1))))
         return cls(solver, flat, through, inner)
 
     def step(self, right: Array, right_common: Array) -> tuple[Array, Array]:
-        """Steps of the poses but the first (M − 1, 6), and of the common errors (m,), from their right sides."""
+        """Steps of the poses without the first (M − 1, 6) and of the common errors (m,), from the right-hand sides."""
         alone = self.solver.solve(right)
         change = self.inner @ (right_common - self.border.T @ alone)
         return (alone - self.through @ change).reshape(-1, 6), change
 
     def covariance(self, poses: Sequence[int]) -> Array:
-        """Joint covariance (6 n + m, 6 n + m) of n poses, by their rows, and of the common errors."""
+        """Joint covariance (6 n + m, 6 n + m) of n poses, given by their rows, and of the common errors."""
         size, m, n = len(self.border), len(self.inner), 6 * len(poses)
         picked = np.zeros((size, n))
         for i, row in enumerate(poses):
@@ -329,15 +330,15 @@ class _Normal:
         return 0.5 * (P + P.T)
 
 
-#: The matrix is symmetric and positive definite: no pivots are looked for off its diagonal.
+#: The matrix is symmetric and positive definite, so pivots are taken from the diagonal.
 _SYMMETRIC = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
 
 
 def _root_of_information(covariances: Array) -> Array:
-    """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), which rounding may have made none.
+    """Matrices R (E, 6, 6) with ``Rᵀ R`` the inverse of covariances (E, 6, 6), some of which may be singular.
 
-    The noise of single steps has no positive part in some directions (see `slam.mapping.atlas.keyframes`): they get the
-    least variance, as the normal equations of steps that are exact are singular to rounding.
+    The noise of single steps can be zero in some directions (see `slam.mapping.atlas.keyframes`). Such directions get a
+    least variance, because exact steps would make the normal equations numerically singular.
     """
     covariances = covariances + LEAST_VARIANCE * np.eye(6)
     scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))

@@ -1,4 +1,4 @@
-"""What the path and the pose graph need of every keyframe, a row each, in arrays that grow."""
+"""Keyframe data for the path and the pose graph: one row per keyframe, in growing arrays."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from slam.geometry.se3 import Array
 from slam.mapping.atlas.keyframes import Keyframe
 
-_LEAST = 64  # cost: rows that there is room for at first
+_LEAST = 64  # cost: rows allocated at first
 
 
 @dataclass(frozen=True)
 class KeyframeRows:
-    """Numbers of keyframes; see `slam.mapping.atlas.keyframes.Keyframe`. Rows beyond `count` are nobody's.
+    """Data of keyframes as arrays, see `slam.mapping.atlas.keyframes.Keyframe`; rows beyond `count` are unused.
 
     Attributes:
         count: number of keyframes.
-        room: stamps (N,), poses (N, 4, 4), step covariances (N, 6, 6), shares (N, 6, m) and ways travelled (N,).
+        room: stamps (N,), poses (N, 4, 4), step covariances (N, 6, 6), shares (N, 6, m) and distances travelled (N,).
     """
 
     count: int = 0
@@ -49,7 +49,7 @@ class KeyframeRows:
 
     @property
     def shares(self) -> Array:
-        """Derivatives (K, 6, m) of the poses by common errors; zero in those of a run with other ones."""
+        """Derivatives (K, 6, m) of the poses by the rig's errors; zero for keyframes of a run with other ones."""
         return self.room[3][: self.count]
 
     @property
@@ -58,10 +58,10 @@ class KeyframeRows:
         return self.room[4][: self.count]
 
     def with_new(self, keyframe: Keyframe) -> KeyframeRows:
-        """With one more keyframe.
+        """A copy with one more keyframe.
 
-        The arrays are shared with `self`, whose own rows stay as they are; of two that continue the same one, only the
-        later holds.
+        It shares its arrays with `self`, whose own rows stay unchanged. If two copies continue the same object, only
+        the later one is valid.
         """
         k, room = self.count, self.room
         new = tuple(
@@ -78,7 +78,7 @@ class KeyframeRows:
 
 
 def _with_room(rows: Array, count: int, shape: tuple[int, ...]) -> Array:
-    """The first `count` rows with room for as many again; zero where they had another shape."""
+    """The first `count` rows in an array of twice the size; zero if the rows had another shape."""
     out = np.zeros((max(_LEAST, 2 * count), *shape))
     if rows.shape[1:] == shape:
         out[:count] = rows[:count]

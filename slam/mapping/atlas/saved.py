@@ -12,7 +12,7 @@ from slam.errors import SlamError
 from slam.geometry.se3 import Array, nearest_rotation
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 
-#: Arrays of a file: numbers of each keyframe (K,), features, those of one keyframe after those of another, loops (L,).
+#: Arrays of a file: scalars, poses and covariances by keyframe, features of all keyframes in succession, and loops.
 ATLAS_TYPES = {
     "keyframe_stamps": np.float64, "keyframe_poses": np.float64, "keyframe_odometry": np.float64,
     "keyframe_covariances": np.float64, "keyframe_steps": np.float64, "keyframe_shares": np.float64,
@@ -23,7 +23,7 @@ ATLAS_TYPES = {
 }  # fmt: skip
 
 _LARGEST = 1e12  # guard: entry of a covariance [rad², m²]
-_TURNED = 1e-6  # guard: by which a rotation matrix may be none
+_TURNED = 1e-6  # guard: largest deviation from a rotation matrix
 _LIMITS = {
     "keyframe_stamps": _LARGEST, "keyframe_poses": FARTHEST_POSITION, "keyframe_odometry": FARTHEST_POSITION,
     "keyframe_covariances": _LARGEST, "keyframe_steps": _LARGEST, "keyframe_shares": _LARGEST,
@@ -33,7 +33,7 @@ _LIMITS = {
 
 
 def to_arrays(keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop]) -> dict[str, np.ndarray]:
-    """The arrays of keyframes, of their poses in the map (K, 4, 4), and of loops, see `ATLAS_TYPES`."""
+    """Keyframes, their poses in the map (K, 4, 4), and loops as arrays, see `ATLAS_TYPES`."""
     k = keyframes
     m = max((f.shares.shape[1] for f in k), default=0)
     shares = [f.shares if f.shares.shape[1] == m else np.zeros((6, m)) for f in k]
@@ -60,11 +60,11 @@ def to_arrays(keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop]
 def from_arrays(
     arrays: Mapping[str, np.ndarray], width: tuple[int, ...], source: str
 ) -> tuple[tuple[Keyframe, ...], Array, tuple[Loop, ...]]:
-    """The keyframes of arrays, their poses in the map (K, 4, 4), and the loops.
+    """Keyframes, their poses in the map (K, 4, 4), and loops from arrays.
 
     Args:
-        arrays: by the names of `ATLAS_TYPES`, of these types.
-        width: length of the descriptors of the map that they belong to (1,).
+        arrays: with the names and types of `ATLAS_TYPES`.
+        width: length of the map's descriptors (1,).
         source: where they were read from, for messages.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Is this the place of that keyframe? Descriptors propose, geometry decides, and gives the pose with its covariance."""
+"""Tests whether a frame shows a keyframe's place: by descriptors, then by geometry, which gives pose and covariance."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from slam.mapping.relocalizer import nowhere
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere
 from slam.tracking.localizer import Localizer
 
-#: What descriptors find slides over the surface when it is seen from elsewhere, all features of a place alike [px].
+#: Shift of features over the surface when seen from another viewpoint, common to all features of a place [px].
 _SLIDE = 1.0
 
-_ROUNDS = 5  # numerics: of least squares, at most
+_ROUNDS = 5  # numerics: most iterations of least squares
 _CONVERGED = 1e-6  # numerics: step [rad], [m]
 
 
@@ -32,9 +32,9 @@ class Verified:
     Attributes:
         keyframe: that shows it.
         T_keyframe_left: pose (4, 4) of the present camera in the keyframe's coordinates.
-        covariance: its covariance (6, 6), perturbing on the right.
-        noise: the part of it (6, 6) that is pixel noise of both frames.
-        matches: the keyframe's features that agree, by their rows, and the present frame's.
+        covariance: of that pose (6, 6), perturbing on the right.
+        noise: the part of the covariance (6, 6) due to pixel noise of both frames.
+        matches: inliers, as rows of the keyframe's features and of the present frame's.
     """
 
     keyframe: Keyframe
@@ -45,7 +45,7 @@ class Verified:
 
 
 def alike(keyframe: Keyframe, features: StereoFeatures, config: AssociationConfig) -> int:
-    """Number of a keyframe's features that match the present ones by descriptor alone."""
+    """Number of matches by descriptor alone between a keyframe and the present frame."""
     return len(match_everywhere(keyframe.descriptors.astype(np.float32), keyframe.laplacian, features, config))
 
 
@@ -57,13 +57,13 @@ def verify(
     config: AtlasConfig,
     seed: int,
 ) -> Verified | None:
-    """The present camera's pose before a keyframe, or None where too few features agree on one, or all in one spot.
+    """The present camera's pose relative to a keyframe; None if too few features agree, or all are in one spot.
 
     Args:
         keyframe: the older one.
         features: of the present frame.
         rig: the cameras.
-        localizer: finds features without a prediction, and those that agree.
+        localizer: matches features without a prediction, and finds the inliers.
         config: settings.
         seed: of the random choice in the geometric check.
     """
@@ -81,7 +81,7 @@ def verify(
     measured = measurement_rows(features.uv_left[seen], features.uv_right[seen])
     try:
         T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
-    except np.linalg.LinAlgError:  # points that no pose depends on, such as those of a map that lies
+    except np.linalg.LinAlgError:  # points that fix no pose, such as those of a corrupt map
         return None
     slide = _SLIDE / rig.left.fu
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
@@ -91,19 +91,19 @@ def verify(
 def refined_pose(
     rig: StereoRig, points: Array, measured: Array, T_world_left: Array, pixel_sigma: float
 ) -> tuple[Array, Array]:
-    """The pose (4, 4) of least squares, and its covariance (6, 6), from points that one stereo frame triangulated.
+    """Least-squares pose (4, 4) and its covariance (6, 6) from points triangulated in one earlier stereo frame.
 
-    Both frames have noise: that of the points is carried into the present pixels.
+    Both frames have noise: the points' covariance is propagated to the present pixels.
 
     Args:
         rig: the cameras.
         points: in the earlier camera's coordinates (M, 3) [m].
         measured: (uL, vL, uR) (M, 3) [px] in the present frame; uR NaN where there is no right pixel.
-        T_world_left: first guess of the present camera in the earlier one's coordinates (4, 4).
+        T_world_left: initial guess of the present camera's pose in the earlier one's coordinates (4, 4).
         pixel_sigma: noise of uL, vL, uR [px].
 
     Raises:
-        LinAlgError: the pose cannot be told from these points.
+        LinAlgError: these points do not determine the pose.
     """
     P = rig.triangulation_covariance(points, pixel_sigma)
     T, normal = T_world_left, np.eye(6)
@@ -128,7 +128,7 @@ def refined_pose(
 
 
 def _rows(keyframe: Keyframe) -> LandmarkRows:
-    """A keyframe's features as landmarks, their ids their rows."""
+    """A keyframe's features as landmarks, with their rows as ids."""
     count = len(keyframe)
     once = np.ones(count, np.int64)
     return LandmarkRows(
