@@ -130,8 +130,10 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether what was seen in motion is likelier with the mean than with the calibration as delivered."""
-        found, mean = self.evidence(), self._solution.mean
-        return found is not None and bool(found.motion.e @ mean - 0.5 * mean @ found.motion.S @ mean > _LIKELIER)
+        if not self.pairs and self._open is None:
+            return False
+        motion, mean = self._moved(), self._solution.mean
+        return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > _LIKELIER)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""
@@ -199,17 +201,16 @@ class SelfCalibration:
         """What this recording alone says, without any prior; None where no motion was seen."""
         if not self.pairs and self._open is None:
             return None
-        rows, *motion = self._parts()
-        moved = sum(motion[1:], motion[0])
+        (rows,), moved = self._rows.total(), self._moved()
         assert self._fields is not None  # as there are rows
         return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
-    def _parts(self) -> list[Evidence]:
-        """What rows and motion say, and the pair that is not complete."""
-        parts = [*self._rows.total(), *self._motion.total()]
+    def _moved(self) -> Evidence:
+        """What motion says: the pairs, and the one that is not complete; there is one of them at least."""
+        parts = self._motion.total()
         if self._open is not None:
             parts.append(self._open.scaled(1 / self._motion.inflation))
-        return parts
+        return sum(parts[1:], parts[0])
 
     def kept(self) -> KeptCalibration:
         """What is known now, to be kept for further recordings of the rig."""
