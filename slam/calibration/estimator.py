@@ -261,4 +261,4 @@ class SelfCalibration:
 
 def _mean_variance(changes: Array, covariance: Array) -> float:
     """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
-    return float(np.einsum("ni,ij,nj->n", changes, covariance, changes).mean())
+    return float((changes @ covariance * changes).sum(axis=1).mean())
