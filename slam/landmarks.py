@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.arrays import isin
 from slam.geometry.se3 import Array, transform
 from slam.showing import count
 
@@ -84,13 +85,15 @@ class LandmarkRows:
         seen again after `rematch_after` frames outside the image count as first seen now, from there. For landmarks
         `held`, which were withheld from the update, the frame counts as neither missed nor seen.
         """
-        back = np.zeros(len(self), bool) if held is None else np.isin(self.ids, held)
+        back = np.zeros(len(self), bool) if held is None else isin(self.ids, held)
         view, hit = self.rows(in_view), self.rows(measured)
         view = view[~back[view]]
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
         views[view] += 1
         missed[view] += 1
-        views[np.setdiff1d(hit, view)] += 1  # measured although not expected
+        unexpected = np.zeros(len(self), bool)
+        unexpected[hit], unexpected[view] = True, False
+        views += unexpected  # measured although not expected
         seen[hit] += 1
         missed[hit] = 0
         last_seen[hit] = frame

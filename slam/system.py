@@ -16,6 +16,7 @@ from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.extraction import Extractor, as_frame
 from slam.foreign import named_failures
+from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
@@ -272,7 +273,7 @@ class StereoSlam:
             corrected = self.calibration.correct(aligned.features)
         corrected = replace(corrected, images=None)
         held = self.objects.suspects
-        rows = matches.rows[np.isin(matches.ids, held)]
+        rows = matches.rows[isin(matches.ids, held)]
         return Associated(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
 
     def _update(self, seen: Associated, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg.blas import dgemm, dsyrk
 from scipy.linalg.lapack import dpstrf
 
-from slam.data import IndexArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 
 CAMERA = 12  #: fixed: size of the camera's state [r, φ, v, ω]
@@ -33,6 +33,7 @@ POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 _LOCAL = 150  # cost: rows of the local part that are never too many
 _WHOLE = 2.5  # cost: all are local where the state has at most so many times the rows of what is measured,
 _WHOLE_STILL = 4  # cost: and stay so up to here
+_PIECES = 8  # cost: of a matrix, that are copied one by one
 _THREE = np.arange(3)
 _LATER = np.maximum(_THREE[:, None], _THREE)  # row of an entry in the lower triangle of a symmetric block
 _EARLIER = np.minimum(_THREE[:, None], _THREE)
@@ -147,7 +148,7 @@ class Covariance:
     def marginal(self, slots: IndexArray) -> Array:
         """The covariance (6 + 3M, 6 + 3M) of ``g = [r, φ, landmarks]``; these are local."""
         g = self._rows(slots)
-        return self._local[g[:, None], g]
+        return self._local.take(g, axis=0).take(g, axis=1)  # cost: a quarter of the time of one index for both axes
 
     def columns(self, slots: IndexArray) -> Array:
         """Covariance (size, 6 + 3M) of the whole state with ``g = [r, φ, landmarks]``; these are local."""
@@ -237,8 +238,8 @@ class Covariance:
         holes, movers = np.flatnonzero(gone[:left]), left + np.flatnonzero(~gone[left:])
         stay = ~gone[self._slots]
         if not stay.all():
-            rows = np.flatnonzero(np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)]))
-            self._local, self._Phi = self._local[rows].take(rows, axis=1), self._Phi[rows]
+            rows = np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)])
+            self._local, self._Phi = _kept(self._local, rows), self._Phi[rows]
             self._slots = self._slots[stay]
         for hole, mover in zip(holes.tolist(), movers.tolist()):
             if self._place[mover] < 0:  # what is stored of local ones does not count
@@ -362,6 +363,24 @@ class Covariance:
 def _spare(rows: int) -> int:
     """Spare rows: few, as BLAS works through them, but a share of all, so that growing seldom copies the matrix."""
     return max(24, rows // 40)
+
+
+def _kept(M: Array, rows: BoolArray) -> Array:
+    """M (N, N) with some rows, and columns, alone; few pieces of it are left out."""
+    edges = np.flatnonzero(np.diff(rows, prepend=False, append=False)).tolist()
+    if len(edges) > 2 * _PIECES:
+        some = np.flatnonzero(rows)
+        return M.take(some, axis=0).take(some, axis=1)
+    count = np.count_nonzero(rows)
+    out = np.empty((count, count))
+    pieces, start = [], 0
+    for first, last in zip(edges[::2], edges[1::2]):
+        pieces.append((slice(start, start + last - first), slice(first, last)))
+        start += last - first
+    for to, of in pieces:
+        for across, of_across in pieces:
+            out[to, across] = M[of, of_across]
+    return out
 
 
 def _symmetric(M: Array) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 from slam.calibration.model import RigModel
 from slam.calibration.sensitivity import Followed, Frozen
 from slam.data import Estimate
-from slam.geometry.arrays import Array, IdArray
+from slam.geometry.arrays import Array, IdArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 from slam.models import EstimatorModels
 
@@ -58,6 +58,7 @@ class RigUncertainty:
         self._stamp = self._measured = 0.0
         self._followed: Followed | None = None
         self._others = Frozen.none(self._columns)
+        self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
 
     def observe(self, T_world_left: Array, stamp: float, ids: IdArray, positions: Array) -> None:
         """Take in a frame.
@@ -76,11 +77,11 @@ class RigUncertainty:
         local = transform(inverse(T), positions)
         front = local[:, 2] > 0
         ids, local, positions = ids[front], local[front], positions[front]
-        lately = before.ids[(before.unseen < _UNSEEN) | _isin(before.ids, ids)]
-        rows = np.flatnonzero(_isin(ids, others.ids))
+        lately = before.ids[(before.unseen < _UNSEEN) | isin(before.ids, ids)]
+        rows = np.flatnonzero(isin(ids, others.ids))
         wanted = _chosen(np.concatenate([lately, ids[rows]]))
         now, others = self._exchanged(before, others, wanted)
-        rows = rows[_isin(ids[rows], wanted)]
+        rows = rows[isin(ids[rows], wanted)]
         if len(rows):  # before the motion, whose error they share with the whole state
             again = np.searchsorted(others.ids, ids[rows])
             now = now.seen_again(others.select(again), transform(inverse(now.T_world), positions[rows]))
@@ -104,12 +105,12 @@ class RigUncertainty:
         if not len(ids) and not len(erased):
             return
         now, others = self._without(erased)
-        new = ~_isin(ids, np.concatenate([now.ids, others.ids, erased]))
+        new = ~isin(ids, np.concatenate([now.ids, others.ids, erased]))
         if new.any():
             ids, local = ids[new], transform(inverse(now.T_world), positions[new])
             wanted = _chosen(np.concatenate([now.ids, ids]))
             now, others = self._exchanged(now, others, wanted)
-            H, field, chosen = self._by_point(local), self._field(local), _isin(ids, wanted)
+            H, field, chosen = self._by_point(local), self._field(local), isin(ids, wanted)
             rest = now.seen_once(ids[~chosen], local[~chosen], H[~chosen], field[~chosen], self._noise)
             now = now.first_seen(ids[chosen], local[chosen], H[chosen], field[chosen], self._noise)
             others = others.joined(rest)
@@ -209,11 +210,14 @@ class RigUncertainty:
 
         It is the symmetric root, so that its columns mean the same in all frames.
         """
+        if self._root is not None and np.array_equal(self._root[0], covariance):
+            return self._root[1]
         n = self._columns
         factor = np.zeros((n, n))
         values, vectors = np.linalg.eigh(covariance)
         factor[:-2, :-2] = vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
         factor[-2, -2], factor[-1, -1] = BASELINE, 1.0
+        self._root = covariance, factor
         return factor
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
@@ -227,11 +231,11 @@ class RigUncertainty:
         now, others = self._followed, self._others
         if not len(erased):
             return now, others
-        return now.select(np.flatnonzero(~_isin(now.ids, erased))), others.select(~_isin(others.ids, erased))
+        return now.select(np.flatnonzero(~isin(now.ids, erased))), others.select(~isin(others.ids, erased))
 
     def _exchanged(self, now: Followed, others: Frozen, wanted: IdArray) -> tuple[Followed, Frozen]:
         """Move landmarks that are not `wanted` any more from the filter's state to the frozen ones."""
-        stays = _isin(now.ids, wanted)
+        stays = isin(now.ids, wanted)
         if stays.all():
             return now, others
         leaving = now.select(np.flatnonzero(~stays)).frozen()
@@ -264,9 +268,3 @@ def _chosen(ids: IdArray) -> IdArray:
     # Knuth's multiplicative hash, which is injective for ids below 2³².
     drawn = (ids.astype(np.uint64) * np.uint64(2654435761)) % np.uint64(2**32)
     return ids[np.lexsort((ids, drawn))[:_FOLLOWED]]
-
-
-def _isin(ids: IdArray, others: IdArray) -> np.ndarray:
-    """Like ``np.isin``, but ten times as fast for small arrays."""
-    known = set(others.tolist())
-    return np.fromiter((i in known for i in ids.tolist()), bool, len(ids))

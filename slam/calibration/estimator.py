@@ -133,8 +133,10 @@ class SelfCalibration:
 
     def _motion_agrees(self) -> bool:
         """Whether the evidence of motion is likelier with the posterior mean than with the calibration as delivered."""
-        found, mean = self.evidence(), self._solution.mean
-        return found is not None and bool(found.motion.e @ mean - 0.5 * mean @ found.motion.S @ mean > _LIKELIER)
+        if not self.pairs and self._open is None:
+            return False
+        motion, mean = self._moved(), self._solution.mean
+        return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > _LIKELIER)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""
@@ -202,17 +204,16 @@ class SelfCalibration:
         """The evidence of this recording alone, without any prior; None if no motion was seen."""
         if not self.pairs and self._open is None:
             return None
-        rows, *motion = self._parts()
-        moved = sum(motion[1:], motion[0])
-        assert self._fields is not None  # because there are rows
+        (rows,), moved = self._rows.total(), self._moved()
+        assert self._fields is not None  # as there are rows
         return RecordingEvidence(rows + moved, moved, residual_scale(self._prior, self._fields))
 
-    def _parts(self) -> list[Evidence]:
-        """The evidence of rows, of motion, and of the incomplete pair."""
-        parts = [*self._rows.total(), *self._motion.total()]
+    def _moved(self) -> Evidence:
+        """The evidence of motion: of the pairs, and of the incomplete one."""
+        parts = self._motion.total()
         if self._open is not None:
             parts.append(self._open.scaled(1 / self._motion.inflation))
-        return parts
+        return sum(parts[1:], parts[0])
 
     def kept(self) -> KeptCalibration:
         """The present posterior, as a prior for further recordings of the rig."""
@@ -263,4 +264,4 @@ class SelfCalibration:
 
 def _mean_variance(changes: Array, covariance: Array) -> float:
     """Mean variance of changes (N, n) by the parameters, with their covariance (n, n)."""
-    return float(np.einsum("ni,ij,nj->n", changes, covariance, changes).mean())
+    return float((changes @ covariance * changes).sum(axis=1).mean())

@@ -78,6 +78,7 @@ class Accumulator:
     def __init__(self, inflation: float, length: int) -> None:
         self._prior = inflation
         self._blocks: list[Evidence] = []
+        self._before: Evidence | None = None  # the sum of all blocks but the last, None where it is out of date
         self._length = length
         self._in_last = 0
         self.count = 0
@@ -87,7 +88,7 @@ class Accumulator:
         """Take in a likelihood."""
         if not self._blocks or self._in_last == self._length:
             self._blocks.append(evidence)
-            self._in_last = 0
+            self._in_last, self._before = 0, None
         else:
             self._blocks[-1] += evidence
         self._in_last += 1
@@ -102,14 +103,16 @@ class Accumulator:
             self._in_last += self._length
         self._blocks = [a + b for a, b in zip(even, odd)] + even[len(odd) :]
         self._length *= 2
+        self._before = None
 
     def total(self) -> list[Evidence]:
         """The sum, with its information divided by the inflation, in a list; empty if there is no likelihood."""
         if not self._blocks:
             return []
-        whole = self._blocks[0]
-        for block in self._blocks[1:]:
-            whole += block
+        *earlier, last = self._blocks
+        if earlier and self._before is None:
+            self._before = sum(earlier[1:], earlier[0])
+        whole = last if self._before is None else self._before + last
         return [whole.scaled(1 / self.inflation)]
 
     def update_inflation(self, mean: Array, covariance: Array) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 
 from slam.calibration.evidence import Evidence
 from slam.calibration.model import RigModel
-from slam.calibration.robust import median, student_weights
+from slam.calibration.robust import student_weights
 from slam.chi_square import chi_square_limit
+from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, so3_exp
 
 _ITERATIONS = 20  # numerics: of Gauss-Newton at most

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -110,11 +110,11 @@ def solve(
         evidence: of the data, from which the prior's scales follow.
         known: evidence of which the parameters' posterior is computed; None if it is `evidence`.
     """
-    whole, covariances, steps, logs = _by_scale(prior, evidence)
+    given = _by_scale(prior, evidence)
+    logs = given.log_likelihoods(prior)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    if known is not None:
-        whole, covariances, steps, _ = _by_scale(prior, known)
+    whole, _, _, covariances, steps = given if known is None else _by_scale(prior, known)
     step = weights @ steps
     off = steps - step
     inner = np.tensordot(weights, covariances + off[:, :, None] * off[:, None], axes=1)
@@ -146,14 +146,31 @@ def residual_scale(prior: Prior, rows: Evidence) -> float:
     return float(np.sqrt(weights @ np.square(RESIDUAL_SCALES) / weights.sum()))
 
 
-def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> tuple[Evidence, Array, Array, Array]:
-    """Total evidence and, per scale of the prior (K): covariances, changes of the mean, log marginal likelihoods."""
-    whole = evidence[0]
-    for more in evidence[1:]:
-        whole += more
-    total = prior.information + whole.S
-    covariances = np.linalg.inv(total)
+class _ByScale(NamedTuple):
+    """The posterior for each scale of the prior (K).
+
+    Attributes:
+        whole: total evidence.
+        e: its information vector (n,), about the prior's mean.
+        information: of the posterior (K, n, n).
+        covariances: of the posterior (K, n, n).
+        steps: changes of the mean (K, n).
+    """
+
+    whole: Evidence
+    e: Array
+    information: Array
+    covariances: Array
+    steps: Array
+
+    def log_likelihoods(self, prior: Prior) -> Array:
+        """Logarithms of the marginal likelihoods (K,)."""
+        return np.asarray(0.5 * (prior.log_determinants - np.linalg.slogdet(self.information)[1] + self.steps @ self.e))
+
+
+def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> _ByScale:
+    whole = sum(evidence[1:], evidence[0])
+    information = prior.information + whole.S
+    covariances = np.linalg.inv(information)
     e = whole.e - whole.S @ prior.mean
-    steps = covariances @ e
-    logs = 0.5 * (prior.log_determinants - np.linalg.slogdet(total)[1] + steps @ e)
-    return whole, covariances, steps, logs
+    return _ByScale(whole, e, information, covariances, covariances @ e)

@@ -46,15 +46,15 @@ class RemainingRigError:
             backend: the present one.
             restarted: part of the path is an earlier back end's and cannot be revised.
         """
-        applied, revising = self._calibration.applied, isinstance(backend, RevisingBackend)
-        if not restarted and isinstance(backend, RevisingBackend) and backend.revises_path:
+        applied, reviser = self._calibration.applied, backend if isinstance(backend, RevisingBackend) else None
+        if not restarted and reviser is not None and reviser.revises_path:
             self.uncertainty.path_follows(applied.parameters)
         else:
-            self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=revising)
-        if not isinstance(backend, RevisingBackend) or applied is self.given:
+            self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=reviser is not None)
+        if reviser is None or applied is self.given:
             return None
         revision = Revision(self.given, applied)
-        backend.revise(revision.rows)
+        reviser.revise(revision.rows)
         self.given = revision.after
         return revision
 

@@ -5,15 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from slam.chi_square import chi_square_limit
-from slam.geometry.se3 import Array
+from slam.geometry.arrays import Array, median
 
 _DEGREES = 4.0  # degrees of freedom of Student's t, with tails like those of matches, a few of which are wrong
-
-
-def median(values: Array) -> float:
-    """The median; for few numbers faster than NumPy's."""
-    ordered = np.sort(values, axis=None)
-    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def student_weights(squared: Array, dof: int, least: float) -> Array:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from slam.geometry.arrays import Array, IdArray
+from slam.geometry.arrays import Array, IdArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 
 _ROUNDING = 1e-12  # numerics: of the trace of a covariance
@@ -50,7 +50,7 @@ class Frozen:
 
     def joined(self, other: Frozen) -> Frozen:
         """Both together; landmarks in `other` replace those with the same id."""
-        mine = self.select(~np.isin(self.ids, other.ids))
+        mine = self.select(~isin(self.ids, other.ids))
         pairs = [(getattr(mine, name), getattr(other, name)) for name in ("ids", "by_rig", "relative", "drift")]
         both = Frozen(*(np.concatenate(pair) for pair in pairs))
         return both.select(np.argsort(both.ids, kind="stable"))
@@ -133,10 +133,10 @@ class Followed:
     def select(self, rows: IdArray) -> Followed:
         """The state with these landmarks only."""
         kept = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
+        covariance = self.covariance.take(kept, axis=0).take(kept, axis=1)  # cost: a fifth of the time of np.ix_
         return Followed(
-            self.T_world, self.ids[rows], self.local[rows], self.unseen[rows], self.by_rig[kept],
-            self.covariance[np.ix_(kept, kept)],
-        )  # fmt: skip
+            self.T_world, self.ids[rows], self.local[rows], self.unseen[rows], self.by_rig[kept], covariance
+        )
 
     def first_seen(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Followed:
         """The state with landmarks (K,) at `local` (K, 3) [m] first seen in this frame; other arguments: `measured`."""

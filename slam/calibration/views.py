@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, fit_motion, move, squared_distance
-from slam.calibration.robust import median
 from slam.chi_square import chi_square_limit
 from slam.data import StereoFeatures
+from slam.geometry.arrays import median
 from slam.geometry.pnp import find_consensus
 from slam.geometry.se3 import Array, inverse
 

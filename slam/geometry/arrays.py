@@ -1,4 +1,7 @@
-"""Names of the array types that signatures use; shapes and units are in the docstrings."""
+"""Names of the array types that signatures use, and what NumPy takes long to begin where there are few numbers.
+
+Shapes and units are in the docstrings.
+"""
 
 from __future__ import annotations
 
@@ -13,3 +16,18 @@ IdArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 #: Places in arrays: row or slot numbers.
 IndexArray = NDArray[np.intp]
+
+_MANY = 500  # cost: NumPy is quicker with more
+
+
+def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
+    """Which of `ids` (N,) are among `others` (M,): ``np.isin``, which takes several times as long for so few."""
+    if len(ids) + len(others) > 2 * _MANY:
+        return np.isin(ids, others)
+    return np.fromiter(map(set(others.tolist()).__contains__, ids.tolist()), bool, len(ids))
+
+
+def median(values: Array) -> float:
+    """The median of some numbers: ``np.median``, which takes longer to begin than these need."""
+    ordered = np.sort(values, axis=None)
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])

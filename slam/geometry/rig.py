@@ -142,7 +142,7 @@ class StereoRig:
         with np.errstate(all="ignore"):  # what is not finite is refused right away
             return cls(left, right, rotation, rotation.T @ offset)
 
-    @property
+    @cached_property
     def baseline(self) -> float:
         """Distance between the camera centres [m]."""
         return float(np.linalg.norm(self.b))

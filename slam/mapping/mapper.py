@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
 from slam.errors import ConfigurationError
+from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array
 from slam.interfaces import Backend, MapBackend
 from slam.landmarks import LandmarkRows
 from slam.mapping.config import MapConfig
@@ -107,7 +107,7 @@ class Mapper:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
         view = self._view(backend, landmarks, step)
         landmarks = self._count(landmarks, view, step)
-        bad = bad_landmarks(landmarks, self.config) | np.isin(landmarks.ids, step.labels.landmarks)
+        bad = bad_landmarks(landmarks, self.config) | isin(landmarks.ids, step.labels.landmarks)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
         known = known_features(view, landmarks, step.features, self.config)
@@ -187,7 +187,7 @@ class Mapper:
     def _count(self, landmarks: LandmarkRows, view: MapView, step: Step) -> LandmarkRows:
         """Count landmarks as seen or missed, unless the frame's pose was not measured."""
         m, matches = self.config, step.matches
-        measured = np.isin(matches.ids, np.concatenate([step.report.used, step.spared]))
+        measured = isin(matches.ids, np.concatenate([step.report.used, step.spared]))
         expected = landmarks.ids[:0]
         if not step.state.unmatched:
             size = (self.rig.width, self.rig.height)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
+from slam.geometry.arrays import median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend, ObjectBackend
@@ -38,7 +39,7 @@ from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene
 from slam.objects.revision import Mend, revise_tracks
-from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, median, record
+from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, record
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many

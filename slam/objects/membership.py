@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
@@ -26,7 +27,7 @@ from slam.objects.track_kernels import (
     squares_of_both,
     weighted_means,
 )
-from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, median, times_vectors
+from slam.objects.tracks import EXPLAINED, Tracks, fit_positions, times_vectors
 
 _ROUNDS = 3  # of fitting poses and points in turn
 _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, before anything is known [rad], [m]

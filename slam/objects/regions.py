@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
+from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, hat
 from slam.objects import scene_kernels as kernels
 from slam.objects.displacements import Displacements
-from slam.objects.tracks import median, times_vectors
+from slam.objects.tracks import times_vectors
 
 _PULL = 16.0  # no track brings more χ² than this: single false ones find no company
 _ROUNDS = (3, 2)  # numerics: of reweighting: Huber's first, which has one minimum, then a sharper one

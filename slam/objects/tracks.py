@@ -208,12 +208,6 @@ def fit_velocities(tracks: Tracks, rows: NDArray[np.intp], times: Array, max_spe
     tracks.position[moving], tracks.covariance[moving] = m.position[moves], m.covariance[moves]
 
 
-def median(values: Array) -> float:
-    """The median of a few values; NumPy's takes longer to begin than these need."""
-    ordered = np.sort(values)
-    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
-
-
 def times_vectors(M: Array, v: Array) -> Array:
     """Products (..., 3) of matrices (..., 3, 3) and vectors (..., 3)."""
     return np.asarray((M @ v[..., None])[..., 0])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
+from slam.geometry.arrays import isin, median
 from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
@@ -46,7 +47,7 @@ class LandmarkMatches:
 
     def without(self, ids: IdArray) -> LandmarkMatches:
         """A copy without some landmarks."""
-        keep = ~np.isin(self.ids, ids)
+        keep = ~isin(self.ids, ids)
         return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left)
 
     def landmark_of(self, features: int) -> IdArray:
@@ -294,7 +295,7 @@ def median_deviation(prediction: Prediction) -> float:
         return float("inf")
     S = prediction.innovation
     largest = 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
-    return float(np.sqrt(np.median(largest)))
+    return float(np.sqrt(median(largest)))
 
 
 def _matches_of(landmarks: LandmarkRows, matches: Matches, T_world_left: Array) -> LandmarkMatches:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Patches, StereoFeatures
+from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import RectifiedRig, StereoRig
-from slam.geometry.se3 import Array
 from slam.interfaces import AligningFrontend, Frontend
 from slam.landmarks import LandmarkRows
 from slam.tracking.answer_check import require_aligned, require_patches
@@ -54,7 +54,7 @@ class Anchors:
 
     def with_new(self, ids: IdArray, patches: Patches, T_world_left: Array) -> Anchors:
         """These and new ones, which replace earlier ones of the same landmark."""
-        old = self.select(~np.isin(self.ids, ids))
+        old = self.select(~isin(self.ids, ids))
         ids = np.concatenate([old.ids, ids])
         poses = np.concatenate([old.poses, np.tile(T_world_left, (len(patches), 1, 1))])
         return Anchors(ids, old.patches.joined(patches), poses).select(np.argsort(ids, kind="stable"))
@@ -118,7 +118,7 @@ class Aligner:
         if not self._enabled or not isinstance(frontend, AligningFrontend):
             return Aligned(features, Anchors.none())
         anchors = anchors.known(landmarks)
-        known, order = np.isin(anchors.ids, matches.ids), np.isin(matches.ids, anchors.ids)
+        known, order = isin(anchors.ids, matches.ids), isin(matches.ids, anchors.ids)
         if matches.T_world_left is None or features.images is None or not known.any():
             return Aligned(features, anchors)
         rows, matched = matches.rows[order], anchors.select(known)  # both by ascending id
@@ -138,7 +138,7 @@ class Aligner:
         uv_right[rows[found]] = rectified.unrectify_right(right[found])
         return Aligned(
             replace(features, uv_left=uv_left, uv_right=uv_right),
-            anchors.select(~np.isin(anchors.ids, matched.ids[~found | outgrown])),
+            anchors.select(~isin(anchors.ids, matched.ids[~found | outgrown])),
         )
 
     def anchored(
@@ -165,7 +165,7 @@ class Aligner:
         if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
             return anchors
         ids, rows = np.concatenate([matches.ids, added.ids]), np.concatenate([matches.rows, added.rows])
-        new = ~np.isin(ids, anchors.ids)
+        new = ~isin(ids, anchors.ids)
         if not new.any():
             return anchors
         uv = self._rig.rectified.rectify_left(features.uv_left[rows[new]])

@@ -7,7 +7,7 @@ import numpy as np
 from backends.ekf.angles import (
     attitude,
 )
-from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.covariance import CAMERA, Covariance, _kept
 from slam.geometry.euler import rotation
 from tests.slam.numeric import assert_equal_to_rounding, positive
 
@@ -209,3 +209,13 @@ def test_the_papers_angles_are_the_ones_of_the_state():
     # R(φ) = Rz Ry Rx, with the world turned: the filter's attitude is the printed matrix times a constant
     phi = np.array([0.3, -0.2, 0.9])
     np.testing.assert_allclose(attitude(np.eye(3), phi), rotation(phi), atol=1e-15)
+
+
+def test_a_part_of_a_matrix():
+    """In few pieces and in many, of the same bytes and in the same order in memory."""
+    rng = np.random.default_rng(2)
+    M = rng.standard_normal((60, 60))
+    for share in (0.0, 0.02, 0.1, 0.5, 0.98, 1.0):
+        rows = rng.random(60) >= share
+        part = _kept(M, rows)
+        assert (part == M[np.ix_(rows, rows)]).all() and part.flags.c_contiguous and not np.shares_memory(part, M)

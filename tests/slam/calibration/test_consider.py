@@ -214,3 +214,15 @@ def test_landmarks_that_come_and_go_are_as_good_as_those_that_stay(monkeypatch, 
     found = walked_after(blackout)
     monkeypatch.setattr(consider, "_UNSEEN", 1000)  # all are followed throughout
     assert found < 2 * walked_after(blackout)  # measured 1.3; joined after the motion, up to 10⁸
+
+
+def test_one_root_of_a_covariance_in_a_frame(monkeypatch):
+    """Another covariance has another root, and that of an equal one is the same."""
+    uncertainty = RigUncertainty(MODEL, EstimatorModels(), np.zeros(len(MODEL.names)))
+    roots, eigh = [], np.linalg.eigh
+    monkeypatch.setattr(consider.np.linalg, "eigh", lambda P: roots.append(P) or eigh(P))
+    one, other = np.diag(np.arange(1.0, len(MODEL.names) + 1)), np.eye(len(MODEL.names))
+    factors = [uncertainty._factor(P) for P in (one, one.copy(), other, one)]
+    assert len(roots) == 3 and (factors[0] == factors[1]).all() and (factors[0] == factors[3]).all()
+    for P, factor in zip((one, one, other), factors):
+        np.testing.assert_allclose((factor @ factor.T)[:-2, :-2], P, atol=1e-12)

@@ -126,6 +126,13 @@ def test_what_motion_has_hardly_shown_is_not_applied():
     assert disparity_error(calibration, TURNED) > 0.9 * disparity_error(drive(TURNED, frames=1), TURNED)
 
 
+def test_what_is_applied_asks_for_motion_alone(monkeypatch):
+    """What the rows leave, the residual fields, has no part in it."""
+    calibration = drive(TURNED)
+    monkeypatch.setattr("slam.calibration.estimator.residual_scale", None)
+    assert calibration._motion_agrees()
+
+
 def test_what_rows_alone_say_is_not_applied():
     """Rows with an error of their own, which is no error of the rig: motion does not show it."""
     theta = parameters(roll=1e-3, yaw=1e-3, pitch=1e-3, left_k1=0.005)

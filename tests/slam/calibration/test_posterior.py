@@ -107,3 +107,27 @@ def test_an_earlier_posterior_is_the_start():
     prior = Prior(np.array([2.0]), np.ones((1, 1, 1)))
     found = solve(prior, 0.0, [evidence(4.0, 1.0)])
     assert found.mean[0] == pytest.approx(3.0) and found.inner[0, 0] == pytest.approx(0.5)
+
+
+def test_sums_of_blocks_have_the_bytes_of_a_sum_from_the_start():
+    """Also after blocks were joined, and after a block was added to."""
+    rng, sums = np.random.default_rng(0), Accumulator(1.3, 2)
+    for _ in range(150):
+        S, e = rng.standard_normal((2, 2)), rng.standard_normal(2)
+        sums.add(Evidence(S, e, np.zeros((2, 1))))
+        blocks = sums._blocks
+        whole = sum(blocks[1:], blocks[0]).scaled(1 / sums.inflation)
+        for _ in range(2):
+            assert all((a == b).all() for a, b in zip(sums.total()[0], whole))
+
+
+def test_earlier_blocks_are_summed_once(monkeypatch):
+    sums = Accumulator(1.0, 4)
+    for _ in range(41):
+        sums.add(evidence(1.0, 1.0))
+    sums.total()
+    added, add = [], Evidence.__add__
+    monkeypatch.setattr(Evidence, "__add__", lambda a, b: added.append(b) or add(a, b))
+    sums.add(evidence(1.0, 1.0))
+    sums.total()
+    assert len(added) == 2  # to the last block, and that to those before it

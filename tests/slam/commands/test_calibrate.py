@@ -106,7 +106,7 @@ def test_recordings_without_pairs_of_views_get_a_warning(tmp_path, monkeypatch, 
     from slam.calibration.evidence import RecordingEvidence
 
     def by_rows(self):
-        rows = self._parts()[0]
+        rows = self._rows.total()[0]
         return RecordingEvidence(rows, rows.scaled(0.0))
 
     monkeypatch.setattr(SelfCalibration, "pairs", property(lambda _: 0))
