@@ -104,9 +104,9 @@ class BatchBackend:
         self._solution = None
 
     @one_blas_thread
-    def revise(self, mend: Callable[[Array], Array]) -> None:
+    def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`."""
-        self._smoother.revise(mend)
+        self._smoother.revise(correct)
         self._solution = None
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, match_everywhere, match_in_windows
 from slam.tracking.localizer import Localizer
@@ -40,7 +40,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 def scene(
     landmarks: int, features: int, uncertainty: float, outliers: float, rng: np.random.Generator
-) -> tuple[Prediction, LandmarkRows, np.ndarray, StereoFeatures]:
+) -> tuple[Prediction, LandmarkTable, np.ndarray, StereoFeatures]:
     """Landmarks in view of a camera whose predicted pose is off, and the features of the frame.
 
     A part of the landmarks has a feature; a share `outliers` of these lies some pixels off.
@@ -69,7 +69,7 @@ def scene(
     S = np.tile(np.eye(2) * (uncertainty**2 + SIGMA**2), (landmarks, 1, 1))
     ids, count = np.arange(landmarks), np.ones(landmarks, np.int64)
     prediction = Prediction(0.0, T, np.eye(6) * 1e-4, ids, expected, expected_right, S)
-    rows = LandmarkRows(ids, looks, signs, count, count, count, count)
+    rows = LandmarkTable(ids, looks, signs, count, count, count, count)
     return prediction, rows, points, frame
 
 
@@ -83,7 +83,7 @@ def cpu_ms(function: Callable[[], object]) -> float:
     return 1e3 * float(np.median(times))
 
 
-def all_distances(rows: LandmarkRows, features: StereoFeatures) -> np.ndarray:
+def all_distances(rows: LandmarkTable, features: StereoFeatures) -> np.ndarray:
     """What comparing all with all costs at least."""
     return np.asarray(np.sqrt(np.maximum(2 - 2 * (rows.descriptors @ features.descriptors.T), 0)))
 

@@ -23,10 +23,11 @@ from experiments.common import script_options
 from frontends.surf import Surf
 from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant
-from slam.compare.scheduler import LocalScheduler, available_cores
+from slam.compare.scheduler import LocalScheduler
 from slam.compare.statistics import difference
 from slam.compare.sweep import sweep
 from slam.compare.wording import sentence
+from slam.runtime.cores import available_cores
 
 WORLDS = ("synthetic:aisle?frames={}", "synthetic:desk?frames={}")
 VARIANTS = tuple(Variant(f"{d}-D", "surf", (f"frontend.descriptor={d}",)) for d in (64, 16))

@@ -18,10 +18,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.common import script_options
 from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
-from slam.compare.scheduler import LocalScheduler, available_cores
+from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
 from slam.run.figures import RunData, draw_map_3d, draw_top_view
 from slam.run.plots import plot
+from slam.runtime.cores import available_cores
 from slam.sequences import open_sequence
 
 HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",

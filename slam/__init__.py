@@ -11,9 +11,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from slam.calibration.kept import KeptCalibration as KeptCalibration
-    from slam.calibration.kept import load_calibration as load_calibration
-    from slam.calibration.kept import save_calibration as save_calibration
+    from slam.calibration.saved import SavedCalibration as SavedCalibration
+    from slam.calibration.saved import load_calibration as load_calibration
+    from slam.calibration.saved import save_calibration as save_calibration
     from slam.geometry.rig import StereoRig as StereoRig
     from slam.geometry.trajectory import Trajectory as Trajectory
     from slam.mapping.map_io import SavedMap as SavedMap
@@ -31,7 +31,7 @@ _PUBLIC = {
     "EstimatorModels": "slam.models",
     "Estimate": "slam.data",
     "FrameResult": "slam.data",
-    "KeptCalibration": "slam.calibration.kept",
+    "SavedCalibration": "slam.calibration.saved",
     "LiveFrames": "slam.sequences.live",
     "Observations": "slam.data",
     "PinholeCamera": "slam.geometry.camera",
@@ -42,11 +42,11 @@ _PUBLIC = {
     "StereoRig": "slam.geometry.rig",
     "StereoSlam": "slam.system",
     "Trajectory": "slam.geometry.trajectory",
-    "load_calibration": "slam.calibration.kept",
+    "load_calibration": "slam.calibration.saved",
     "load_map": "slam.mapping.map_io",
     "load_rig": "slam.sequences.rigs",
     "open_sequence": "slam.sequences",
-    "save_calibration": "slam.calibration.kept",
+    "save_calibration": "slam.calibration.saved",
     "save_map": "slam.mapping.map_io",
     "warm_up": "slam.run.warm_up",
 }

@@ -6,13 +6,13 @@ import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
-from slam.foreign import named_failures
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
+from slam.third_party import named_failures
 from slam.tracking.input_warnings import InputWarnings
 
 #: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].

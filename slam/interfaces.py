@@ -166,8 +166,8 @@ class RevisingBackend(Protocol):
 
     revises_path: bool
 
-    def revise(self, mend: Callable[[Array], Array]) -> None:
-        """Correct all measurements so far: `mend` maps rectified rows (uL, vL, uR) (N, 3) [px] to corrected ones.
+    def revise(self, correct: Callable[[Array], Array]) -> None:
+        """Correct all measurements so far: `correct` maps rectified rows (uL, vL, uR) (N, 3) [px] to corrected ones.
 
         Called before `Backend.predict` when the estimate of the rig's error has changed. A missing uR is NaN and stays
         NaN. A back end without this method keeps its estimate from the earlier measurements.

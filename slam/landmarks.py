@@ -14,7 +14,7 @@ from slam.showing import count
 
 
 @dataclass(frozen=True)
-class LandmarkRows:
+class LandmarkTable:
     """Landmarks in the map, a row each, ids ascending.
 
     Attributes:
@@ -53,10 +53,10 @@ class LandmarkRows:
         return len(self.ids)
 
     def __repr__(self) -> str:
-        return f"LandmarkRows({count(len(self), 'landmark')}, {self.descriptors.shape[1]}-D)"
+        return f"LandmarkTable({count(len(self), 'landmark')}, {self.descriptors.shape[1]}-D)"
 
     @classmethod
-    def empty(cls, dimensions: int) -> LandmarkRows:
+    def empty(cls, dimensions: int) -> LandmarkTable:
         """No landmarks, for descriptors of `dimensions` numbers."""
         none = np.zeros(0, np.int64)
         return cls(none, np.zeros((0, dimensions), np.float32), np.zeros(0, np.int8), none, none, none, none)
@@ -76,16 +76,16 @@ class LandmarkRows:
         camera: Array | None = None,
         in_image: BoolArray | None = None,
         rematch_after: int = 0,
-        held: IdArray | None = None,
-    ) -> LandmarkRows:
+        withheld: IdArray | None = None,
+    ) -> LandmarkTable:
         """The rows after a frame, given which ids were in view, which were measured, and by which features.
 
         `descriptor_update` is the weight of the new descriptors in the landmarks' own: 1 keeps the newest, 0 the first.
         `in_image` says which landmarks (N,) lie inside the image. If the camera's position (3,) [m] is given, landmarks
         seen again after `rematch_after` frames outside the image count as first seen now, from there. For landmarks
-        `held`, which were withheld from the update, the frame counts as neither missed nor seen.
+        `withheld` from the update, the frame counts as neither missed nor seen.
         """
-        back = np.zeros(len(self), bool) if held is None else isin(self.ids, held)
+        back = np.zeros(len(self), bool) if withheld is None else isin(self.ids, withheld)
         view, hit = self.rows(in_view), self.rows(measured)
         view = view[~back[view]]
         seen, views, missed, last_seen = (a.copy() for a in (self.seen, self.in_view, self.missed, self.last_seen))
@@ -108,7 +108,7 @@ class LandmarkRows:
         out_of_view = self.out_of_view + (0 if in_image is None else ~in_image)
         unseen = self.unseen + (~back if len(hit) else 0)
         out_of_view[hit] = unseen[hit] = 0
-        return LandmarkRows(
+        return LandmarkTable(
             self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, out_of_view, unseen
         )
 
@@ -123,10 +123,10 @@ class LandmarkRows:
         features: StereoFeatures,
         feature_rows: NDArray[np.intp],
         camera: Array | None = None,
-    ) -> LandmarkRows:
+    ) -> LandmarkTable:
         """The rows with new landmarks, seen from `camera` (3,)."""
         once = np.ones(len(ids), np.int64)
-        new = LandmarkRows(
+        new = LandmarkTable(
             ids,
             features.descriptors[feature_rows],
             features.laplacian[feature_rows],
@@ -138,16 +138,16 @@ class LandmarkRows:
         )
         return self.joined(new)
 
-    def joined(self, other: LandmarkRows) -> LandmarkRows:
+    def joined(self, other: LandmarkTable) -> LandmarkTable:
         """These and others, ids ascending; none may be in both."""
-        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(LandmarkRows))
-        whole = LandmarkRows(*both)
+        both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(LandmarkTable))
+        whole = LandmarkTable(*both)
         return whole.select(np.argsort(whole.ids, kind="stable"))
 
-    def moved(self, T: Array) -> LandmarkRows:
+    def moved(self, T: Array) -> LandmarkTable:
         """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
         return replace(self, seen_from=transform(T, self.seen_from))
 
-    def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkRows:
+    def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkTable:
         """Some of the rows, in order."""
-        return LandmarkRows(*(getattr(self, f.name)[keep] for f in fields(LandmarkRows)))
+        return LandmarkTable(*(getattr(self, f.name)[keep] for f in fields(LandmarkTable)))

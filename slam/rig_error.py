@@ -12,24 +12,24 @@ from slam.geometry.arrays import Array
 
 @dataclass(frozen=True)
 class CommonError:
-    """Error of poses due to the rig's error: ``shares @ scale @ c``, with the same c for all poses.
+    """Error of poses due to the rig's error: ``jacobian @ root @ c``, with the same c for all poses.
 
     If the correction has changed since a pose was estimated, the pose still contains the difference. It is one column
-    of `scale`: its effect on the pose is only known from a model of the estimator, so it counts as an error, too.
+    of `root`: its effect on the pose is only known from a model of the estimator, so it counts as an error, too.
 
     Attributes:
-        shares: derivative (6, m) of the pose, perturbed on the right, by m errors that all poses share.
-        scale: derivative (m, n) of these errors by the common errors c (n,), which have unit variance.
+        jacobian: derivative (6, m) of the pose, perturbed on the right, by m errors that all poses share.
+        root: derivative (m, n) of these errors by the common errors c (n,), which have unit variance.
     """
 
-    shares: Array = field(default_factory=lambda: np.zeros((6, 0)))
-    scale: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    jacobian: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    root: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def covariance(self) -> Array:
         """What it adds to the pose's covariance (6, 6)."""
-        root = self.shares @ self.scale
-        return np.asarray(root @ root.T)
+        S = self.jacobian @ self.root
+        return np.asarray(S @ S.T)
 
 
 class Correction(Protocol):

@@ -10,45 +10,45 @@ from typing import overload
 import numpy as np
 
 from slam import registry
-from slam.calibration import KeptCalibration, RemainingRigError, Revision, SelfCalibration
+from slam.calibration import RemainingRigError, Revision, SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame, UpdateReport
 from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.extraction import Extractor, as_frame
-from slam.foreign import named_failures
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, Frontend
-from slam.landmarks import LandmarkRows
-from slam.mapping.atlas.atlas import Atlas, Gap
+from slam.landmarks import LandmarkTable
+from slam.mapping.atlas.atlas import Atlas, TrackingGap
 from slam.mapping.atlas.loop_closer import LoopCloser
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.mapper import MapChange, Mapper
 from slam.mapping.relocalizer import Relocalizer
-from slam.mapping.step import Associated, Completed, Step
+from slam.mapping.step import AssociatedFrame, Completed, Step
 from slam.objects.modes import ObjectDetector, detector_for
 from slam.results import frame_result
-from slam.runtime.ahead import ahead
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.memory import keep_freed_memory
 from slam.runtime.one_thread import OneThread
+from slam.runtime.prefetch import prefetch
 from slam.runtime.stages import Stages
 from slam.showing import count
-from slam.tracking.answer_check import require_estimate, require_positions, require_prediction, require_report
+from slam.third_party import named_failures
 from slam.tracking.feature_check import usable
 from slam.tracking.localizer import LandmarkMatches, Localizer
-from slam.tracking.patch_alignment import Aligner, Anchors
+from slam.tracking.patch_alignment import Aligner, PatchAnchors
+from slam.tracking.protocol_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.state import TrackingState
 
 
 def _require_types(
-    rig: StereoRig, config: SystemConfig | None, prior_map: SavedMap | None, rig_prior: KeptCalibration | None
+    rig: StereoRig, config: SystemConfig | None, prior_map: SavedMap | None, rig_prior: SavedCalibration | None
 ) -> None:
     """Raise ConfigurationError if an argument of a system has another type than documented."""
     kinds: dict[str, tuple[object, type]] = {
         "rig": (rig, StereoRig), "config": (config, SystemConfig),
-        "prior_map": (prior_map, SavedMap), "rig_prior": (rig_prior, KeptCalibration),
+        "prior_map": (prior_map, SavedMap), "rig_prior": (rig_prior, SavedCalibration),
     }  # fmt: skip
     for name, (value, kind) in kinds.items():
         if not isinstance(value, kind) and (value is not None or name == "rig"):
@@ -97,7 +97,7 @@ class StereoSlam:
         kind: str = "handheld",
         config: SystemConfig | None = None,
         prior_map: SavedMap | None = None,
-        rig_prior: KeptCalibration | None = None,
+        rig_prior: SavedCalibration | None = None,
     ) -> None:
         keep_freed_memory()
         _require_types(rig, config, prior_map, rig_prior)
@@ -117,7 +117,7 @@ class StereoSlam:
             if isinstance(backend, str)
             else registry.require_methods("backends", backend)
         )
-        self.landmarks: LandmarkRows | None = None  # of the last step that was completed
+        self.landmarks: LandmarkTable | None = None  # of the last step that was completed
         self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
         self.objects: ObjectDetector = detector_for(rig, c.objects, c.models)
         self.frontend_name = names[0] or ""
@@ -188,7 +188,7 @@ class StereoSlam:
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
         extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
         depth = 1 if getattr(frames, "live", False) else 2  # live frames must not wait
-        for frame, features, milliseconds in ahead(extracted, depth) if overlap else extracted:
+        for frame, features, milliseconds in prefetch(extracted, depth) if overlap else extracted:
             with self._stepping:
                 result = self._step(features, frame.index)
             yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
@@ -231,8 +231,8 @@ class StereoSlam:
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
             seen = self._associate(prediction, features, index)
         with stages.stage("update"):  # the measurement of the landmarks
-            report, spared, state = self._update(seen, dt)
-            seen = self._begin_anew(seen, state, index)
+            report, left_out, state = self._update(seen, dt)
+            seen = self._start_new_map(seen, state, index)
         with stages.stage("estimate"):
             estimate = self._estimate_pose(report)
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
@@ -240,8 +240,8 @@ class StereoSlam:
             objects = self.objects.update(self.backend, seen.features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(
-                index, seen.features, seen.prediction, seen.matches, seen.held, seen.held_rows, spared, report, state,
-                estimate, labels,
+                index, seen.features, seen.prediction, seen.matches, seen.withheld, seen.withheld_rows, left_out,
+                report, state, estimate, labels,
             )  # fmt: skip
             change, anchors = self._manage(seen, step)
         with stages.stage("atlas"):  # a loop closure corrects the path
@@ -262,10 +262,10 @@ class StereoSlam:
         dt, self._stamp = stamp - self._stamp, stamp
         return prediction, dt
 
-    def _associate(self, prediction: Prediction, features: StereoFeatures, index: int) -> Associated:
+    def _associate(self, prediction: Prediction, features: StereoFeatures, index: int) -> AssociatedFrame:
         """Match landmarks with features, and align the features if the front end can."""
         corrected = self.calibration.correct(features)
-        landmarks = self.landmarks or LandmarkRows.empty(features.descriptors.shape[1])
+        landmarks = self.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
         landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
         anchors, places = self._last.anchors, self.backend.positions
         aligned = self._aligner.align(self.frontend, anchors, features, matches, landmarks, places)
@@ -274,17 +274,17 @@ class StereoSlam:
         corrected = replace(corrected, images=None)
         held = self.objects.suspects
         rows = matches.rows[isin(matches.ids, held)]
-        return Associated(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
+        return AssociatedFrame(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
 
-    def _update(self, seen: Associated, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:
+    def _update(self, seen: AssociatedFrame, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:
         """Update the back end: its report, the ids of landmarks left out of the update, and the tracking state."""
         positions = self._positions(seen.matches.ids)
-        asked, spared = self._localizer.informative(seen.prediction, seen.matches, positions, dt)
+        asked, left_out = self._localizer.informative(seen.prediction, seen.matches, positions, dt)
         report = self.backend.update(asked.observations(seen.features), asked.T_world_left)
         require_report(report, self.backend)
         state = self._localizer.state_after(self._last.state, seen.prediction, seen.features, asked, report)
         self.calibration.observe(replace(seen.aligned.features, images=None), seen.pose)
-        return report, spared, state
+        return report, left_out, state
 
     def _estimate_pose(self, report: UpdateReport) -> Estimate:
         """The camera's pose after an update; the rig's uncertainty is propagated to it."""
@@ -294,12 +294,12 @@ class StereoSlam:
         )
         return estimate
 
-    def _manage(self, seen: Associated, step: Step) -> tuple[MapChange, Anchors]:
+    def _manage(self, seen: AssociatedFrame, step: Step) -> tuple[MapChange, PatchAnchors]:
         """Change the map after a frame: the change, and the landmarks' image patches."""
         change = self._mapper.update(self.backend, seen.landmarks, step)
         T = step.estimate.T_world_left
         anchors = self._aligner.anchored(self.frontend, seen.aligned, seen.matches, change.added, T)
-        if self.landmarks is not None and not len(seen.landmarks):  # left behind: a new map has begun
+        if self.landmarks is not None and not len(seen.landmarks):  # left behind: a new map was started
             change = replace(change, erased=np.concatenate([self.landmarks.ids, change.erased]))
         new = np.setdiff1d(change.added.ids, change.erased)
         self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
@@ -315,9 +315,9 @@ class StereoSlam:
         step = replace(step, estimate=estimate, common=common, correction=self.calibration.applied)
         atlas, seen_again = self._loop_closer.update(self.atlas, step, change.added, self._path)
         if seen_again is not None:
-            change = self._mapper.give_back(self.backend, change, step, seen_again)
+            change = self._mapper.restore(self.backend, change, step, seen_again)
             back = np.sort(change.returned.ids)
-            self._rig_error.uncertainty.see_anew(back, self._positions(back))
+            self._rig_error.uncertainty.replace_landmarks(back, self._positions(back))
         return step, atlas, change
 
     @one_blas_thread
@@ -398,7 +398,7 @@ class StereoSlam:
 
     @property
     def restarted(self) -> list[int]:
-        """Indices of the frames in which another back end took over: a kidnapped camera, or a map begun anew."""
+        """Indices of the frames in which another back end took over: a kidnapped camera, or a new map."""
         return self._relocalizer.restarted
 
     def _revise(self) -> Revision | None:
@@ -430,8 +430,8 @@ class StereoSlam:
         return True
 
     def _localize(
-        self, prediction: Prediction, landmarks: LandmarkRows, features: StereoFeatures, index: int
-    ) -> tuple[LandmarkRows, Prediction, LandmarkMatches]:
+        self, prediction: Prediction, landmarks: LandmarkTable, features: StereoFeatures, index: int
+    ) -> tuple[LandmarkTable, Prediction, LandmarkMatches]:
         """Match landmarks in this frame; if the camera was kidnapped, start a new back end first.
 
         If it is at a place of the atlas that is no longer in the map, landmarks of that place join the map.
@@ -458,11 +458,11 @@ class StereoSlam:
             landmarks, place = self._mapper.insert(new, landmarks, found.place), found.stamp
             positions = new.positions(landmarks.ids)
         prediction = new.predict(features.stamp)
-        gap = Gap(self._last.measured_at, features.stamp)
-        self._take_over(new, path, self.atlas.found_again(gap, place), index)
+        gap = TrackingGap(self._last.measured_at, features.stamp)
+        self._take_over(new, path, self.atlas.relocalized(gap, place), index)
         return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)
 
-    def _begin_anew(self, seen: Associated, state: TrackingState, index: int) -> Associated:
+    def _start_new_map(self, seen: AssociatedFrame, state: TrackingState, index: int) -> AssociatedFrame:
         """If the camera is in an unknown place, begin a new map there with a new back end.
 
         The new map's pose relative to the earlier one is as uncertain as the predicted pose, until a place of the atlas
@@ -472,11 +472,11 @@ class StereoSlam:
         if not (unknown and c.enabled and len(self.atlas) and self._relocalizer.can_restart(self.backend)):
             return seen
         before = self._rig_error.added_to(require_estimate(self.backend.estimate(landmarks=False), self.backend))
-        new, path = self._relocalizer.begin_anew(self.backend, seen.features.stamp)
+        new, path = self._relocalizer.start_new_map(self.backend, seen.features.stamp)
         after, common = new.estimate(landmarks=False), self._rig_error.common(as_given=False)
         since, models = self._last.measured_at, self.config.models
-        self._take_over(new, path, self.atlas.begun_anew(since, before, after, common, models), index)
-        none = LandmarkRows.empty(seen.features.descriptors.shape[1])
+        self._take_over(new, path, self.atlas.with_new_map(since, before, after, common, models), index)
+        none = LandmarkTable.empty(seen.features.descriptors.shape[1])
         return replace(seen, landmarks=none, matches=LandmarkMatches.nothing())
 
     def _take_over(self, new: Backend, path: Trajectory, atlas: Atlas, index: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from backends.ekf.atomic import all_or_nothing
 from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import POSE
-from backends.ekf.landmarks import far_charts
+from backends.ekf.landmarks import distant_anchors
 from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
 from backends.ekf.motion import motion_noise
 from backends.ekf.recovery import agreement
@@ -174,7 +174,7 @@ class EkfBackend:
         self._state.landmarks.require_new(ids)
         if len(ids):
             none = np.zeros((len(ids), 3, POSE))
-            self._state.append(ids, far_charts(positions, covariances), positions, none, covariances)
+            self._state.append(ids, distant_anchors(positions, covariances), positions, none, covariances)
 
     @one_blas_thread
     @all_or_nothing
@@ -190,7 +190,7 @@ class EkfBackend:
 
     revises_path = False
 
-    def revise(self, mend: Callable[[Array], Array]) -> None:
+    def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: landmarks in view move to where they are seen at from now on.
 
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
@@ -202,7 +202,7 @@ class EkfBackend:
         T = self._poses[-1] @ rectified_rig.T_left_rectified
         z, _ = rectified_rig.rig.project_stereo(se3.transform(se3.inverse(T), marks.points), jacobian=False)
         rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
-        z = mend(z[rows])
+        z = correct(z[rows])
         if not np.isfinite(z).all():
             raise MeasurementError("ekf: a mended measurement is not finite")
         points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))

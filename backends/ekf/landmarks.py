@@ -231,7 +231,7 @@ class Landmarks:
         return self.coordinates.jacobian(self.anchors[slots], self.state[slots])
 
 
-def far_charts(points: Array, covariances: Array) -> Array:
+def distant_anchors(points: Array, covariances: Array) -> Array:
     """Charts (M, 3, 4) for points (M, 3) that are known as Gaussians in the world, by their covariances (M, 3, 3).
 
     They stand off by so many standard deviations that all coordinates are linear in the position: the Gaussian stays.

@@ -21,7 +21,7 @@ from backends.ekf.covariance import POSE
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.tracking.agreement import CONFIRMED, ENOUGH, HEEDED, share_by_chance
+from slam.tracking.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
 #: The change of [r, φ] (6,) to a pose on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]
@@ -39,8 +39,8 @@ class Agreement:
 def agreement(problem: Problem, noises: Sequence[Array], search: Search, models: EstimatorModels) -> Agreement | None:
     """Solve with the prior that most observations agree with.
 
-    Less than a third of the observations is not heeded where as many wrong ones might agree by chance: these move the
-    pose anywhere.
+    Where less than a third of the observations agrees, and as many wrong ones might agree by chance, that agreement is
+    ignored: it could move the pose anywhere.
 
     Args:
         problem: the update.
@@ -69,19 +69,19 @@ def agreement(problem: Problem, noises: Sequence[Array], search: Search, models:
 def _as_predicted(problem: Problem, noises: Sequence[Array]) -> Agreement | None:
     """With the prediction, or a wider one that most observations pass the gate of."""
     wider, gated, noise = _gated(problem, noises)
-    found = _heeded(wider, gated, noise)
+    found = _agreed(wider, gated, noise)
     if noise is not None and (found is None or 2 * found.solution.used.sum() < len(problem.z)):
-        found = _heeded(problem, gate(problem), None) or found  # they passed, but do not agree with each other
+        found = _agreed(problem, gate(problem), None) or found  # they passed, but do not agree with each other
     return found
 
 
-def _heeded(problem: Problem, gated: Gated, noise: Array | None) -> Agreement | None:
+def _agreed(problem: Problem, gated: Gated, noise: Array | None) -> Agreement | None:
     """What agrees with a prediction, if it is more than might agree by chance."""
     solution = solve(problem, gated)
     if solution is None:
         return None
-    used, few = int(solution.used.sum()), len(problem.z) < ENOUGH
-    if not few and HEEDED * used < len(problem.z) and _by_chance(gated, used, problem):
+    used, few = int(solution.used.sum()), len(problem.z) < MIN_OBSERVATIONS
+    if not few and ONE_AGREES_IN * used < len(problem.z) and _by_chance(gated, used, problem):
         return None
     return Agreement(problem, solution, noise)
 
@@ -101,7 +101,7 @@ def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, A
     What still disagrees is taken out later by `solve`.
     """
     first = gate(problem)
-    most = max(ENOUGH, _half(problem))
+    most = max(MIN_OBSERVATIONS, _half(problem))
     if len(problem.z) < most or first.used.sum() >= most:
         return problem, first, None
     for noise in (None, *noises):
@@ -115,7 +115,7 @@ def _gated(problem: Problem, noises: Sequence[Array]) -> tuple[Problem, Gated, A
 
 def _restarted(problem: Problem, search: Search, models: EstimatorModels) -> Agreement | None:
     """With a camera that is where the landmarks say, wherever it was before; None where most do not agree with it."""
-    least = max(CONFIRMED, _half(problem))
+    least = max(MIN_CONSENSUS, _half(problem))
     change = search() if len(problem.z) >= least else None
     if change is None:
         return None

@@ -88,7 +88,7 @@ class SmootherBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        self._graph.mend()
+        self._graph.repair()
         self._commit()
         stamps = self.measurement_log.path.stamps
         require_stamp("smoother", stamp, float(stamps[-1]) if len(stamps) else None)
@@ -133,7 +133,7 @@ class SmootherBackend:
         with self._whole():
             if found.jump is not None:
                 before = self._belief.covariances_from_measured()
-                failure = self._graph.start_anew(predicted.stamp, T, world_covariance(P), before, slots[used], z[used])
+                failure = self._graph.restart(predicted.stamp, T, world_covariance(P), before, slots[used], z[used])
             else:
                 failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
             if failure:
@@ -168,7 +168,7 @@ class SmootherBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
-        self._graph.mend()
+        self._graph.repair()
         if landmarks and self.measurement_log.path.predicted is None:
             self._graph.converge()
         stamp, T, P = self._belief.newest()
@@ -185,7 +185,7 @@ class SmootherBackend:
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
-        self._graph.mend()
+        self._graph.repair()
         path = self.measurement_log.path
         ahead = path.predicted
         if ahead is not None:  # not in the graph yet: its measurements are still to come
@@ -222,12 +222,12 @@ class SmootherBackend:
         return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
 
     @one_blas_thread
-    def revise(self, mend: Callable[[Array], Array]) -> None:
+    def revise(self, correct: Callable[[Array], Array]) -> None:
         """See `slam.interfaces.RevisingBackend.revise`: solves the whole problem again, as long as that takes."""
         self._commit()
         if self.measurement_log.measurements.count:
             with self._whole():
-                self._graph.revise(mend)
+                self._graph.revise(correct)
 
     # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
 
@@ -260,7 +260,7 @@ class SmootherBackend:
     @contextmanager
     def _whole(self) -> Iterator[None]:
         """Make a block atomic: if it is interrupted, the measurement log is restored."""
-        self._graph.mend()
+        self._graph.repair()
         restore = snapshot(self.measurement_log)
         try:
             yield

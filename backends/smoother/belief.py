@@ -26,7 +26,7 @@ from backends.smoother.variables import pose_key
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.tracking.agreement import CONFIRMED
+from slam.tracking.agreement import MIN_CONSENSUS
 
 
 class Belief:
@@ -106,7 +106,7 @@ class Belief:
         if not len(window) or not path.measured or not recovery.unknown_turn(window.covariance[-6:, -6:]):
             return False
         newest = path.measured[-1]
-        if np.count_nonzero(self._log.measurements.frame == newest) < CONFIRMED:
+        if np.count_nonzero(self._log.measurements.frame == newest) < MIN_CONSENSUS:
             return False
         with suppress(SolverError):  # the oldest pose, where it is held, may be turned in the world by any angle
             return recovery.unknown_turn(self._graph.solver.joint_covariance([pose_key(newest)]))
@@ -134,7 +134,9 @@ class Belief:
         P = uncertainty.quadratic(self.landmarks_by_window(slots), self.window().covariance) + marks.covariance[slots]
         variables = marks.variable[slots].tolist()
         try:
-            exact = self._graph.solver.point_covariances(variables, pose_key(path.count - 1), self._log.history.held)
+            exact = self._graph.solver.point_covariances(
+                variables, pose_key(path.count - 1), self._log.history.reference
+            )
         except SolverError:
             self._graph.recover()
             return P

@@ -11,13 +11,13 @@ import numpy as np
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_builder import FactorBuilder
 from backends.smoother.factors import FactorMaker, to_pose3
-from backends.smoother.held import Held
-from backends.smoother.lag import held_pose, overdue, without_old
+from backends.smoother.lag import overdue, reference_pose, without_old
 from backends.smoother.landmarks import Known
 from backends.smoother.marginal import reference_prior
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.positions import linearise, place
 from backends.smoother.rebuild import optimise, pose_factor, stepped, whole_problem
+from backends.smoother.reference_pose import ReferencePose
 from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray, IndexArray
@@ -97,8 +97,8 @@ class FactorGraph:
         self.solutions += 1
         self.placements += 1
 
-    def mend(self) -> None:
-        """Make the solver anew after an interruption."""
+    def repair(self) -> None:
+        """Build a new solver after an interruption."""
         if self._broken:
             self.recover()
             self._broken = False
@@ -153,7 +153,7 @@ class FactorGraph:
         self._advance()
         return ""
 
-    def start_anew(
+    def restart(
         self, stamp: float, T_world_left: Array, covariance: Array, covariances: Array, slots: IndexArray, z: Array
     ) -> str:
         """Add a frame whose pose is set by the landmarks, not by the poses before it.
@@ -173,7 +173,7 @@ class FactorGraph:
         """
         log, frame = self.log, self.log.path.count
         log.path.append(stamp, T_world_left)
-        log.start_anew(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
+        log.restart(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
         self._out_of_date()
         self._solved, self._broken = False, True
         rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
@@ -229,10 +229,10 @@ class FactorGraph:
             self.log.finish(marks.tracks[slot])
         marks.remove(slots)
 
-    def revise(self, mend: Callable[[Array], Array]) -> None:
-        """Correct all measurements by `mend` and solve anew."""
+    def revise(self, correct: Callable[[Array], Array]) -> None:
+        """Correct all measurements by `correct` and solve the problem again."""
         marks = self.log.landmarks
-        self.log.revise(mend, self._make.point)
+        self.log.revise(correct, self._make.point)
         try:
             self._rebuild(near=True)
         except SolverError:
@@ -242,17 +242,17 @@ class FactorGraph:
                 self._place(marks.used())
 
     def joint_covariance(self, keys: list[int]) -> Array:
-        """Joint covariance of pose variables, as if none was held (see `backends.smoother.marginal.Held`).
+        """Joint covariance of pose variables, as if none was held (see `backends.smoother.reference_pose`).
 
         Raises:
             SolverError: the solver cannot give it.
         """
-        held = self.log.history.held
+        held = self.log.history.reference
         if held is None:
             return self.solver.joint_covariance(keys)
         others = [key for key in keys if key != held.key]
         P = self.solver.joint_covariance([held.key, *others])
-        P = held.let_go(P, P[:, :6], P[:6, :6])
+        P = held.released(P, P[:, :6], P[:6, :6])
         return P if len(others) < len(keys) else P[6:, 6:]
 
     def converge(self) -> None:
@@ -324,7 +324,7 @@ class FactorGraph:
             self._factor_builder.eliminate_late(rest.change, first, rest.gone)
             solver = self._new_solver()
             new = solver.update(rest.change)
-            held = _informed(rest.held, solver)
+            held = _with_covariance(rest.held, solver)
             left = self.solver.poses(pose_key(i) for i in range(self.log.history.first, first))
         except SolverError:
             return
@@ -402,7 +402,7 @@ class FactorGraph:
         self._factor_builder.eliminate_late(change)
         start = time.process_time()
         prior = self.log.history.prior
-        held = None if prior is None else held_pose(self.log, prior, change.values)
+        held = None if prior is None else reference_pose(self.log, prior, change.values)
         if held is not None:  # before all is solved: poses that have left would not follow if it moved
             change.factors.add(held.factor())
         try:
@@ -413,9 +413,9 @@ class FactorGraph:
         solver = self._new_solver()
         new = solver.update(change)
         with suppress(SolverError):
-            held = _informed(held, solver)
+            held = _with_covariance(held, solver)
         self._broken = True  # until all of the following has been done
-        self.log.history.held = held
+        self.log.history.reference = held
         for track in self.log.landmarks.tracks.values():
             track.factor = -1
         for track, number in places:
@@ -427,6 +427,6 @@ class FactorGraph:
         self._broken = False
 
 
-def _informed(held: Held | None, solver: Solver) -> Held | None:
+def _with_covariance(held: ReferencePose | None, solver: Solver) -> ReferencePose | None:
     """The held pose with its covariance from a new solver."""
-    return None if held is None else held.informed(solver.joint_covariance([held.key]))
+    return None if held is None else held.with_covariance_from(solver.joint_covariance([held.key]))

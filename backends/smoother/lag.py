@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import gtsam
 
-from backends.smoother.held import Held
 from backends.smoother.landmarks import Track
 from backends.smoother.marginal import MarginalPrior, marginal_prior
 from backends.smoother.measurement_log import MeasurementLog
+from backends.smoother.reference_pose import ReferencePose
 from backends.smoother.solver import FAILURES, Change, Solver, SolverError
 from backends.smoother.variables import pose_key, put, size_of
 
@@ -22,7 +22,7 @@ _SHARE = 2
 
 
 @dataclass(frozen=True)
-class Rest:
+class Marginalised:
     """The problem after marginalisation.
 
     Attributes:
@@ -39,7 +39,7 @@ class Rest:
     gone: list[int]
     finished: list[Track]
     prior: MarginalPrior
-    held: Held | None
+    held: ReferencePose | None
     change: Change
     slots: dict[int, int]
 
@@ -50,7 +50,7 @@ def overdue(log: MeasurementLog, lag: int) -> int | None:
     return first if first >= log.history.first + max(1, lag // _SHARE) else None
 
 
-def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> Rest:
+def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> Marginalised:
     """Marginalise the poses before frame `first`, and landmark variables last measured before it.
 
     Those of erased landmarks leave, and of the others the oldest if there are more than `most`.
@@ -64,7 +64,7 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
     leaving = {*map(pose_key, range(history.first, first)), *gone}
     touched, staying = gtsam.NonlinearFactorGraph(), set()
     slots: dict[int, int] = {}
-    held_keys, keep = [] if history.held is None else [history.held.key], kept.factors.add
+    held_keys, keep = [] if history.reference is None else [history.reference.key], kept.factors.add
     for slot, factor in solver.factors():  # there are thousands
         keys = factor.keys()
         if leaving.isdisjoint(keys):
@@ -74,11 +74,11 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
             touched.add(factor)  # but not what holds the oldest pose; a prior on that alone is a `CustomFactor`
             staying.update(keys)
     values = solver.values()
-    if history.held is not None and history.held.pulled(values.atPose3(history.held.key).matrix()):
+    if history.reference is not None and history.reference.is_strained(values.atPose3(history.reference.key).matrix()):
         values = _solved_together(kept.factors, touched, values)
     ordered = sorted(staying - leaving, key=lambda key: (-size_of(key), key))  # poses first
     prior = marginal_prior(touched, values, sorted(leaving), ordered)
-    held = held_pose(log, prior, values)
+    held = reference_pose(log, prior, values)
     kept.factors.add(prior.factor())
     if held is not None:
         kept.factors.add(held.factor())
@@ -87,10 +87,10 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> R
             put(kept.values, key, values)
     oldest = pose_key(first)
     finished = [track for track in log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
-    return Rest(first, gone, finished, prior, held, kept, slots)
+    return Marginalised(first, gone, finished, prior, held, kept, slots)
 
 
-def held_pose(log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> Held | None:
+def reference_pose(log: MeasurementLog, prior: MarginalPrior, values: gtsam.Values) -> ReferencePose | None:
     """The oldest pose, held where it is; None if landmarks with a prior in the world fix it already."""
     if any(known.frame is None for known in log.history.known.values()):
         return None

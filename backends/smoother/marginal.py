@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
-from backends.smoother.held import Held
+from backends.smoother.reference_pose import ReferencePose
 from backends.smoother.solver import FAILURES, SolverError
 from backends.smoother.variables import size_of
 from slam.geometry.se3 import Array, adjoint, hat, inverse, nearest_rotation, points_by_pose
@@ -95,11 +95,11 @@ class MarginalPrior:
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(self.R)), list(self.keys), error)
 
-    def held(self, T_reference: Array) -> Held:
+    def held(self, T_reference: Array) -> ReferencePose:
         """The reference pose held where it stands, `T_reference` (4, 4)."""
         known = self.of_reference()
         information = known.R.T @ known.R
-        return Held(self.poses[0], T_reference, information, np.linalg.inv(information))
+        return ReferencePose(self.poses[0], T_reference, information, np.linalg.inv(information))
 
     def of_reference(self) -> MarginalPrior:
         """What is known of the reference pose alone."""

@@ -15,7 +15,7 @@ from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
 if TYPE_CHECKING:
-    from backends.smoother.marginal import Held, MarginalPrior
+    from backends.smoother.marginal import MarginalPrior, ReferencePose
 
 _SINGULAR = 1e-12  # numerics: smallest eigenvalue of a covariance, as a share of its trace
 
@@ -83,7 +83,7 @@ class History:
         self.owner: dict[int, int] = {}
         self.first = 0
         self.prior: MarginalPrior | None = None
-        self.held: Held | None = None
+        self.reference: ReferencePose | None = None
         self.places: dict[int, Array] = {}
         self.known: dict[int, Known] = {}
         self.restarted = 0
@@ -138,13 +138,13 @@ class MeasurementLog:
             del self.history.explicit[variable], self.history.places[variable], self.history.owner[variable]
             self.landmarks.variable[slot] = -1
 
-    def revise(self, mend: Callable[[Array], Array], point: Callable[[list[float]], Any]) -> None:
+    def revise(self, correct: Callable[[Array], Array], point: Callable[[list[float]], Any]) -> None:
         """Mend all measurements; `point` makes the solver's measurements of rows (uL, vL, uR).
 
         Raises:
             MeasurementError: a mended measurement is not finite.
         """
-        z = mend(self.measurements.z.copy())
+        z = correct(self.measurements.z.copy())
         if not (np.isfinite(z) | np.isnan(self.measurements.z)).all():
             raise MeasurementError("smoother: a mended measurement is not finite")
         self.measurements.z[:] = z
@@ -153,7 +153,7 @@ class MeasurementLog:
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
-    def start_anew(self, prior: MarginalPrior, covariances: Array) -> None:
+    def restart(self, prior: MarginalPrior, covariances: Array) -> None:
         """Begin with the newest pose, of which `prior` is known, and with the landmarks as they stand before it.
 
         `covariances` (M, 3, 3) of all landmarks, by slot, as seen from there, in world axes.
@@ -162,7 +162,7 @@ class MeasurementLog:
         path.jumps.append(frame)
         history.prior = None
         self.forget_measurements()
-        history.first, history.prior, history.held, history.restarted = frame, prior, None, 0
+        history.first, history.prior, history.reference, history.restarted = frame, prior, None, 0
         history.known = {serial: known for serial, known in history.known.items() if known.frame is None}
         slots, T = marks.used(), path.poses[-1]
         marks.recent[slots], marks.seen[slots], marks.information[slots], marks.older[slots] = -1, 0, 0, 0
@@ -180,13 +180,13 @@ class MeasurementLog:
             history.known[serial] = Known(position, covariance, frame, seen=False)
         self._forget_unused_measurements()
 
-    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: Held | None) -> None:
+    def advance(self, first: int, gone: Collection[int], prior: MarginalPrior, held: ReferencePose | None) -> None:
         """Let go of the poses before frame `first` and of the landmark variables `gone`: `prior` holds what they said.
 
         Measurements that no factor and no landmark refers to any more are forgotten.
         """
         history, frame = self.history, self.measurements.frame
-        history.first, history.prior, history.held = first, prior, held
+        history.first, history.prior, history.reference = first, prior, held
         history.finished = [rows for rows in history.finished if frame[rows].min() >= first]
         for name in ("explicit", "places", "owner"):
             kept = {key: value for key, value in getattr(history, name).items() if key not in gone}

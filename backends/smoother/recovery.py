@@ -4,7 +4,7 @@ Then the prediction is probably wrong, not the observations. There are two cases
 
 - It is so far off that the solution is not found from there: start from the pose on which the landmarks agree.
 - The camera is where its earlier poses exclude it: these were wrong, after a stretch with hardly anything to see. The
-  problem starts anew with that pose and the landmarks (`FactorGraph.start_anew`); earlier poses stay as they are.
+  problem is restarted with that pose and the landmarks (`FactorGraph.restart`); earlier poses stay as they are.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, inverse
-from slam.tracking.agreement import CONFIRMED, ENOUGH, HEEDED, share_by_chance
+from slam.tracking.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 from slam.tracking.gating import squared_distances
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
@@ -36,7 +36,7 @@ class Agreement:
     Attributes:
         T: the newest pose (4, 4).
         used: which observations (M,) agree with it.
-        jump: variances (6,) that the prediction lacks, if the problem shall start anew; else None.
+        jump: variances (6,) that the prediction lacks, if the problem shall be restarted; else None.
         contradicted: updates in succession, with this one, in which most observations agreed on another pose than
             was expected.
     """
@@ -61,18 +61,18 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the problem shall start anew in any case (`Belief.lost`).
+        lost: whether the problem shall be restarted in any case (`Belief.lost`).
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):
-        anew = lost and used.sum() >= CONFIRMED
-        return Agreement(T, used, np.zeros(6) if anew else None)
-    there = search() if len(used) >= CONFIRMED else None
+        restart = lost and used.sum() >= MIN_CONSENSUS
+        return Agreement(T, used, np.zeros(6) if restart else None)
+    there = search() if len(used) >= MIN_CONSENSUS else None
     found = None if there is None else _seated(problem, there)
     contradicted = 0 if found is None else contradicted + 1
     if found is not None and (found.jump is None or contradicted >= _LASTING):
         return found
-    if len(used) >= ENOUGH and HEEDED * used.sum() < len(used) and _by_chance(problem, T, used):
+    if len(used) >= MIN_OBSERVATIONS and ONE_AGREES_IN * used.sum() < len(used) and _by_chance(problem, T, used):
         used = np.zeros_like(used)
     return Agreement(T, used, None, contradicted)
 
@@ -92,7 +92,7 @@ def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
         wide = np.linalg.inv(problem.information) + np.diag(jump)
         problem = replace(problem, information=np.linalg.inv(wide))
     T, used = pose_only.solve(problem, there)
-    return Agreement(T, used, jump) if used.sum() >= max(CONFIRMED, (len(used) + 1) // 2) else None
+    return Agreement(T, used, jump) if used.sum() >= max(MIN_CONSENSUS, (len(used) + 1) // 2) else None
 
 
 def _by_chance(problem: pose_only.PoseProblem, T: Array, used: BoolArray) -> bool:

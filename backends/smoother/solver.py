@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from backends.smoother.held import Held
+from backends.smoother.reference_pose import ReferencePose
 from backends.smoother.variables import ballast_key, size_of
 from slam.errors import SlamError
 from slam.geometry.se3 import Array
@@ -132,7 +132,7 @@ class Solver:
             raise SolverError("gtsam: a covariance is not finite and positive")
         return P
 
-    def point_covariances(self, keys: list[int], newest: int, held: Held | None = None) -> dict[int, Array]:
+    def point_covariances(self, keys: list[int], newest: int, held: ReferencePose | None = None) -> dict[int, Array]:
         """Covariances (3, 3) of those point variables that were eliminated together with the newest pose, or after it.
 
         As if the pose `held` was not held.
@@ -142,7 +142,7 @@ class Solver:
         """
         return self._guarded(lambda: self._point_covariances(keys, newest, held))
 
-    def _point_covariances(self, keys: list[int], newest: int, held: Held | None) -> dict[int, Array]:
+    def _point_covariances(self, keys: list[int], newest: int, held: ReferencePose | None) -> dict[int, Array]:
         root = _root_of(self._isam, newest)
         if root is None or (held is not None and held.key not in root[0]):
             return {}
@@ -154,7 +154,7 @@ class Solver:
             return {key: part @ part.T for key, part in rows.items()}
         own = half[starts[held.key] : starts[held.key] + 6]
         P = own @ own.T
-        return {key: held.let_go(part @ part.T, part @ own.T, P) for key, part in rows.items()}
+        return {key: held.released(part @ part.T, part @ own.T, P) for key, part in rows.items()}
 
     def _joint_covariance(self, keys: list[int]) -> Array:
         root = _root_of(self._isam, keys[-1])

@@ -6,18 +6,18 @@ docs/selfcalibration.md derives the estimator. May import `slam.geometry` and th
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.estimator import SelfCalibration
-from slam.calibration.kept import KeptCalibration, load_calibration, save_calibration
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior
 from slam.calibration.remaining import RemainingRigError
+from slam.calibration.saved import SavedCalibration, load_calibration, save_calibration
 
 __all__ = [
-    "KeptCalibration",
     "RemainingRigError",
     "Revision",
     "RigCorrection",
     "RigModel",
     "RigPosterior",
+    "SavedCalibration",
     "SelfCalibration",
     "SelfCalibrationConfig",
     "load_calibration",

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam.calibration.model import RigModel
-from slam.calibration.sensitivity import Followed, Frozen
+from slam.calibration.sensitivity import InactiveLandmarks, SensitivityState
 from slam.data import Estimate
 from slam.geometry.arrays import Array, IdArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
@@ -34,7 +34,7 @@ _EVERY = 0.08  # cost: least time between the filter's updates [s]; frames in be
 _LONGEST = 1.0  # guard: time [s] after which a motion counts as unknown
 
 
-class RigUncertainty:
+class SchmidtFilter:
     """What the rig's uncertainty adds to the covariances of poses and landmarks.
 
     Columns of all sensitivities are the parameters of `RigModel`, the baseline's length (a share), and one column of
@@ -56,8 +56,8 @@ class RigUncertainty:
         self._noise = models.pixel_sigma**2 * np.array([[1.0, 0, 1], [0, 1, 0], [1, 0, 2]])  # of (x, y, d)
         self._columns = len(model.names) + 2
         self._stamp = self._measured = 0.0
-        self._followed: Followed | None = None
-        self._others = Frozen.none(self._columns)
+        self._followed: SensitivityState | None = None
+        self._others = InactiveLandmarks.none(self._columns)
         self._root: tuple[Array, Array] | None = None  # of the last covariance, which is asked for thrice in a frame
 
     def observe(self, T_world_left: Array, stamp: float, ids: IdArray, positions: Array) -> None:
@@ -72,7 +72,7 @@ class RigUncertainty:
         T = T_world_left @ self._model.rig.rectified.T_left_rectified
         before, others = self._followed, self._others
         if before is None:
-            self._followed, self._stamp, self._measured = Followed.start(T, self._columns), stamp, stamp
+            self._followed, self._stamp, self._measured = SensitivityState.start(T, self._columns), stamp, stamp
             return
         local = transform(inverse(T), positions)
         front = local[:, 2] > 0
@@ -116,7 +116,7 @@ class RigUncertainty:
             others = others.joined(rest)
         self._followed, self._others = now, others
 
-    def see_anew(self, ids: IdArray, positions: Array) -> None:
+    def replace_landmarks(self, ids: IdArray, positions: Array) -> None:
         """Take in landmarks (M,) at `positions` (M, 3) [m] as new ones, replacing their former state."""
         self.change(ids[:0], positions[:0], ids)
         self.change(ids, positions, ids[:0])
@@ -225,7 +225,7 @@ class RigUncertainty:
         v, w = np.sqrt(self._motion.velocity_variance(min(abs(dt), _LONGEST)))
         return 2 * float(w) * min(abs(dt), _LONGEST), 2 * float(v) * min(abs(dt), _LONGEST)
 
-    def _without(self, erased: IdArray) -> tuple[Followed, Frozen]:
+    def _without(self, erased: IdArray) -> tuple[SensitivityState, InactiveLandmarks]:
         """The filter's state and the frozen landmarks, without the erased ones."""
         assert self._followed is not None
         now, others = self._followed, self._others
@@ -233,7 +233,9 @@ class RigUncertainty:
             return now, others
         return now.select(np.flatnonzero(~isin(now.ids, erased))), others.select(~isin(others.ids, erased))
 
-    def _exchanged(self, now: Followed, others: Frozen, wanted: IdArray) -> tuple[Followed, Frozen]:
+    def _exchanged(
+        self, now: SensitivityState, others: InactiveLandmarks, wanted: IdArray
+    ) -> tuple[SensitivityState, InactiveLandmarks]:
         """Move landmarks that are not `wanted` any more from the filter's state to the frozen ones."""
         stays = isin(now.ids, wanted)
         if stays.all():

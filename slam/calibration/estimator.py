@@ -10,18 +10,18 @@ import numpy as np
 from slam.calibration.config import SelfCalibrationConfig
 from slam.calibration.correction import Revision, RigCorrection
 from slam.calibration.evidence import Accumulator, Evidence, RecordingEvidence
-from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.motion import Pair, noise_variances, pair_evidence, parallax
 from slam.calibration.posterior import RigPosterior, Solution, residual_scale, solve
 from slam.calibration.prior import (
-    as_delivered,
-    as_found,
+    factory_prior,
     focal_sigma,
     prior_information,
+    resumed_prior,
     systematic_variance,
 )
 from slam.calibration.rows import row_evidence
+from slam.calibration.saved import RigNumbers, SavedCalibration
 from slam.calibration.views import NO_MATCHES, Rows, View, match, pair_of
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
@@ -58,18 +58,18 @@ class SelfCalibration:
         unsolved: number of pairs for which no motion was found.
     """
 
-    def __init__(self, rig: StereoRig, config: SelfCalibrationConfig, kept: KeptCalibration | None = None) -> None:
+    def __init__(self, rig: StereoRig, config: SelfCalibrationConfig, kept: SavedCalibration | None = None) -> None:
         self.rig = rig
         self.config = config
         self.model = RigModel(rig)
         self._kept = kept is not None
         if kept is None:
-            self._prior = as_delivered(self.model)
+            self._prior = factory_prior(self.model)
         else:
             kept.require_fits(rig)
             if not config.enabled:
                 raise ConfigurationError("a kept calibration needs self_calibration.enabled=true")
-            self._prior = as_found(self.model, kept.posterior.mean, kept.posterior.covariance)
+            self._prior = resumed_prior(self.model, kept.posterior.mean, kept.posterior.covariance)
         self._systematic = systematic_variance(self.model, config.systematic)
         self._rows = Accumulator(config.inflation, _BLOCK_OF_ROWS)
         self._motion = Accumulator(config.inflation, _BLOCK_OF_PAIRS)
@@ -215,9 +215,9 @@ class SelfCalibration:
             parts.append(self._open.scaled(1 / self._motion.inflation))
         return sum(parts[1:], parts[0])
 
-    def kept(self) -> KeptCalibration:
+    def kept(self) -> SavedCalibration:
         """The present posterior, as a prior for further recordings of the rig."""
-        return KeptCalibration(self.posterior, RigNumbers.of(self.rig), self._solution.residual)
+        return SavedCalibration(self.posterior, RigNumbers.of(self.rig), self._solution.residual)
 
     def summary(self) -> dict[str, Any]:
         """The result as plain types."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.calibration.evidence import RecordingEvidence
-from slam.calibration.kept import KeptCalibration, RigNumbers
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import RigPosterior, solve
-from slam.calibration.prior import as_delivered, residual_variance, systematic_variance
+from slam.calibration.prior import factory_prior, residual_variance, systematic_variance
+from slam.calibration.saved import RigNumbers, SavedCalibration
 from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
@@ -21,7 +21,7 @@ _SAYS = 1.0  # least information of a recording on a parameter, in units of the 
 _DIFFERS = 3.0  # and disagree if by more than this many; differences between the two limits may be chance
 
 
-def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> KeptCalibration:
+def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], systematic: float) -> SavedCalibration:
     """The calibration of a rig from several recordings.
 
     Each recording has a systematic error of its own, which averages out over recordings but not within one, and is
@@ -42,10 +42,10 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
     known = [part.whole if alone else part.whole.with_error(variance) for part in evidence]
     scaled_by = [part.motion if alone else part.whole for part in evidence]
     residual = max(part.residual for part in evidence)
-    solution = solve(as_delivered(model), residual, scaled_by, known)
+    solution = solve(factory_prior(model), residual, scaled_by, known)
     covariance = solution.covariance + (np.diag(variance) if alone else 0.0)
     posterior = RigPosterior(model.names, model.units, solution.mean, 0.5 * (covariance + covariance.T))
-    return KeptCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
+    return SavedCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def agreement(model: RigModel, evidence: Sequence[RecordingEvidence], systematic
     """
     if len(evidence) < 2:
         return None
-    prior, variance = as_delivered(model).covariances[-1], systematic_variance(model, systematic)
+    prior, variance = factory_prior(model).covariances[-1], systematic_variance(model, systematic)
     before = 1 / np.diag(prior)
     means, informations = [], []
     for recording in evidence:

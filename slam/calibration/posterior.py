@@ -169,6 +169,7 @@ class _ByScale(NamedTuple):
 
 
 def _by_scale(prior: Prior, evidence: Sequence[Evidence]) -> _ByScale:
+    """The posterior of the sum of `evidence` for each scale of the prior."""
     whole = sum(evidence[1:], evidence[0])
     information = prior.information + whole.S
     covariances = np.linalg.inv(information)

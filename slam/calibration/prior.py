@@ -78,7 +78,7 @@ class Prior:
         return np.asarray(np.linalg.slogdet(self.information)[1])
 
 
-def as_delivered(model: RigModel) -> Prior:
+def factory_prior(model: RigModel) -> Prior:
     """Prior of a calibration as delivered, by how calibrations are usually made."""
     spread = np.linalg.inv(prior_information(model))
     drift, zoom = (np.outer(sigma, sigma) for sigma in (offset_sigma(model), focal_sigma(model)))
@@ -87,7 +87,7 @@ def as_delivered(model: RigModel) -> Prior:
     return Prior(np.zeros(len(model.names)), sum(wide))
 
 
-def as_found(model: RigModel, mean: Array, covariance: Array) -> Prior:
+def resumed_prior(model: RigModel, mean: Array, covariance: Array) -> Prior:
     """Prior of a rig calibrated by earlier recordings; its cameras may have rotated since.
 
     Args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from slam.calibration.consider import RigUncertainty
+from slam.calibration.consider import SchmidtFilter
 from slam.calibration.correction import Revision
 from slam.calibration.estimator import SelfCalibration
 from slam.data import Estimate
@@ -29,7 +29,7 @@ class RemainingRigError:
     def __init__(self, calibration: SelfCalibration, models: EstimatorModels) -> None:
         self._calibration = calibration
         self.given = calibration.applied
-        self.uncertainty = RigUncertainty(calibration.model, models, self.given.parameters)
+        self.uncertainty = SchmidtFilter(calibration.model, models, self.given.parameters)
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.

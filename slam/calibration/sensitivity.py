@@ -24,7 +24,7 @@ _ROUNDING = 1e-12  # numerics: of the trace of a covariance
 
 
 @dataclass(frozen=True)
-class Frozen:
+class InactiveLandmarks:
     """Landmarks outside the filter's state, as they were when they left it; one row each, ids ascending.
 
     Attributes:
@@ -40,24 +40,24 @@ class Frozen:
     drift: Array
 
     @classmethod
-    def none(cls, columns: int) -> Frozen:
+    def none(cls, columns: int) -> InactiveLandmarks:
         """No landmark, with so many parameters."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3, columns)), np.zeros((0, 3, 3)), np.zeros((0, 6, 6)))
 
-    def select(self, rows: np.ndarray) -> Frozen:
+    def select(self, rows: np.ndarray) -> InactiveLandmarks:
         """These rows."""
-        return Frozen(self.ids[rows], self.by_rig[rows], self.relative[rows], self.drift[rows])
+        return InactiveLandmarks(self.ids[rows], self.by_rig[rows], self.relative[rows], self.drift[rows])
 
-    def joined(self, other: Frozen) -> Frozen:
+    def joined(self, other: InactiveLandmarks) -> InactiveLandmarks:
         """Both together; landmarks in `other` replace those with the same id."""
         mine = self.select(~isin(self.ids, other.ids))
         pairs = [(getattr(mine, name), getattr(other, name)) for name in ("ids", "by_rig", "relative", "drift")]
-        both = Frozen(*(np.concatenate(pair) for pair in pairs))
+        both = InactiveLandmarks(*(np.concatenate(pair) for pair in pairs))
         return both.select(np.argsort(both.ids, kind="stable"))
 
 
 @dataclass(frozen=True)
-class Followed:
+class SensitivityState:
     """The filter's state: the pose (six rows) and F recently measured landmarks (three rows each).
 
     Attributes:
@@ -77,12 +77,12 @@ class Followed:
     covariance: Array
 
     @classmethod
-    def start(cls, T_world: Array, columns: int) -> Followed:
+    def start(cls, T_world: Array, columns: int) -> SensitivityState:
         """The state at an exactly known pose, without landmarks."""
         none = np.zeros(0, np.int64)
         return cls(T_world, none, np.zeros((0, 3)), none, np.zeros((6, columns)), np.zeros((6, 6)))
 
-    def moved(self, T_world: Array, rotation: float, translation: float) -> Followed:
+    def moved(self, T_world: Array, rotation: float, translation: float) -> SensitivityState:
         """The state predicted at the next pose.
 
         Args:
@@ -98,9 +98,9 @@ class Followed:
         covariance[:, :6] = covariance[:, :6] @ turned.T
         B = np.concatenate([np.eye(6), (T_world[:3, :3] @ points_by_pose(local)).reshape(-1, 6)])
         covariance += (B * np.repeat(np.square([rotation, translation]), 3)) @ B.T
-        return Followed(T_world, self.ids, local, self.unseen + 1, by_rig, covariance)
+        return SensitivityState(T_world, self.ids, local, self.unseen + 1, by_rig, covariance)
 
-    def measured(self, rows: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Followed:
+    def measured(self, rows: IdArray, local: Array, H: Array, field: Array, noise: Array) -> SensitivityState:
         """The state updated by measurements of landmarks.
 
         Args:
@@ -124,21 +124,21 @@ class Followed:
         by_rig, covariance = self.by_rig + gain.T @ residual, self.covariance - gain.T @ gain
         return replace(seen, by_rig=by_rig, covariance=covariance)
 
-    def met(self, rows: IdArray, local: Array) -> Followed:
+    def met(self, rows: IdArray, local: Array) -> SensitivityState:
         """The state after landmarks `rows` were seen but not used as measurements; `local` are their positions [m]."""
         everywhere, unseen = self.local.copy(), self.unseen.copy()
         everywhere[rows], unseen[rows] = local, 0
         return replace(self, local=everywhere, unseen=unseen)
 
-    def select(self, rows: IdArray) -> Followed:
+    def select(self, rows: IdArray) -> SensitivityState:
         """The state with these landmarks only."""
         kept = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
         covariance = self.covariance.take(kept, axis=0).take(kept, axis=1)  # cost: a fifth of the time of np.ix_
-        return Followed(
+        return SensitivityState(
             self.T_world, self.ids[rows], self.local[rows], self.unseen[rows], self.by_rig[kept], covariance
         )
 
-    def first_seen(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Followed:
+    def first_seen(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> SensitivityState:
         """The state with landmarks (K,) at `local` (K, 3) [m] first seen in this frame; other arguments: `measured`."""
         by_rig, own = self._by_sight(H, field, noise)
         size, places = 3 * len(ids), np.arange(len(ids))
@@ -147,13 +147,13 @@ class Followed:
         across = np.zeros((size, len(self.covariance)))
         return self._with(ids, local, by_rig.reshape(size, self.by_rig.shape[1]), across, blocks.reshape(size, size))
 
-    def seen_once(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> Frozen:
+    def seen_once(self, ids: IdArray, local: Array, H: Array, field: Array, noise: Array) -> InactiveLandmarks:
         """Landmarks first seen in this frame, ids ascending, that do not enter the state."""
         by_rig, own = self._by_sight(H, field, noise)
         by_world = by_rig - self._by_pose(local) @ self.by_rig[:6]
-        return Frozen(ids, by_world, own, np.broadcast_to(self.drift(), (len(ids), 6, 6)))
+        return InactiveLandmarks(ids, by_world, own, np.broadcast_to(self.drift(), (len(ids), 6, 6)))
 
-    def seen_again(self, frozen: Frozen, local: Array) -> Followed:
+    def seen_again(self, frozen: InactiveLandmarks, local: Array) -> SensitivityState:
         """The state with landmarks (K,) at `local` (K, 3) [m] that were in it before.
 
         Relative to the camera, each one's error is its former one plus the pose's drift since. The drift's covariance
@@ -175,13 +175,13 @@ class Followed:
             own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += P
         return self._with(frozen.ids, local, by_rig.reshape(size, -1), across, own)
 
-    def frozen(self) -> Frozen:
+    def frozen(self) -> InactiveLandmarks:
         """All landmarks in the form they have outside the state; ids ascending."""
         order = np.argsort(self.ids, kind="stable")
         count = len(self.ids)
         blocks = self.covariance[6:, 6:].reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count)]
         drift = np.broadcast_to(self.drift(), (count, 6, 6))
-        return Frozen(self.ids, self.in_world(), blocks, drift).select(order)
+        return InactiveLandmarks(self.ids, self.in_world(), blocks, drift).select(order)
 
     def in_world(self) -> Array:
         """∂y/∂δ (F, 3, m) of the landmarks' positions in world coordinates."""
@@ -202,7 +202,7 @@ class Followed:
         """Derivatives (K, 3, 6) of fixed points by the pose, relative to the camera and in world axes."""
         return np.asarray(self.T_world[:3, :3] @ points_by_pose(local))
 
-    def _with(self, ids: IdArray, local: Array, by_rig: Array, across: Array, own: Array) -> Followed:
+    def _with(self, ids: IdArray, local: Array, by_rig: Array, across: Array, own: Array) -> SensitivityState:
         """The state with more landmarks, given their covariances with the state and with each other."""
         return replace(
             self,

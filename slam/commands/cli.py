@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slam.commands import completion
-from slam.commands.ending import one_line_errors
+from slam.commands.error_exit import one_line_errors
 from slam.commands.options import (
     BackendOption,
     CalibrationOption,
@@ -58,7 +58,7 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point; errors end as `slam.commands.ending` says."""
+    """Entry point; errors end as `slam.commands.error_exit` says."""
     logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
     os.environ["MPLBACKEND"] = "agg"  # pictures are files here, whatever windows are to be drawn with elsewhere
@@ -113,7 +113,7 @@ def run_command(
     quiet: QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
-    from slam.commands.compile_beside import compiled_beside
+    from slam.commands.background_compilation import compiled_in_background
     from slam.commands.display import Progress
     from slam.commands.folders import run_folder
     from slam.commands.run import Wanted, prepare
@@ -128,7 +128,7 @@ def run_command(
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
         if options.config.objects.mode != "off":
-            stack.enter_context(compiled_beside(options.backend))
+            stack.enter_context(compiled_in_background(options.backend))
         options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
         watches = _watches(stack, opened, viewer, draw)

@@ -9,11 +9,12 @@ from pathlib import Path
 from slam.compare.paper import write_paper
 from slam.compare.plan import Plan, Variant, parse_variant
 from slam.compare.report import conclusions, most_trials, write_report
-from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler, available_cores
+from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import count_tests, groups, write_tables
 from slam.compare.wording import caution
 from slam.errors import ConfigurationError
+from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2

@@ -231,8 +231,3 @@ def _distributed() -> Any:
         return importlib.import_module("distributed")
     except ImportError as error:
         raise SlamError("--scheduler needs dask.distributed: pip install 'surf-stereo-slam[cluster]'") from error
-
-
-def available_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -6,11 +6,10 @@ what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``.
 frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
 old place is measured again the former may not be positive definite; such stretches are left out.
 
-Truth has errors of its own. `TruthNoise` gives each true pose an independent one, the first included: the turn of a
-recording's first true pose would otherwise count as an error of the whole path. What is the same in all poses, a turn
-between the axes of the truth's sensor and the camera's, is found from all stretches of one length by least squares and
-taken out, of the rig's errors as well. Stretches over which the truth contradicts itself are left out
-(`slam.evaluation.doubtful_truth`).
+Truth has errors of its own, the first pose included: else its turn would count as an error of the whole path. Their
+covariance is added, and stretches over which the truth contradicts itself are left out
+(`slam.evaluation.truth_error`). What is the same in all poses, a turn between the axes of the truth's sensor and the
+camera's, is found from all stretches of one length by least squares and taken out, of the rig's errors as well.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam.evaluation.doubtful_truth import RowArray, doubtful
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
+from slam.evaluation.truth_error import RowArray, doubtful, truth_covariances
 from slam.geometry.arrays import Array
-from slam.geometry.se3 import adjoint, inverse, log
+from slam.geometry.se3 import adjoint, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
 
@@ -103,10 +102,9 @@ def stretch_nees(
     first, last = np.broadcast_arrays(first, last)
     estimated = inverse(own.poses[first]) @ own.poses[last]
     residuals = pose_residuals(estimated, inverse(true.poses[first]) @ true.poses[last])
-    A = np.array([adjoint(inverse(T)) for T in estimated]).reshape(-1, _DOF, _DOF)
+    A = adjoint(inverse(estimated))
     noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
-    Q = _truth_covariances(true, noise)
-    N = noises[last] + Q[last] - A @ (noises[first] - Q[first]) @ np.swapaxes(A, 1, 2)
+    N = noises[last] - A @ noises[first] @ np.swapaxes(A, 1, 2) + truth_covariances(true, noise, first, last, A)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
     finite = np.isfinite(N).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
     usable = np.flatnonzero(finite & ~doubtful(true, noise, first, last))
@@ -126,16 +124,6 @@ def stretch_nees(
 def _with(N: Array, G: Array) -> Array:
     """Covariances (M, 6, 6) and what common errors (M, 6, k) of unit variance add to them."""
     return np.asarray(N + G @ np.swapaxes(G, 1, 2))
-
-
-def _truth_covariances(true: Trajectory, noise: TruthNoise) -> Array:
-    """Covariances (N, 6, 6) of the true poses; the error of a stamp is one along the motion."""
-    Q = np.tile(noise.covariance, (len(true), 1, 1))
-    if noise.time and len(true) > 1:
-        rate = log(inverse(true.poses[:-1]) @ true.poses[1:]) / np.diff(true.stamps)[:, None]
-        moved = noise.time * np.concatenate([rate, rate[-1:]])
-        Q += moved[:, :, None] * moved[:, None]
-    return Q
 
 
 def _remounted(errors: Array, A: Array, P: Array, mounting: float) -> Array:
@@ -163,10 +151,10 @@ def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array)
 
     Where one end is after a loop nothing is apart: there the difference of the covariances is added to `N` (M, 6, 6).
     """
-    G = np.zeros((len(ends), _DOF, max(last.scale.shape[1] for _, last in ends)))
+    G = np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
-        if first.shares.shape == last.shares.shape:
-            G[row, :, : last.scale.shape[1]] = (last.shares - a @ first.shares) @ last.scale
+        if first.jacobian.shape == last.jacobian.shape:
+            G[row, :, : last.root.shape[1]] = (last.jacobian - a @ first.jacobian) @ last.root
         else:
             N[row] += last.covariance - a @ first.covariance @ a.T
     return G

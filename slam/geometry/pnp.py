@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
+from slam.geometry.arrays import median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse
 
@@ -132,7 +133,7 @@ def _approach(rig: StereoRig, points: Array, measured: Array, T_left_world: Arra
         good = np.isfinite(error)
         if good.sum() < MINIMAL_POINTS:
             break
-        rows = _some(good & (error <= _median(error[good])))
+        rows = _some(good & (error <= median(error[good])))
         T_left_world = _refined(rig, points, measured, rows[None], T_left_world[None], 2)[0]
     return T_left_world
 
@@ -143,12 +144,6 @@ def _some(mask: BoolArray) -> NDArray[np.intp]:
     if len(rows) <= _ENOUGH:
         return rows
     return rows[np.linspace(0, len(rows) - 1, _ENOUGH).astype(int)]
-
-
-def _median(values: Array) -> float:
-    """The median of a few numbers; NumPy's takes longer to begin than these need."""
-    ordered = np.sort(values)
-    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
 
 
 def _refined(

@@ -174,11 +174,11 @@ def log(T: Array) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """Adjoint (6, 6): ``T exp(ξ) T⁻¹ = exp(Ad_T ξ)`` with ξ = [rotation, translation]."""
-    R = T[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = R
-    out[3:, :3] = hat(T[:3, 3]) @ R
+    """Adjoint (..., 6, 6) of T (..., 4, 4): ``T exp(ξ) T⁻¹ = exp(Ad_T ξ)`` with ξ = [rotation, translation]."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
     return out
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 
 _BLOCK = 256  # cost: landmarks compared with all others at once
 
 
-def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+def bad_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) are to be erased: not continuously detected although in view (paper A, IV)."""
     lost = landmarks.missed >= config.erase_missed
     tested = landmarks.in_view > config.erase_missed
@@ -23,7 +23,7 @@ def bad_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
     return np.asarray(lost | rare | unconfirmed | forgotten)
 
 
-def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConfig) -> BoolArray:
+def crowded_landmarks(landmarks: LandmarkTable, positions: Array, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) at `positions` (N, 3) [m] are redundant once out of view; see `MapConfig.spacing`.
 
     Landmarks that have just gone out of view are compared with each other and with all others out of view. Those of a
@@ -45,7 +45,7 @@ def crowded_landmarks(landmarks: LandmarkRows, positions: Array, config: MapConf
     return out
 
 
-def surplus_landmarks(landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+def surplus_landmarks(landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     """Which landmarks (N,) to erase so that `max_landmarks` remain.
 
     First those that were measured in a single frame, then the others by their last measurement, oldest first; those

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from slam.chi_square import SIGMAS
 from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.tracking.association import pairs_in_boxes
 from slam.tracking.visibility import MapView
@@ -16,7 +16,7 @@ from slam.tracking.visibility import MapView
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 
 
-def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, config: MapConfig) -> BoolArray:
+def known_features(view: MapView, landmarks: LandmarkTable, features: StereoFeatures, config: MapConfig) -> BoolArray:
     """Which unmatched features (F,) have the position and descriptor of an existing landmark.
 
     Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
@@ -31,7 +31,7 @@ def known_features(view: MapView, landmarks: LandmarkRows, features: StereoFeatu
     return out
 
 
-def doubled_landmarks(view: MapView, landmarks: LandmarkRows, config: MapConfig) -> BoolArray:
+def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig) -> BoolArray:
     """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
     out = np.zeros(len(landmarks), bool)
     shown = np.flatnonzero(view.in_image)
@@ -57,7 +57,7 @@ def _near_landmarks(uv: Array, view: MapView, config: MapConfig) -> tuple[NDArra
 
 
 def _alike(
-    landmarks: LandmarkRows,
+    landmarks: LandmarkTable,
     rows: NDArray[np.intp],
     descriptors: NDArray[np.float32],
     laplacian: NDArray[np.int8],

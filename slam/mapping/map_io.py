@@ -23,7 +23,7 @@ from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.atlas.saved import ATLAS_TYPES, from_arrays, to_arrays
@@ -156,17 +156,17 @@ class SavedMap:
         return 1 + max([int(ids.max(initial=-1)) for ids in (self.ids, *(k.landmarks for k in self.keyframes))])
 
     @property
-    def rows(self) -> LandmarkRows:
+    def rows(self) -> LandmarkTable:
         """The landmarks' bookkeeping at the start of a run that has seen none of them yet."""
         none = np.zeros(len(self), np.int64)
-        return LandmarkRows(
+        return LandmarkTable(
             self.ids, self.descriptors, self.laplacian, self.seen, self.in_view, none, none - 1, self.seen_from
         )  # fmt: skip
 
     @classmethod
     def of(
         cls,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         estimate: Estimate,
         frontend: str,
         world_frame: str,

@@ -13,7 +13,7 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -35,7 +35,7 @@ class MapChange:
         returned: landmarks of a revisited place that rejoined the map, and the features that show them now.
     """
 
-    landmarks: LandmarkRows
+    landmarks: LandmarkTable
     added: LandmarkMatches
     erased: IdArray
     returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
@@ -103,7 +103,7 @@ class Mapper:
                 raise ConfigurationError("map.monocular: this back end cannot place landmarks")
             self._monocular = self._new_monocular()
 
-    def update(self, backend: Backend, landmarks: LandmarkRows, step: Step) -> MapChange:
+    def update(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapChange:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
         view = self._view(backend, landmarks, step)
         landmarks = self._count(landmarks, view, step)
@@ -119,7 +119,7 @@ class Mapper:
             backend.remove(erased)
         return MapChange(landmarks, added, erased)
 
-    def give_back(self, backend: Backend, change: MapChange, step: Step, returned: Returned) -> MapChange:
+    def restore(self, backend: Backend, change: MapChange, step: Step, returned: Returned) -> MapChange:
         """Let landmarks of a revisited place rejoin the map, if the back end can place them.
 
         They keep the ids that they had. If the back end still holds such a landmark, at its old, drifted position, that
@@ -127,7 +127,7 @@ class Mapper:
         """
         if not isinstance(backend, MapBackend):
             return change
-        taken = np.concatenate([step.matches.rows, change.added.rows, step.held_rows, step.labels.moving])
+        taken = np.concatenate([step.matches.rows, change.added.rows, step.withheld_rows, step.labels.moving])
         free = np.flatnonzero(~np.isin(returned.rows, taken))
         if not len(free):
             return change
@@ -142,7 +142,7 @@ class Mapper:
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, self._camera(backend))
         return replace(change, landmarks=landmarks, returned=LandmarkMatches(ids, rows))
 
-    def insert(self, backend: Backend, landmarks: LandmarkRows, place: KnownPlace) -> LandmarkRows:
+    def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
         """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""
         assert isinstance(backend, MapBackend)  # only such back ends start in a map
         new = np.flatnonzero(~np.isin(place.ids, landmarks.ids) | (place.ids < 0))
@@ -151,12 +151,12 @@ class Mapper:
         backend.insert(ids, place.positions[new], place.covariances[new])
         once = np.ones(len(ids), np.int64)
         seen_from = np.tile(place.seen_from, (len(ids), 1))
-        rows = LandmarkRows(
+        rows = LandmarkTable(
             ids, place.descriptors[new], place.laplacian[new], once, once, 0 * once, 0 * once - 1, seen_from
         )
         return landmarks.joined(rows)
 
-    def reconcile(self, backend: Backend, landmarks: LandmarkRows | None) -> LandmarkRows | None:
+    def reconcile(self, backend: Backend, landmarks: LandmarkTable | None) -> LandmarkTable | None:
         """Make rows and back end agree after an interrupted step: landmarks that only one of them has are erased.
 
         Args:
@@ -178,16 +178,16 @@ class Mapper:
     def _new_monocular(self) -> MonocularDepth:
         return MonocularDepth(self.rig, self._localizer.pixel_sigma, self.config.max_depth_error)
 
-    def _view(self, backend: Backend, landmarks: LandmarkRows, step: Step) -> MapView:
+    def _view(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapView:
         """The map as the camera sees it."""
         positions = backend.positions(landmarks.ids)
         pose = step.estimate.T_world_left
         return MapView.of(self.rig, pose, positions, step.features, self._localizer.pixel_sigma)
 
-    def _count(self, landmarks: LandmarkRows, view: MapView, step: Step) -> LandmarkRows:
+    def _count(self, landmarks: LandmarkTable, view: MapView, step: Step) -> LandmarkTable:
         """Count landmarks as seen or missed, unless the frame's pose was not measured."""
         m, matches = self.config, step.matches
-        measured = isin(matches.ids, np.concatenate([step.report.used, step.spared]))
+        measured = isin(matches.ids, np.concatenate([step.report.used, step.left_out]))
         expected = landmarks.ids[:0]
         if not step.state.unmatched:
             size = (self.rig.width, self.rig.height)
@@ -197,12 +197,12 @@ class Mapper:
         ids, rows = matches.ids[measured], matches.rows[measured]
         place = view.T_world_left[:3, 3], view.in_image, self._localizer.config.rematch_after
         return landmarks.after_frame(
-            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.held
+            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.withheld
         )
 
     def _add(
-        self, backend: Backend, landmarks: LandmarkRows, step: Step, known: BoolArray
-    ) -> tuple[LandmarkRows, LandmarkMatches]:
+        self, backend: Backend, landmarks: LandmarkTable, step: Step, known: BoolArray
+    ) -> tuple[LandmarkTable, LandmarkMatches]:
         """Turn features that are no landmarks yet into landmarks, unless the pose is unknown.
 
         Features that move, or whose motion label is undecided, are left out.
@@ -226,11 +226,11 @@ class Mapper:
         self,
         monocular: MonocularDepth,
         backend: Backend,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         step: Step,
         added: LandmarkMatches,
         free: BoolArray,
-    ) -> tuple[LandmarkRows, LandmarkMatches]:
+    ) -> tuple[LandmarkTable, LandmarkMatches]:
         """Turn features without a stereo match into landmarks once two views give their depth (paper B, 2.2)."""
         features, matches = step.features, step.matches
         if len(matches) < MINIMAL_POINTS:

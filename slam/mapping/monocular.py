@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, hat, inverse, points_by_pose, transform
-from slam.landmarks import LandmarkRows
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.landmarks import LandmarkTable
 from slam.tracking.association import match_everywhere, match_in_boxes, pairs_in_boxes
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.visibility import MapView
@@ -131,14 +131,6 @@ def _step(
     return step, covariance, misfit
 
 
-def _adjoints(T: Array) -> Array:
-    """Adjoints (N, 6, 6) of poses (N, 4, 4), see `slam.geometry.se3.adjoint`."""
-    out = np.zeros((len(T), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = T[:, :3, :3]
-    out[:, 3:, :3] = hat(T[:, :3, 3]) @ T[:, :3, :3]
-    return out
-
-
 def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma: float) -> Array:
     """Covariance (6, 6) of the pose that a frame's measurements of landmarks at `local` (M, 3) [m] give by themselves.
 
@@ -151,7 +143,7 @@ def frame_covariance(rig: StereoRig, local: Array, has_stereo: BoolArray, sigma:
     return np.asarray(np.linalg.inv(rows.T @ rows + 1e-6 * np.eye(6)))
 
 
-def unclaimed(view: MapView, landmarks: LandmarkRows, features: StereoFeatures, rows: NDArray) -> NDArray[np.intp]:
+def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures, rows: NDArray) -> NDArray[np.intp]:
     """Those of the features `rows` (K,) that no landmark in view claims: none nearby in the image looks alike."""
     shown = np.flatnonzero(view.in_image)
     if not len(rows) or not len(shown):
@@ -230,7 +222,7 @@ class MonocularDepth:
         self,
         estimate: Estimate,
         view: MapView,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         features: StereoFeatures,
         found: LandmarkMatches,
     ) -> Array:
@@ -256,7 +248,7 @@ class MonocularDepth:
         row, view = self._followed(views, features, rows, T_world_left)
         seen = views.select(view)
         back = inverse(seen.T_first)
-        motion = _adjoints(inverse(T_world_left) @ seen.T_first)
+        motion = adjoint(inverse(T_world_left) @ seen.T_first)
         P = covariance + motion @ seen.covariance @ np.swapaxes(motion, 1, 2)
         depths = two_view_depth(
             self._rig, seen.uv_first, features.uv_left[row], back @ T_world_left, P, self._sigma
@@ -287,7 +279,12 @@ class MonocularDepth:
 
 
 def find_pose(
-    rig: StereoRig, landmarks: LandmarkRows, positions: Array, features: StereoFeatures, localizer: Localizer, seed: int
+    rig: StereoRig,
+    landmarks: LandmarkTable,
+    positions: Array,
+    features: StereoFeatures,
+    localizer: Localizer,
+    seed: int,
 ) -> Array | None:
     """The camera's pose (4, 4) in a map from left pixels alone, by P3P and RANSAC.
 

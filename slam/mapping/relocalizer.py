@@ -115,7 +115,7 @@ class Relocalizer:
         )
         return self._new(models)
 
-    def begin_anew(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory]:
+    def start_new_map(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory]:
         """A new back end without landmarks at the old one's pose, which is exact for it: it defines its coordinates.
 
         A single estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.se3 import Array
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.object_data import MotionLabels
 from slam.rig_error import CommonError, Correction
 from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligned, Anchors
+from slam.tracking.patch_alignment import Aligned, PatchAnchors
 from slam.tracking.state import TrackingState
 
 
 @dataclass(frozen=True)
-class Associated:
+class AssociatedFrame:
     """A frame whose features are matched with landmarks.
 
     Attributes:
@@ -26,18 +26,18 @@ class Associated:
         features: the same features, corrected by the calibration.
         landmarks: the map.
         prediction: of the back end.
-        matches: matched landmarks, without the held ones.
-        held: ids of landmarks withheld from the back end's update, because they may move.
-        held_rows: features matched with held landmarks.
+        matches: matched landmarks, without the withheld ones.
+        withheld: ids of landmarks withheld from the back end's update, because they may move.
+        withheld_rows: features matched with withheld landmarks.
     """
 
     aligned: Aligned
     features: StereoFeatures
-    landmarks: LandmarkRows
+    landmarks: LandmarkTable
     prediction: Prediction
     matches: LandmarkMatches
-    held: IdArray
-    held_rows: NDArray[np.intp]
+    withheld: IdArray
+    withheld_rows: NDArray[np.intp]
 
     @property
     def pose(self) -> Array:
@@ -53,10 +53,10 @@ class Step:
         index: of the frame.
         features: all of them, corrected by the calibration.
         prediction: of the back end.
-        matches: matched landmarks, without the held ones.
-        held: ids of landmarks withheld from the back end's update, because they may move.
-        held_rows: features matched with held landmarks.
-        spared: ids of matched landmarks left out of the update, because others are more informative.
+        matches: matched landmarks, without the withheld ones.
+        withheld: ids of landmarks withheld from the back end's update, because they may move.
+        withheld_rows: features matched with withheld landmarks.
+        left_out: ids of matched landmarks left out of the update, because others are more informative.
         report: of the update.
         state: whether the pose is known.
         estimate: the camera's pose after the update.
@@ -69,9 +69,9 @@ class Step:
     features: StereoFeatures
     prediction: Prediction
     matches: LandmarkMatches
-    held: IdArray
-    held_rows: NDArray[np.intp]
-    spared: IdArray
+    withheld: IdArray
+    withheld_rows: NDArray[np.intp]
+    left_out: IdArray
     report: UpdateReport
     state: TrackingState
     estimate: Estimate
@@ -97,12 +97,12 @@ class Completed:
     state: TrackingState = field(default_factory=TrackingState)
     dimensions: int | None = None
     mapped: bool = False
-    anchors: Anchors = field(default_factory=Anchors.none)
+    anchors: PatchAnchors = field(default_factory=PatchAnchors.none)
     measured_at: float = -np.inf
 
-    def after(self, step: Step, added: int, anchors: Anchors, begun_anew: bool) -> Completed:
-        """The state after one more step, in which `added` landmarks joined the map, or a new map was begun."""
+    def after(self, step: Step, added: int, anchors: PatchAnchors, new_map: bool) -> Completed:
+        """The state after one more step, in which `added` landmarks joined the map, or a new map was started."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        known = not step.state.unmatched or not self.mapped or begun_anew
+        known = not step.state.unmatched or not self.mapped or new_map
         measured_at = step.features.stamp if known else self.measured_at
         return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors, measured_at)

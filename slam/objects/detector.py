@@ -38,7 +38,7 @@ from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
 from slam.objects.regions import classify_scene
-from slam.objects.revision import Mend, revise_tracks
+from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, record
 
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
@@ -81,10 +81,10 @@ class MovingObjectDetector:
         self._forgotten, self._candidates = [], []
         self._estimates = BodyEstimates(self.config, self.models)
 
-    def revise(self, mend: Mend) -> None:
+    def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
         if self.tracks is not None:
-            revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, mend)
+            revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
 
     # ------------------------------------------------------------------------------------------- a step, first part
 

@@ -12,7 +12,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects.config import ObjectsConfig
-from slam.objects.revision import Mend
+from slam.objects.revision import CorrectRows
 
 
 class ObjectDetector(Protocol):
@@ -27,11 +27,11 @@ class ObjectDetector(Protocol):
         """Forget all tracks and bodies, after a kidnapping for instance; ids are not used again."""
         ...
 
-    def revise(self, mend: Mend) -> None:
+    def revise(self, correct: CorrectRows) -> None:
         """Take note that the rig's correction changes before the next frame.
 
         Args:
-            mend: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
+            correct: takes rectified rows (uL, vL, uR) (N, 3) [px] as they were corrected before to what they are now.
         """
         ...
 
@@ -58,7 +58,7 @@ class NoDetector:
     def restart(self) -> None:
         """There is nothing to forget."""
 
-    def revise(self, mend: Mend) -> None:
+    def revise(self, correct: CorrectRows) -> None:
         """There is nothing to revise."""
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:

@@ -26,7 +26,7 @@ from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.revision import Mend
+from slam.objects.revision import CorrectRows
 
 _LARGEST = 2**28  # bytes of a database's file
 _FARTHEST = 1e8  # guard: of its numbers
@@ -259,7 +259,7 @@ class Procedure1Detector:
         """The database goes on; the last pose does not."""
         self._last = None
 
-    def revise(self, mend: Mend) -> None:
+    def revise(self, correct: CorrectRows) -> None:
         """Nothing measured is kept."""
 
     def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:

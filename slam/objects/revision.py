@@ -14,11 +14,11 @@ from slam.geometry.se3 import Array
 from slam.objects.bodies import Body
 from slam.objects.tracks import Tracks, times_vectors
 
-Mend = Callable[[Array], Array]
+CorrectRows = Callable[[Array], Array]
 
 
 def revise_tracks(
-    tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig, mend: Mend
+    tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig, correct: CorrectRows
 ) -> None:
     """Move the points of all tracks to where their pixels say that they are, corrected anew; in place.
 
@@ -28,13 +28,13 @@ def revise_tracks(
         poses: T_world_left (W, 4, 4) in the frames of the window's slots.
         slot: of the newest frame.
         rig: the cameras.
-        mend: corrects rectified rows (uL, vL, uR) (N, 3) [px] anew, as of `slam.calibration.correction.Revision`.
+        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] anew, as of `slam.calibration.correction.Revision`.
     """
     rows, slots = np.nonzero(tracks.dof)
     points = tracks.anchor[rows] + tracks.p[rows, slots]
-    tracks.p[rows, slots] += _shifts(points, poses[slots], rig, mend)
+    tracks.p[rows, slots] += _shifts(points, poses[slots], rig, correct)
     alive = np.flatnonzero(tracks.ids >= 0)
-    shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, mend)
+    shift = _shifts(tracks.position[alive], np.broadcast_to(poses[slot], (len(alive), 4, 4)), rig, correct)
     tracks.position[alive] += shift
     tracks.older_b[alive] += times_vectors(tracks.older_A[alive], shift)
     for body in bodies.values():
@@ -42,7 +42,7 @@ def revise_tracks(
         tracks.local[alive[mine]] += shift[mine] @ body.T[:3, :3]
 
 
-def _shifts(points: Array, T_world_left: Array, rig: StereoRig, mend: Mend) -> Array:
+def _shifts(points: Array, T_world_left: Array, rig: StereoRig, correct: CorrectRows) -> Array:
     """By what points (N, 3) seen from poses (N, 4, 4) move, in world coordinates (N, 3); not at all out of view."""
     rectified = rig.rectified
     T = T_world_left @ rectified.T_left_rectified
@@ -52,7 +52,7 @@ def _shifts(points: Array, T_world_left: Array, rig: StereoRig, mend: Mend) -> A
     left = rectified.rig.left
     seen = np.isfinite(z).all(axis=1) & left.in_image(z[:, :2])
     good = np.flatnonzero(seen & (np.abs(z[:, 0] - z[:, 2]) < left.width))
-    change = mend(z[good]) - z[good]
+    change = correct(z[good]) - z[good]
     finite = np.isfinite(change).all(axis=1)
     good, change = good[finite], change[finite]
     shifts[good] = times_vectors(R[good], np.linalg.solve(J[good], change[..., None])[..., 0])

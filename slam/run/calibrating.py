@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.calibration import KeptCalibration, RigModel, RigPosterior
+from slam.calibration import RigModel, RigPosterior, SavedCalibration
 from slam.calibration.corrected import corrected_rig
 from slam.calibration.evidence import RecordingEvidence
 from slam.calibration.joint import Agreement, agreement, joint_calibration
-from slam.calibration.kept import RigNumbers
+from slam.calibration.saved import RigNumbers
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
@@ -104,7 +104,7 @@ class Calibrated:
     """
 
     found: Sequence[Found]
-    kept: KeptCalibration
+    kept: SavedCalibration
     agreed: Agreement | None
     off: float
     warning: str

@@ -21,7 +21,7 @@ from slam.files import RowFile, lock_folder, reason, write_text
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, tum_line
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.object_data import MovingObject
 from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
 
@@ -101,7 +101,7 @@ class RunFiles:
         """Write trajectory_final.txt; raises SlamError where it cannot be written, and nothing is left of it."""
         write_text(self.folder / "trajectory_final.txt", _tum(trajectory))
 
-    def write_landmarks(self, estimate: Estimate, landmarks: LandmarkRows | None, numbers: list[int]) -> None:
+    def write_landmarks(self, estimate: Estimate, landmarks: LandmarkTable | None, numbers: list[int]) -> None:
         """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
         rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
         write_text(self.folder / "landmarks.csv", _rows([LANDMARK_COLUMNS, *rows]))
@@ -156,7 +156,7 @@ def _tum(trajectory: Trajectory) -> str:
     return "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
 
 
-def _landmark_rows(estimate: Estimate, landmarks: LandmarkRows, numbers: list[int]) -> Iterator[list[Any]]:
+def _landmark_rows(estimate: Estimate, landmarks: LandmarkTable, numbers: list[int]) -> Iterator[list[Any]]:
     """A row of landmarks.csv for each landmark."""
     upper = np.triu_indices(3)
     for i, position, covariance in zip(estimate.ids, estimate.positions, estimate.covariances):

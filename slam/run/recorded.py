@@ -16,7 +16,7 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
 
 
@@ -172,7 +172,7 @@ class Recording:
         added, removed = np.searchsorted(self.added.frame, k + 1), np.searchsorted(self.removed_frame, k + 1)
         return int(added - removed)
 
-    def landmarks(self, frames: int) -> LandmarkRows:
+    def landmarks(self, frames: int) -> LandmarkTable:
         """The map after the first so many frames: how often each landmark was given, and when; no appearance."""
         ids, frame = (
             np.concatenate([getattr(rows, name) for rows in (self.added, self.observed)]) for name in ("ids", "frame")
@@ -185,7 +185,7 @@ class Recording:
         unique, seen, last = unique[kept], seen[kept], last[kept]
         none = np.zeros(len(unique), np.int64)
         descriptors = np.zeros((len(unique), 0), np.float32)
-        return LandmarkRows(unique, descriptors, none.astype(np.int8), seen, seen, none, last)
+        return LandmarkTable(unique, descriptors, none.astype(np.int8), seen, seen, none, last)
 
     def _gone(self, frames: int) -> IdArray:
         """Ids of landmarks that left the map in the first so many frames, and did not come back after that."""

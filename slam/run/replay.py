@@ -19,13 +19,13 @@ from slam.data import (
     UpdateReport,
     UpdateStatus,
 )
-from slam.foreign import named_failures
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recorded import RecordedFrame, Recording
-from slam.tracking.answer_check import require_estimate, require_prediction, require_report
+from slam.third_party import named_failures
 from slam.tracking.association import AssociationConfig
+from slam.tracking.protocol_check import require_estimate, require_prediction, require_report
 
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 

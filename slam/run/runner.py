@@ -57,7 +57,7 @@ class RunOptions:
         record: file for a recording of what the back end is given, see `slam.run.replay`; None for none.
         prior_map: file of a map to start in, see `slam.mapping.map_io`; None to begin a new one.
         save_map: file for the map at the end; None for none.
-        calibration: file with what is known of the rig's error, see `slam.calibration.kept`; None for nothing.
+        calibration: file with what is known of the rig's error, see `slam.calibration.saved`; None for nothing.
         mono: use the left images alone.
         overlap: read and extract the next frame while the present one is estimated; the results are the same.
         live: take frames at their own rate, and leave out those that come too late; of a camera always.

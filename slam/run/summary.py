@@ -9,11 +9,10 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
-from slam.foreign import named_failures
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.objects.metrics import ObjectScore
 from slam.rig_error import CommonError
 from slam.run.recorded import Recording
@@ -22,7 +21,8 @@ from slam.runtime.compile_clock import compile_clock, working_time
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
-from slam.tracking.answer_check import require_estimate
+from slam.third_party import named_failures
+from slam.tracking.protocol_check import require_estimate
 
 
 @dataclass
@@ -94,7 +94,7 @@ class Replayed:
             return require_estimate(self.backend.estimate(), self.backend)
 
     @property
-    def landmarks(self) -> LandmarkRows:
+    def landmarks(self) -> LandmarkTable:
         """How often, and when last, each landmark was given so far."""
         return self.recording.landmarks(len(self.record.stamps))
 

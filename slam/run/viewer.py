@@ -127,7 +127,7 @@ class Viewer:
         rr, atlas = self._rr, system.atlas
         at = atlas.poses_in_map()[:, :3, 3]
         self._log("world/places/keyframes", rr.Points3D(at, colors=_PLACE, radii=0.05))
-        self._log("world/places/path", rr.LineStrips3D([at[atlas.known :]], colors=_PLACE))
+        self._log("world/places/path", rr.LineStrips3D([at[atlas.prior_count :]], colors=_PLACE))
         for name, pairs, colour in (
             ("closed", [(loop.first, loop.second) for loop in atlas.loops], _CLOSED),
             ("refused", atlas.refused, _REFUSED),

@@ -9,7 +9,7 @@ import numpy as np
 from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.se3 import Array, pose, rotation_from_quaternion
 from slam.geometry.stamps import increasing
-from slam.geometry.trajectory import Trajectory
+from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import ImuCamera, euroc_camera, kalibr_cameras, rig_from_cameras
 from slam.sequences.faults import FaultLog
@@ -27,6 +27,10 @@ from slam.sequences.source import (
 )
 from slam.sequences.tables import read_rows, shorten, stamp_and_name
 from slam.sequences.truth import LARGEST, require_truth
+
+#: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
+#: half a metre apart, which makes 2 mrad. The camera's orientation in the vehicle is calibrated to half a degree or so.
+MOCAP_NOISE = TruthNoise(rotation=0.002, translation=0.001, mounting=0.01)
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")  # both give the body's (IMU's) pose
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "../camchain.yaml", "../dso/camchain.yaml")
@@ -57,7 +61,9 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
         require_size(source.first_size(), (rig.width, rig.height), calibration)
         truth = _ground_truth(root, cameras[0].T_body_camera, faults)
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    return RecordedSequence(name, "euroc", options.get("kind", "handheld"), rig, source, truth, None, warnings)
+    return RecordedSequence(
+        name, "euroc", options.get("kind", "handheld"), rig, source, truth, None, warnings, MOCAP_NOISE
+    )
 
 
 def _root(folder: Path) -> Path:

@@ -11,9 +11,9 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-ENOUGH = 6  #: fewest observations whose agreement is tested
-HEEDED = 3  #: a prediction holds if at least one in so many observations agrees with it
-CONFIRMED = 5  #: fewest observations that agree on a pose by more than chance; three determine it
+MIN_OBSERVATIONS = 6  #: fewest observations whose agreement is tested
+ONE_AGREES_IN = 3  #: a prediction holds if at least one in so many observations agrees with it
+MIN_CONSENSUS = 5  #: fewest observations that agree on a pose by more than chance; three determine it
 INFLATION = (3.0, 10.0)  #: factors on the process noise's standard deviation tried if observations disagree
 _HYPOTHESES = 200  # cost: poses tried in the search for one on which the observations agree
 _AS_NEW = 2.0  # innovation variance of a landmark as uncertain as a new one, in units of the pixel variance
@@ -34,7 +34,7 @@ def landmarks_pose(
     """
     threshold = models.pixel_sigma * np.sqrt(_AS_NEW * chi_square_limit(3, models.gate_probability))
     found = find_consensus(rig, points, z, T_world_left, float(threshold), _HYPOTHESES, seed)
-    enough = found.inliers.sum() >= max(CONFIRMED, (len(z) + 1) // 2)
+    enough = found.inliers.sum() >= max(MIN_CONSENSUS, (len(z) + 1) // 2)
     return found.T_world_left if enough and np.isfinite(found.T_world_left).all() else None
 
 

@@ -16,7 +16,7 @@ from slam.geometry.arrays import isin, median
 from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
 from slam.tracking.hypotheses import PoseHypotheses
@@ -87,7 +87,7 @@ class Localizer:
     def localize(
         self,
         prediction: Prediction,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         positions: Array,
         features: StereoFeatures,
         state: TrackingState,
@@ -150,7 +150,7 @@ class Localizer:
     def match(
         self,
         prediction: Prediction,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         positions: Array,
         features: StereoFeatures,
         seed: int,
@@ -198,7 +198,7 @@ class Localizer:
         self,
         T_world_left: Array,
         prediction: Prediction,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         positions: Array,
         features: StereoFeatures,
         seed: int,
@@ -211,18 +211,18 @@ class Localizer:
             return LandmarkMatches.nothing()
         return _matches_of(landmarks, matches.select(consensus.inliers), consensus.T_world_left)
 
-    def similar_view(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+    def similar_view(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
         """Which landmarks (N,) at `positions` are seen from this pose (4, 4) much as they were at first sight."""
         limits = self.config.view_angle, self.config.view_ratio
         return similar_view(positions, landmarks.seen_from, T_world_left[:3, 3], *limits)
 
-    def _looked_for(self, T_world_left: Array, landmarks: LandmarkRows, positions: Array) -> BoolArray:
+    def _looked_for(self, T_world_left: Array, landmarks: LandmarkTable, positions: Array) -> BoolArray:
         """Which landmarks (N,) are searched for in windows: those in a similar view, and those long out of view."""
         alike = self.similar_view(T_world_left, landmarks, positions)
         return alike | landmarks.long_out_of_view(self.config.rematch_after)
 
     def _in_windows(
-        self, prediction: Prediction, landmarks: LandmarkRows, rows: NDArray[np.intp], features: StereoFeatures
+        self, prediction: Prediction, landmarks: LandmarkTable, rows: NDArray[np.intp], features: StereoFeatures
     ) -> Matches:
         """Matches by rows of the whole map."""
         descriptors = (landmarks.descriptors, landmarks.laplacian)
@@ -240,7 +240,7 @@ class Localizer:
         return find_consensus(self.rig, positions[matches.landmarks], measured, guess, threshold, hypotheses, seed)
 
     def _expected(
-        self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkRows, positions: Array
+        self, T_world_left: Array, prediction: Prediction, landmarks: LandmarkTable, positions: Array
     ) -> Prediction:
         """The prediction for another pose, with small windows."""
         left, right = self.rig.project(transform(inverse(T_world_left), positions))
@@ -261,7 +261,7 @@ class Localizer:
         consensus: PoseConsensus,
         matches: Matches,
         expected: Prediction,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         positions: Array,
         features: StereoFeatures,
         seed: int,
@@ -298,7 +298,7 @@ def median_deviation(prediction: Prediction) -> float:
     return float(np.sqrt(median(largest)))
 
 
-def _matches_of(landmarks: LandmarkRows, matches: Matches, T_world_left: Array) -> LandmarkMatches:
+def _matches_of(landmarks: LandmarkTable, matches: Matches, T_world_left: Array) -> LandmarkMatches:
     if not len(matches):
         return LandmarkMatches.nothing()
     order = np.argsort(matches.landmarks, kind="stable")

@@ -17,9 +17,9 @@ from slam.data import BoolArray, IdArray, Patches, StereoFeatures
 from slam.geometry.arrays import Array, isin
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.interfaces import AligningFrontend, Frontend
-from slam.landmarks import LandmarkRows
-from slam.tracking.answer_check import require_aligned, require_patches
+from slam.landmarks import LandmarkTable
 from slam.tracking.localizer import LandmarkMatches
+from slam.tracking.protocol_check import require_aligned, require_patches
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
 _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew, so that another such change stays below the largest
@@ -27,7 +27,7 @@ _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
 @dataclass(frozen=True)
-class Anchors:
+class PatchAnchors:
     """Landmarks' image patches and the poses from which they were taken: one row per landmark, ids ascending.
 
     Attributes:
@@ -41,29 +41,29 @@ class Anchors:
     poses: Array
 
     @classmethod
-    def none(cls) -> Anchors:
+    def none(cls) -> PatchAnchors:
         """No landmark."""
         return cls(np.zeros(0, np.int64), Patches.none(), np.zeros((0, 4, 4)))
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def select(self, keep: BoolArray | NDArray[np.intp]) -> Anchors:
+    def select(self, keep: BoolArray | NDArray[np.intp]) -> PatchAnchors:
         """Some of the rows, in order."""
-        return Anchors(self.ids[keep], self.patches.select(keep), self.poses[keep])
+        return PatchAnchors(self.ids[keep], self.patches.select(keep), self.poses[keep])
 
-    def with_new(self, ids: IdArray, patches: Patches, T_world_left: Array) -> Anchors:
+    def with_new(self, ids: IdArray, patches: Patches, T_world_left: Array) -> PatchAnchors:
         """These and new ones, which replace earlier ones of the same landmark."""
         old = self.select(~isin(self.ids, ids))
         ids = np.concatenate([old.ids, ids])
         poses = np.concatenate([old.poses, np.tile(T_world_left, (len(patches), 1, 1))])
-        return Anchors(ids, old.patches.joined(patches), poses).select(np.argsort(ids, kind="stable"))
+        return PatchAnchors(ids, old.patches.joined(patches), poses).select(np.argsort(ids, kind="stable"))
 
-    def known(self, landmarks: LandmarkRows) -> Anchors:
+    def known(self, landmarks: LandmarkTable) -> PatchAnchors:
         """Those of landmarks that are in the map and were measured recently."""
         rows = np.minimum(landmarks.rows(self.ids), max(len(landmarks) - 1, 0))
         if not len(landmarks):
-            return Anchors.none()
+            return PatchAnchors.none()
         keep = (landmarks.ids[rows] == self.ids) & (landmarks.unseen[rows] <= _FORGOTTEN)
         return self.select(keep)
 
@@ -78,7 +78,7 @@ class Aligned:
     """
 
     features: StereoFeatures
-    anchors: Anchors
+    anchors: PatchAnchors
 
 
 class Aligner:
@@ -96,10 +96,10 @@ class Aligner:
     def align(
         self,
         frontend: Frontend | None,
-        anchors: Anchors,
+        anchors: PatchAnchors,
         features: StereoFeatures,
         matches: LandmarkMatches,
-        landmarks: LandmarkRows,
+        landmarks: LandmarkTable,
         positions: Callable[[IdArray], Array],
     ) -> Aligned:
         """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
@@ -116,7 +116,7 @@ class Aligner:
             SlamError: the front end does not return pixels.
         """
         if not self._enabled or not isinstance(frontend, AligningFrontend):
-            return Aligned(features, Anchors.none())
+            return Aligned(features, PatchAnchors.none())
         anchors = anchors.known(landmarks)
         known, order = isin(anchors.ids, matches.ids), isin(matches.ids, anchors.ids)
         if matches.T_world_left is None or features.images is None or not known.any():
@@ -148,7 +148,7 @@ class Aligner:
         matches: LandmarkMatches,
         added: LandmarkMatches,
         T_world_left: Array,
-    ) -> Anchors:
+    ) -> PatchAnchors:
         """The anchors valid after a frame, with new ones for its landmarks that have none.
 
         Args:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.calibration.kept import KeptCalibration, RigNumbers, load_calibration
+from slam.calibration.saved import RigNumbers, SavedCalibration, load_calibration
 from slam.config import SystemConfig
 from slam.mapping.map_io import SavedMap, decode, encode, load_map
 from slam.objects.config import ObjectsConfig
@@ -121,7 +121,7 @@ def kept_calibration(rng: np.random.Generator, folder: Path) -> None:
     """A kept calibration with hostile values, and a run that begins with it."""
     rig, frames = scene()
     path = folder / "a.json"
-    tree = KeptCalibration(_run()[0].calibration.posterior, RigNumbers.of(rig)).to_json()
+    tree = SavedCalibration(_run()[0].calibration.posterior, RigNumbers.of(rig)).to_json()
     for _ in range(int(rng.integers(1, 3))):
         tree = _hostile_tree(rng, tree)
     text = json.dumps(tree)

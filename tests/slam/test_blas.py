@@ -72,7 +72,7 @@ def show_nothing(sequence, count):
 @pytest.mark.parametrize(
     "name, part",
     [
-        ("system", "slam.calibration.estimator.as_delivered"),
+        ("system", "slam.calibration.estimator.factory_prior"),
         ("run", "slam.run.runner.outcome"),
         ("calibrate", "slam.run.calibrating.joint_calibration"),
     ],

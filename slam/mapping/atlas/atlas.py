@@ -17,8 +17,8 @@ from scipy.linalg import block_diag
 from slam.data import Estimate
 from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.chain import Chain, adjoints, shared_out
-from slam.mapping.atlas.keyframes import Keyframe, Loop, what_was_added
+from slam.mapping.atlas.chain import Chain, spread_over
+from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.mapping.atlas.places import PlaceIndex, Vectors
 from slam.mapping.atlas.rows import KeyframeRows
 from slam.models import ANYWHERE, EstimatorModels
@@ -31,10 +31,10 @@ _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unk
 
 
 @dataclass(frozen=True)
-class Anchor:
+class MapAnchor:
     """A pose with its uncertainty in the map, from which those of later poses are propagated.
 
-    It is the newest keyframe's at the last loop closure, or that at which a new back end has begun since.
+    It is the newest keyframe's at the last loop closure, or the first pose of a new back end that has started since.
 
     Attributes:
         T_odom_left: the pose (4, 4), as the back end estimated it then.
@@ -53,15 +53,15 @@ class Anchor:
 
     def belief(self, rig: CommonError) -> tuple[Array, Array]:
         """The common errors (n,) and their covariance (n, n); zero and unity if there are others by now."""
-        if rig.scale.shape != self.rig.scale.shape:
-            return np.zeros(rig.scale.shape[1]), np.eye(rig.scale.shape[1])
+        if rig.root.shape != self.rig.root.shape:
+            return np.zeros(rig.root.shape[1]), np.eye(rig.root.shape[1])
         return self.common_as(rig), self.covariance[6:, 6:]
 
     def common_as(self, rig: CommonError) -> Array:
         """The common errors (n,) in units of `rig`, as the rig's posterior has changed since; zero if others by now."""
-        if rig.scale.shape != self.rig.scale.shape:
-            return np.zeros(rig.scale.shape[1])
-        return np.asarray(np.linalg.lstsq(rig.scale, self.rig.scale @ self.common, rcond=None)[0])
+        if rig.root.shape != self.rig.root.shape:
+            return np.zeros(rig.root.shape[1])
+        return np.asarray(np.linalg.lstsq(rig.root, self.rig.root @ self.common, rcond=None)[0])
 
     def later(self, back: Array, shares: Array) -> Array:
         """Covariance (6, 6) of a later pose, without the noise since.
@@ -72,27 +72,27 @@ class Anchor:
             back: adjoint (6, 6) of the anchor's pose in the later one's coordinates.
             shares: derivative (6, m) of the motion since by the rig's errors.
         """
-        J = np.concatenate([back, shares @ self.rig.scale], axis=1)
-        found = shares @ self.rig.scale @ self.common
+        J = np.concatenate([back, shares @ self.rig.root], axis=1)
+        found = shares @ self.rig.root @ self.common
         return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
 
 
 @dataclass(frozen=True)
-class Gap:
+class TrackingGap:
     """A time in which the camera moved without being tracked, and after which a new back end took over.
 
     Attributes:
         since: time of the last measured pose before it [s].
         until: time of the first pose after it [s].
-        covariance: of that pose (6, 6), perturbing on the right, see `moved_unseen`; None if the camera was found
-            elsewhere, so that nothing is known of its motion.
+        covariance: of that pose (6, 6), perturbing on the right, see `covariance_after_unseen_motion`; None if the
+            camera was found elsewhere, so that nothing is known of its motion.
         anchor: the first pose after it, if a new map begins there that no loop has tied to the rest so far.
     """
 
     since: float
     until: float
     covariance: Array | None = None
-    anchor: Anchor | None = None
+    anchor: MapAnchor | None = None
 
 
 @dataclass(frozen=True)
@@ -104,36 +104,37 @@ class Atlas:
         rows: their poses and whatever else the pose graph needs of them.
         index: of their appearance, for place recognition.
         loops: those in the pose graph.
-        spare: the latest verified loops outside the pose graph: refused, unconfirmed, or with no new information.
+        inactive_loops: the latest verified loops outside the pose graph: refused, unconfirmed, or not
+            informative.
         dropped: number of this run's loops taken out of the pose graph to save time.
         refused: loops that contradict the path, as pairs of keyframe numbers.
         corrected: poses T_map_left (C, 4, 4) of the first C keyframes, as of the last loop closure.
         solved: the anchor at the last of these; None without a loop.
-        anchor: from which the present pose's covariance is propagated: `solved`, or where a new map has begun since.
+        anchor: from which the present pose's covariance is propagated: `solved`, or where a new map has started since.
         T_map_odom: pose (4, 4) of the back end's frame in the map.
         pending: the last loop that passed the gate, whether in the pose graph or not.
         confirmed: whether another keyframe shortly before agreed with `pending`.
         gaps: one before each back end but the first.
         restarts: number of gaps before the last keyframe.
-        known: number of keyframes of the prior map that this run started in; they come first.
+        prior_count: number of keyframes of the prior map that this run started in; they come first.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
     rows: KeyframeRows = field(default_factory=KeyframeRows)
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
-    spare: tuple[Loop, ...] = ()
+    inactive_loops: tuple[Loop, ...] = ()
     dropped: int = 0
     refused: tuple[tuple[int, int], ...] = ()
     corrected: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    solved: Anchor | None = None
-    anchor: Anchor | None = None
+    solved: MapAnchor | None = None
+    anchor: MapAnchor | None = None
     T_map_odom: Array = field(default_factory=lambda: np.eye(4))
     pending: Loop | None = None
     confirmed: bool = False
-    gaps: tuple[Gap, ...] = ()
+    gaps: tuple[TrackingGap, ...] = ()
     restarts: int = 0
-    known: int = 0
+    prior_count: int = 0
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -150,7 +151,7 @@ class Atlas:
         atlas = cls()
         for keyframe in keyframes:
             atlas = atlas.with_new(replace(keyframe, frame=-1), keyframe.descriptors.astype(np.float32))
-        return replace(atlas, loops=tuple(loops), corrected=poses, known=len(atlas))
+        return replace(atlas, loops=tuple(loops), corrected=poses, prior_count=len(atlas))
 
     def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
         """A copy with one more keyframe, which has descriptors (F, D)."""
@@ -166,8 +167,8 @@ class Atlas:
 
         Keyframes of a prior map are included, and also counted separately as ``known``.
         """
-        closed = sum(loop.second >= self.known for loop in self.loops)
-        known = {"known": self.known} if self.known else {}
+        closed = sum(loop.second >= self.prior_count for loop in self.loops)
+        known = {"known": self.prior_count} if self.prior_count else {}
         return {"keyframes": len(self), **known, "closed": closed + self.dropped, "refused": len(self.refused)}
 
     def with_loop(self, loop: Loop, most: int) -> Atlas:
@@ -176,13 +177,13 @@ class Atlas:
         while len(loops) > most:
             at = np.array([self.keyframes[k.second].travelled for k in loops])
             least = 1 + int(np.argmin(at[2:] - at[:-2]))
-            dropped += loops[least].second >= self.known
+            dropped += loops[least].second >= self.prior_count
             loops = loops[:least] + loops[least + 1 :]
         return replace(self, loops=loops, dropped=dropped)
 
-    def with_spare(self, loop: Loop, most: int) -> Atlas:
+    def with_inactive_loop(self, loop: Loop, most: int) -> Atlas:
         """A copy with one more loop outside the pose graph; the last `most` are kept."""
-        return replace(self, spare=(*self.spare, loop)[-most:])
+        return replace(self, inactive_loops=(*self.inactive_loops, loop)[-most:])
 
     def with_loops(self, held: Sequence[Loop], believed: Sequence[Loop], most: int) -> Atlas:
         """A copy with other loops in the pose graph; previous ones that are not `believed` any more become refused.
@@ -193,8 +194,8 @@ class Atlas:
         out = [x for x in self.loops if x.pair not in kept]
         refused = [pair for pair in self.refused if pair not in good]
         refused += [x.pair for x in out if x.pair not in good]
-        spare = [x for x in (*self.spare, *out) if x.pair not in kept]
-        atlas = replace(self, loops=(), spare=tuple(spare[-most:]), refused=tuple(refused))
+        spare = [x for x in (*self.inactive_loops, *out) if x.pair not in kept]
+        atlas = replace(self, loops=(), inactive_loops=tuple(spare[-most:]), refused=tuple(refused))
         for loop in held:
             atlas = atlas.with_loop(loop, most)
         return replace(atlas, pending=held[-1], confirmed=True)
@@ -202,8 +203,8 @@ class Atlas:
     def solved_by(self, solution: Solution, rig: CommonError) -> Atlas:
         """A copy with the keyframes' poses by the pose graph; `rig` says what its common errors stand for."""
         last = self.keyframes[-1]
-        shared = replace(rig, shares=last.shares)
-        anchor = Anchor(last.T_odom_left, last.covariance, solution.covariance, solution.common, shared)
+        shared = replace(rig, jacobian=last.jacobian)
+        anchor = MapAnchor(last.T_odom_left, last.covariance, solution.covariance, solution.common, shared)
         return replace(
             self,
             corrected=solution.poses,
@@ -213,7 +214,7 @@ class Atlas:
             T_map_odom=solution.poses[-1] @ inverse(last.T_odom_left),
         )
 
-    def found_again(self, gap: Gap, place: float | None) -> Atlas:
+    def relocalized(self, gap: TrackingGap, place: float | None) -> Atlas:
         """A copy with a gap after which the camera was found in the map.
 
         Args:
@@ -222,11 +223,11 @@ class Atlas:
         """
         anchor = self.anchor
         if place is not None:
-            begun = [g.anchor for g in self.gaps if g.anchor is not None and g.until <= place]
-            anchor = begun[-1] if begun else self.solved
+            starts = [g.anchor for g in self.gaps if g.anchor is not None and g.until <= place]
+            anchor = starts[-1] if starts else self.solved
         return replace(self, gaps=(*self.gaps, gap), anchor=anchor)
 
-    def begun_anew(
+    def with_new_map(
         self, since: float, before: Estimate, after: Estimate, common: CommonError, models: EstimatorModels
     ) -> Atlas:
         """A copy with a new back end from here on, which takes its first pose for exact; in the map it is uncertain.
@@ -238,11 +239,11 @@ class Atlas:
             common: the part of the pose's error that other frames share.
             models: motion model, with the speeds of a camera of this kind.
         """
-        n = common.scale.shape[1]
+        n = common.root.shape[1]
         error, known = (np.zeros(n), np.eye(n)) if self.anchor is None else self.anchor.belief(common)
-        P = moved_unseen(self.estimate(before, common).covariance, after.stamp - since, models)
-        anchor = Anchor(after.T_world_left, after.covariance, block_diag(P, known), error, common)
-        return replace(self, gaps=(*self.gaps, Gap(since, after.stamp, P, anchor)), anchor=anchor)
+        P = covariance_after_unseen_motion(self.estimate(before, common).covariance, after.stamp - since, models)
+        anchor = MapAnchor(after.T_world_left, after.covariance, block_diag(P, known), error, common)
+        return replace(self, gaps=(*self.gaps, TrackingGap(since, after.stamp, P, anchor)), anchor=anchor)
 
     def closed_in(self, frame: int) -> int | None:
         """Index of the earlier frame with which `frame` closed a loop; None if it closed none."""
@@ -263,14 +264,14 @@ class Atlas:
             rig: what the common errors stand for now.
             path: the present estimate of the whole path; None for the poses as they were estimated at the time.
         """
-        poses, count, m = self.rows.poses.copy(), len(self), len(rig.scale)
+        poses, count, m = self.rows.poses.copy(), len(self), len(rig.root)
         if path is not None:
-            poses[self.known :] = path.poses[np.searchsorted(path.stamps, self.rows.stamps[self.known :])]
-        shares = self.rows.shares
+            poses[self.prior_count :] = path.poses[np.searchsorted(path.stamps, self.rows.stamps[self.prior_count :])]
+        shares = self.rows.jacobian
         if shares.shape[2] != m:  # all keyframes are from a prior map that was made without common errors
             shares = np.zeros((count, 6, m))
-        common = (shares.reshape(6 * count, m) @ rig.scale).reshape(count, 6, rig.scale.shape[1])
-        common[1:] -= adjoints(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
+        common = (shares.reshape(6 * count, m) @ rig.root).reshape(count, 6, rig.root.shape[1])
+        common[1:] -= adjoint(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
         return Chain(poses, self.rows.steps, common)
 
     def in_map(self, chain: Chain) -> Array:
@@ -300,8 +301,8 @@ class Atlas:
         T, R = self.T_map_odom, self.T_map_odom[:3, :3]
         anchor = self.anchor
         back = adjoint(inverse(estimate.T_world_left) @ anchor.T_odom_left)
-        noise = what_was_added(estimate.covariance - common.covariance, back @ anchor.noise @ back.T)
-        covariance = anchor.later(back, common.shares - back @ anchor.rig.shares) + noise
+        noise = covariance_growth(estimate.covariance - common.covariance, back @ anchor.noise @ back.T)
+        covariance = anchor.later(back, common.jacobian - back @ anchor.rig.jacobian) + noise
         return replace(
             estimate,
             T_world_left=T @ estimate.T_world_left,
@@ -318,8 +319,8 @@ class Atlas:
 
         chain = self.chain(self.solved.rig, path)
         moved = solve(chain, self.loops, self.in_map(chain)).poses
-        stamps = self.rows.stamps[self.known :]
-        return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.known :], self._unseen_time))
+        stamps = self.rows.stamps[self.prior_count :]
+        return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
 
     def _unseen_time(self, stamps: Array) -> Array:
         """Total duration (N,) [s] of gaps before each of `stamps` (N,) [s]."""
@@ -328,7 +329,7 @@ class Atlas:
         return np.asarray(lasted.sum(axis=1))
 
 
-def moved_unseen(covariance: Array, duration: float, models: EstimatorModels) -> Array:
+def covariance_after_unseen_motion(covariance: Array, duration: float, models: EstimatorModels) -> Array:
     """Covariance (6, 6) of a predicted pose after a gap, in which the camera may have moved at any usual velocity.
 
     The motion model takes changes of velocity for white noise, which bends and stops in a long gap are not. So the
@@ -358,7 +359,7 @@ def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = Fa
     T, P = estimate.T_world_left, estimate.covariances
     J = T[:3, :3] @ points_by_pose(transform(inverse(T), estimate.positions))
     before, after = (J @ pose @ np.swapaxes(J, 1, 2) for pose in (estimate.covariance, covariance))
-    moved = what_was_added(P, before) + after
+    moved = covariance_growth(P, before) + after
     surer = np.trace(moved, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
     return np.where((surer | may_grow)[:, None, None], moved, P)
 
@@ -366,8 +367,8 @@ def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = Fa
 def _between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_time: Callable[[Array], Array]) -> Array:
     """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,) [s], are moved to other poses (K, 4, 4).
 
-    Between two keyframes the change is interpolated in time; if there was a gap between them, see `Gap`, all of it is
-    put into the gap, of which `unseen_time` gives the duration.
+    Between two keyframes the change is interpolated in time; if there was a gap between them, see `TrackingGap`, all
+    of it is put into the gap, of which `unseen_time` gives the duration.
     """
     rows = np.searchsorted(path.stamps, stamps)
     odom = path.poses[rows]
@@ -379,6 +380,6 @@ def _between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_tim
     seen = span <= 0
     since, span = np.where(seen, path.stamps - stamps[at], since), np.where(seen, stamps[to] - stamps[at], span)
     share = np.clip(since / np.where(to > at, span, 1.0), 0.0, 1.0)
-    return shared_out(
+    return spread_over(
         moved[at], inverse(odom[at]) @ path.poses, inverse(path.poses) @ odom[to], share[:, None] * change
     )

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
+from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, inverse, log
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Chain:
         number = np.arange(len(self.poses))
         end = ends[np.searchsorted(ends, number)]
         begin = ends[np.maximum(np.searchsorted(ends, number) - 1, 0)]
-        A = adjoints(inverse(self.poses[end]) @ self.poses)
+        A = adjoint(inverse(self.poses[end]) @ self.poses)
         parts = []
         for step in (A @ self.steps @ np.swapaxes(A, 1, 2), A @ self.common):
             step[ends[0]] = 0
@@ -105,12 +105,12 @@ def spread(chain: Chain, ends: NDArray[np.intp], propagated: Propagated, moved: 
     part = expected + (propagated.noise @ weight[at])[:, :, 0]
     part[ends[0]] = 0
     part[ends[1:]] = change
-    out = shared_out(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)
+    out = spread_over(moved[at], inverse(chain.poses[ends[:-1]])[at] @ chain.poses, rest, part)
     out[ends] = moved
     return out
 
 
-def shared_out(begin: Array, motion: Array, rest: Array, change: Array) -> Array:
+def spread_over(begin: Array, motion: Array, rest: Array, change: Array) -> Array:
     """Poses (N, 4, 4) on stretches whose ends move.
 
     Args:
@@ -119,13 +119,4 @@ def shared_out(begin: Array, motion: Array, rest: Array, change: Array) -> Array
         rest: estimated motion from the poses to the ends of their stretches (N, 4, 4).
         change: of the motions (N, 6), perturbing the poses at the stretches' ends on the right.
     """
-    return np.asarray(begin @ motion @ exp((adjoints(rest) @ change[:, :, None])[:, :, 0]))
-
-
-def adjoints(T: Array) -> Array:
-    """Adjoints (N, 6, 6) of poses (N, 4, 4)."""
-    out = np.zeros((len(T), 6, 6))
-    R = T[:, :3, :3]
-    out[:, :3, :3] = out[:, 3:, 3:] = R
-    out[:, 3:, :3] = hat(T[:, :3, 3]) @ R
-    return out
+    return np.asarray(begin @ motion @ exp((adjoint(rest) @ change[:, :, None])[:, :, 0]))

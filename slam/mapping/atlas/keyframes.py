@@ -27,7 +27,7 @@ class Keyframe:
         covariance: of that pose (6, 6), without the common errors.
         step_covariance: covariance (6, 6) by noise of the motion since the keyframe before, perturbing this pose on the
             right.
-        shares: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
+        jacobian: derivative (6, m) of the pose by the errors that all poses share, see `slam.rig_error.CommonError`.
         travelled: length of the path up to here [m].
         depth: median depth of the features [m].
         points: features in coordinates of the rectified left camera (F, 3) [m].
@@ -42,7 +42,7 @@ class Keyframe:
     T_odom_left: Array
     covariance: Array
     step_covariance: Array
-    shares: Array
+    jacobian: Array
     travelled: float
     depth: float
     points: NDArray[np.float32]
@@ -157,10 +157,10 @@ def step_covariance(before: Keyframe, T_odom_left: Array, covariance: Array) -> 
         covariance: of the later pose (6, 6), by noise.
     """
     back = adjoint(inverse(T_odom_left) @ before.T_odom_left)
-    return what_was_added(covariance, back @ before.covariance @ back.T)
+    return covariance_growth(covariance, back @ before.covariance @ back.T)
 
 
-def what_was_added(after: Array, before: Array) -> Array:
+def covariance_growth(after: Array, before: Array) -> Array:
     """The positive semidefinite part (…, n, n) of the difference `after` − `before` of covariances (…, n, n).
 
     Rotations and translations are made comparable by dividing by the standard deviations of `after`.

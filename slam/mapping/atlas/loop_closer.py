@@ -149,7 +149,7 @@ class LoopCloser:
             return None
         T_odom_keyframe = inverse(atlas.T_map_odom) @ atlas.pose_in_map(loop.first)
         place = self._place(seen.keyframe, T_odom_keyframe)
-        stamp = -np.inf if loop.first < atlas.known else seen.keyframe.stamp
+        stamp = -np.inf if loop.first < atlas.prior_count else seen.keyframe.stamp
         return Found(T_odom_keyframe @ loop.T_first_second, place, stamp)
 
     def _place(self, keyframe: Keyframe, T_odom_left: Array) -> KnownPlace:
@@ -175,7 +175,7 @@ class LoopCloser:
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
         """Whether the view differs enough from the last keyframe's, or a loop waits for confirmation."""
-        if len(atlas) == atlas.known or self._in_doubt(atlas):
+        if len(atlas) == atlas.prior_count or self._in_doubt(atlas):
             return True
         last = atlas.keyframes[-1]
         X = self._rectified.T_left_rectified
@@ -202,7 +202,7 @@ class LoopCloser:
             last = atlas.keyframes[-1]
             travelled = last.travelled + _UNKNOWN_WAY
         gaps = atlas.gaps[atlas.restarts :]
-        if len(atlas) > atlas.known and not gaps:
+        if len(atlas) > atlas.prior_count and not gaps:
             last = atlas.keyframes[-1]
             travelled = last.travelled + float(np.linalg.norm(T[:3, 3] - last.T_odom_left[:3, 3]))
             added = step_covariance(last, T, P)
@@ -214,7 +214,7 @@ class LoopCloser:
             T,
             P,
             added,
-            step.common.shares,
+            step.common.jacobian,
             travelled,
             float(np.median(points[:, 2])),
             points.astype(np.float32),
@@ -305,10 +305,10 @@ class LoopCloser:
             return self._refuse(atlas, chain, loop, seen, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
-            return atlas.with_spare(loop, self._config.most_loops), None
+            return atlas.with_inactive_loop(loop, self._config.most_loops), None
         atlas = replace(atlas, confirmed=True)
-        if atlas.loops and not says_more(graph, atlas.loops[-1], loop):
-            return atlas.with_spare(loop, self._config.most_loops), None
+        if atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
+            return atlas.with_inactive_loop(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():
             return self._refuse(replace(atlas, pending=None), chain, loop, seen, rig)
@@ -323,14 +323,14 @@ class LoopCloser:
         from slam.mapping.atlas.pose_graph import PoseGraph
 
         most, limit, refused = self._config.most_loops, self._config.gate_sigmas**2, {*atlas.refused, loop.pair}
-        atlas = replace(atlas.with_spare(loop, most), refused=(*atlas.refused, loop.pair))
+        atlas = replace(atlas.with_inactive_loop(loop, most), refused=(*atlas.refused, loop.pair))
         left = self._config.return_depths * np.array([k.depth for k in atlas.keyframes])
-        every, start = (*atlas.loops, *atlas.spare), atlas.in_map(chain)
+        every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
 
         def places(loops: Sequence[Loop]) -> list[Loop]:
             return spaced(loops, atlas.rows.travelled, left)
 
-        if not atlas.loops or len(places([x for x in atlas.spare if x.pair in refused])) < 2:
+        if not atlas.loops or len(places([x for x in atlas.inactive_loops if x.pair in refused])) < 2:
             return atlas, None
         rival = agreeing(chain, every, loop, chain.poses, limit)
         if len(places(rival)) <= len(places(agreeing(chain, every, atlas.loops[-1], start, limit))):
@@ -369,7 +369,7 @@ class LoopCloser:
         return Returned(m.features, keyframe.landmarks[m.landmarks], transform(X, near), symmetric)
 
 
-def says_more(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
+def is_informative(graph: PoseGraph, last: Loop, loop: Loop) -> bool:
     """Whether a loop is more certain than the path since the last loop, in any direction.
 
     The path's uncertainty includes that of the common errors after the loops so far: in a place that is seen again and

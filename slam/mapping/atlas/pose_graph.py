@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, hat, inverse, log
-from slam.mapping.atlas.chain import Chain, Propagated, adjoints, spread
+from slam.mapping.atlas.chain import Chain, Propagated, spread
 from slam.mapping.atlas.keyframes import Loop
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ class _Problem:
         """Residuals (E, 6) at poses (M, 4, 4) and common errors (m,), and Jacobians (E, 6, 6) by poses a and b."""
         r = self.residuals(poses, common)
         back = _by_perturbation(r + self.expected(common))
-        return r, -back @ adjoints(inverse(poses[self.b]) @ poses[self.a]), back
+        return r, -back @ adjoint(inverse(poses[self.b]) @ poses[self.a]), back
 
     def gradient(self, poses: Array, common: Array) -> tuple[Array, Array]:
         """Right-hand sides of the normal equations: poses without the first (6 (M − 1),), and common errors (m,)."""

@@ -18,7 +18,8 @@ class KeyframeRows:
 
     Attributes:
         count: number of keyframes.
-        room: stamps (N,), poses (N, 4, 4), step covariances (N, 6, 6), shares (N, 6, m) and distances travelled (N,).
+        room: stamps (N,), poses (N, 4, 4), step covariances (N, 6, 6), Jacobians (N, 6, m) and distances
+            travelled (N,).
     """
 
     count: int = 0
@@ -48,7 +49,7 @@ class KeyframeRows:
         return self.room[2][: self.count]
 
     @property
-    def shares(self) -> Array:
+    def jacobian(self) -> Array:
         """Derivatives (K, 6, m) of the poses by the rig's errors; zero for keyframes of a run with other ones."""
         return self.room[3][: self.count]
 
@@ -67,10 +68,10 @@ class KeyframeRows:
         new = tuple(
             np.asarray(value, np.float64)
             for value in (
-                keyframe.stamp, keyframe.T_odom_left, keyframe.step_covariance, keyframe.shares, keyframe.travelled,
+                keyframe.stamp, keyframe.T_odom_left, keyframe.step_covariance, keyframe.jacobian, keyframe.travelled,
             )
         )  # fmt: skip
-        if k >= len(room[0]) or room[3].shape[1:] != keyframe.shares.shape:
+        if k >= len(room[0]) or room[3].shape[1:] != keyframe.jacobian.shape:
             room = tuple(_with_room(rows, k, value.shape) for rows, value in zip(room, new))  # type: ignore[assignment]
         for rows, value in zip(room, new):
             rows[k] = value

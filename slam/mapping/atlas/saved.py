@@ -35,8 +35,8 @@ _LIMITS = {
 def to_arrays(keyframes: Sequence[Keyframe], poses: Array, loops: Sequence[Loop]) -> dict[str, np.ndarray]:
     """Keyframes, their poses in the map (K, 4, 4), and loops as arrays, see `ATLAS_TYPES`."""
     k = keyframes
-    m = max((f.shares.shape[1] for f in k), default=0)
-    shares = [f.shares if f.shares.shape[1] == m else np.zeros((6, m)) for f in k]
+    m = max((f.jacobian.shape[1] for f in k), default=0)
+    shares = [f.jacobian if f.jacobian.shape[1] == m else np.zeros((6, m)) for f in k]
     columns = [
         [f.stamp for f in k], poses, [f.T_odom_left for f in k], [f.covariance for f in k],
         [f.step_covariance for f in k], shares, [f.travelled for f in k], [f.depth for f in k], [len(f) for f in k],

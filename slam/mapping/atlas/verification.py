@@ -10,7 +10,7 @@ from slam.data import StereoFeatures
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
 from slam.mapping.monocular import find_pose
@@ -127,10 +127,10 @@ def refined_pose(
     return T, np.linalg.inv(normal)
 
 
-def _rows(keyframe: Keyframe) -> LandmarkRows:
+def _rows(keyframe: Keyframe) -> LandmarkTable:
     """A keyframe's features as landmarks, with their rows as ids."""
     count = len(keyframe)
     once = np.ones(count, np.int64)
-    return LandmarkRows(
+    return LandmarkTable(
         np.arange(count), keyframe.descriptors.astype(np.float32), keyframe.laplacian, once, once, 0 * once, -once
     )

@@ -20,8 +20,6 @@ TEXT = "a slow drive past parked cars, among cyclists and walkers whose legs swi
 OPTIONS = (Option("people", 5, "cyclists and walkers", 0, 5),)
 DEFAULTS = street.DEFAULTS
 
-_Triple = tuple[float, float, float]
-
 PACE = 5.0  #: driving speed [m/s]
 DURATION = 14.0  #: [s]
 PARTS = 3  #: bodies a person is made of: the trunk (with the bicycle), and two legs

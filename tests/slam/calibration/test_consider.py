@@ -9,7 +9,7 @@ import pytest
 
 import backends
 from slam.calibration import RigModel, SelfCalibrationConfig, consider
-from slam.calibration.consider import RigUncertainty
+from slam.calibration.consider import SchmidtFilter
 from slam.config import SystemConfig
 from slam.data import Observations, StereoFeatures
 from slam.geometry.se3 import inverse, log, transform
@@ -93,7 +93,7 @@ def test_what_is_known_of_the_rig_is_in_the_covariances(backend):
     for k, T in enumerate(path(20)):
         result = other.process_features(cloud.features(T, k / 30)[0])
     np.testing.assert_array_equal(result.estimate.covariance, other.backend.estimate(landmarks=False).covariance)
-    assert not result.common.shares.size
+    assert not result.common.jacobian.size
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -123,8 +123,8 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
             system.calibration._motion_agrees = lambda: True
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
-    np.testing.assert_array_equal(result.common.scale[:-2, -1], mean)
-    in_path = system._rig_error.common(as_given=False).scale[:-2, -1]
+    np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
+    in_path = system._rig_error.common(as_given=False).root[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
 
 
@@ -132,7 +132,7 @@ def test_a_known_error_stays_in_a_path_that_is_not_revised():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(2, 6, 40)])
     ids = np.arange(40)
-    uncertainty = RigUncertainty(MODEL, CONFIG.models, error_of("right_cx", 0.0))
+    uncertainty = SchmidtFilter(MODEL, CONFIG.models, error_of("right_cx", 0.0))
     none = np.zeros(0, np.int64)
     for k, T in enumerate(path(10)):
         uncertainty.observe(T, k / 30, ids, points)
@@ -152,7 +152,7 @@ def there_and_back(delta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     rng, none = np.random.default_rng(1), np.zeros(0, np.int64)
     backend = backends.create("ekf", RIG, models=CONFIG.models)
-    uncertainty = RigUncertainty(MODEL, CONFIG.models, 0.0 * delta)
+    uncertainty = SchmidtFilter(MODEL, CONFIG.models, 0.0 * delta)
     points = np.column_stack([rng.uniform(-2, 2, (220, 2)), rng.uniform(3, 8, 220)])
     points[:, 2] += 0.2 * (np.arange(220) // 20)
     poses, sensitivities, known = [], [], set()
@@ -193,7 +193,7 @@ def walked_after(blackout: int) -> float:
     Each landmark is seen in two frames of six, so all are followed, left, and followed again.
     """
     rng, none, interval = np.random.default_rng(0), np.zeros(0, np.int64), 0.3
-    uncertainty = RigUncertainty(MODEL, CONFIG.models, np.zeros(len(MODEL.names)))
+    uncertainty = SchmidtFilter(MODEL, CONFIG.models, np.zeros(len(MODEL.names)))
     ids, points = np.arange(60), np.column_stack([rng.uniform(-2, 2, (60, 2)), rng.uniform(3, 9, 60)])
     poses, largest = path(400)[::10], 0.0
     for k in range(blackout + 1):
@@ -218,7 +218,7 @@ def test_landmarks_that_come_and_go_are_as_good_as_those_that_stay(monkeypatch, 
 
 def test_one_root_of_a_covariance_in_a_frame(monkeypatch):
     """Another covariance has another root, and that of an equal one is the same."""
-    uncertainty = RigUncertainty(MODEL, EstimatorModels(), np.zeros(len(MODEL.names)))
+    uncertainty = SchmidtFilter(MODEL, EstimatorModels(), np.zeros(len(MODEL.names)))
     roots, eigh = [], np.linalg.eigh
     monkeypatch.setattr(consider.np.linalg, "eigh", lambda P: roots.append(P) or eigh(P))
     one, other = np.diag(np.arange(1.0, len(MODEL.names) + 1)), np.eye(len(MODEL.names))

@@ -9,7 +9,7 @@ from slam.calibration import RigPosterior
 from slam.calibration.evidence import Accumulator, Evidence
 from slam.calibration.model import RigModel
 from slam.calibration.posterior import residual_scale, solve
-from slam.calibration.prior import Prior, as_delivered, residual_variance
+from slam.calibration.prior import Prior, factory_prior, residual_variance
 from slam.calibration.rows import row_evidence
 from slam.errors import CalibrationError
 from tests.slam.calibration.drives import CAR, parameters, residual_fields
@@ -70,8 +70,8 @@ def test_how_large_the_residual_fields_are_is_seen_in_the_rows(scale):
         vertical = -model.vertical(points) @ theta - model.residual_vertical(points) @ fields
         found = row_evidence(model, points, vertical + 0.1 * rng.standard_normal(300), theta)[1]
         rows = found if rows is None else rows + found
-    assert residual_scale(as_delivered(model), rows) == pytest.approx(scale, rel=0.4)
-    assert residual_scale(as_delivered(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
+    assert residual_scale(factory_prior(model), rows) == pytest.approx(scale, rel=0.4)
+    assert residual_scale(factory_prior(model), rows.scaled(1e-9)) > 0.4  # where they say nothing
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])

@@ -6,8 +6,9 @@ import time
 
 import pytest
 
-from slam.compare.scheduler import DaskScheduler, Job, LocalScheduler, WorkerDiedError, available_cores
+from slam.compare.scheduler import DaskScheduler, Job, LocalScheduler, WorkerDiedError
 from slam.errors import SlamError
+from slam.runtime.cores import available_cores
 from tests.slam.compare import jobs
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

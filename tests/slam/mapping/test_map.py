@@ -5,7 +5,7 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -34,7 +34,7 @@ def rows_with(**columns):
     n = len(next(iter(columns.values())))
     base = {name: np.zeros(n, np.int64) for name in ("seen", "in_view", "missed", "last_seen")}
     base.update({k: np.asarray(v) for k, v in columns.items()})
-    return LandmarkRows(np.arange(n), np.zeros((n, 16), np.float32), np.ones(n, np.int8), **base)
+    return LandmarkTable(np.arange(n), np.zeros((n, 16), np.float32), np.ones(n, np.int8), **base)
 
 
 def test_as_many_as_wanted_and_the_strongest_of_a_cell():
@@ -96,14 +96,14 @@ def test_frames_unseen_are_counted_though_the_others_are_seen_in_every_one():
         rows = rows.after_frame(2 * frame + 1, none, none, features_at(np.zeros((0, 2))), none.astype(np.intp))
     assert rows.unseen.tolist() == [6] + [0] * 80
     assert np.flatnonzero(bad_landmarks(rows, MapConfig(confirmed=6))).tolist() == [0]
-    earlier = LandmarkRows(**{**vars(rows), "last_seen": rows.last_seen - (np.arange(81) == 0)})
+    earlier = LandmarkTable(**{**vars(rows), "last_seen": rows.last_seen - (np.arange(81) == 0)})
     assert not bad_landmarks(earlier, MapConfig(confirmed=6)).any()  # kept by an earlier run, not seen in this one
 
 
 def test_what_is_held_back_is_neither_missed_nor_seen():
     rows = rows_with(seen=[5, 5, 5], in_view=[5, 5, 5], missed=[4, 4, 4], unseen=[4, 4, 4])
     after = rows.after_frame(
-        9, np.array([0, 1, 2]), np.array([2]), features_at([(1, 1)]), np.array([0]), held=np.array([0])
+        9, np.array([0, 1, 2]), np.array([2]), features_at([(1, 1)]), np.array([0]), withheld=np.array([0])
     )
     assert [getattr(after, name).tolist() for name in ("seen", "in_view", "missed", "unseen")] == [
         [5, 5, 6],
@@ -192,7 +192,7 @@ def like(features, rows, seen):
     """Landmarks that look like some of the features."""
     n, none = len(rows), np.zeros(len(rows), np.int64)
     looks, signs = features.descriptors[rows], features.laplacian[rows]
-    return LandmarkRows(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
+    return LandmarkTable(np.arange(n), looks, signs, np.asarray(seen), none, none, none)
 
 
 def test_a_feature_that_is_a_landmark_already_is_known():
@@ -230,7 +230,7 @@ def test_hidden_landmarks_are_not_expected():
 
 def test_looks_are_renewed_as_far_as_wanted():
     rows = rows_with(seen=[1], in_view=[1], missed=[0])
-    rows = LandmarkRows(**{**vars(rows), "descriptors": np.eye(16, dtype=np.float32)[:1]})
+    rows = LandmarkTable(**{**vars(rows), "descriptors": np.eye(16, dtype=np.float32)[:1]})
     features = features_at([(1, 1), (2, 2)])
     for descriptor_update, expected in ((0.0, (1, 0)), (1.0, (0, 1)), (0.5, (0.5**0.5, 0.5**0.5))):
         after = rows.after_frame(1, rows.ids, rows.ids, features, np.array([1]), descriptor_update)

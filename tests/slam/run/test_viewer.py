@@ -60,7 +60,7 @@ def test_places_and_loops_are_shown(monkeypatch):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = at
     atlas = SimpleNamespace(
-        poses_in_map=lambda: poses, known=1, loops=(SimpleNamespace(first=0, second=3),), refused=((1, 2), (0, 2))
+        poses_in_map=lambda: poses, prior_count=1, loops=(SimpleNamespace(first=0, second=3),), refused=((1, 2), (0, 2))
     )
     with Viewer("live") as viewer:
         viewer._draw_places(SimpleNamespace(atlas=atlas))

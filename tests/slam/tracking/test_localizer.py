@@ -7,7 +7,7 @@ import pytest
 
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
 from slam.tracking.association import AssociationConfig
 from slam.tracking.localizer import Localizer, jump
@@ -17,13 +17,13 @@ from tests.slam.scene import RIG, Cloud
 T_TRUE = se3.exp(np.array([0.02, 0.3, -0.01, 0.2, 0.05, 0.4]))
 
 
-def scene(frame: int = 0) -> tuple[LandmarkRows, np.ndarray, StereoFeatures]:
+def scene(frame: int = 0) -> tuple[LandmarkTable, np.ndarray, StereoFeatures]:
     """Landmarks of which fifteen each look alike, their positions, and the features of a later frame."""
     cloud = Cloud(150)
     kind = np.arange(150) % 10
     cloud.descriptors, cloud.laplacian = cloud.descriptors[kind], cloud.laplacian[kind]
     start, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkRows.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
+    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), start, np.arange(len(ids)))
     return landmarks, cloud.points[ids], cloud.features(T_TRUE, 1.0 + frame, 0.2)[0]
 
 
@@ -68,7 +68,7 @@ def test_other_places_wait_for_several_frames(far):
 def test_places_are_not_asked_for_where_landmarks_are_found():
     cloud = Cloud(150)
     features, ids = cloud.features(np.eye(4), 0.0)
-    landmarks = LandmarkRows.empty(32).with_new(0, np.arange(len(ids)), features, np.arange(len(ids)))
+    landmarks = LandmarkTable.empty(32).with_new(0, np.arange(len(ids)), features, np.arange(len(ids)))
 
     def never() -> np.ndarray:
         raise AssertionError

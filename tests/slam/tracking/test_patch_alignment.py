@@ -12,9 +12,9 @@ from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.landmarks import LandmarkRows
+from slam.landmarks import LandmarkTable
 from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligner, Anchors, warps_of
+from slam.tracking.patch_alignment import Aligner, PatchAnchors, warps_of
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 
@@ -23,8 +23,8 @@ def patches(count: int, value: float = 0.0) -> Patches:
     return Patches(np.full((count, 5, 5), value, np.float32), np.full((count, 2), 2.0), np.full(count, 15.0))
 
 
-def rows(ids: IdArray, unseen: IdArray) -> LandmarkRows:
-    empty = LandmarkRows.empty(4).with_new(0, ids, _features(len(ids)), np.arange(len(ids)))
+def rows(ids: IdArray, unseen: IdArray) -> LandmarkTable:
+    empty = LandmarkTable.empty(4).with_new(0, ids, _features(len(ids)), np.arange(len(ids)))
     return replace(empty, unseen=unseen)
 
 
@@ -50,13 +50,13 @@ def test_warps_are_the_derivative_of_a_surface_that_faces_the_camera():
 
 
 def test_anchors_are_replaced_and_given_up():
-    anchors = Anchors.none().with_new(np.array([3, 7]), patches(2), np.eye(4))
+    anchors = PatchAnchors.none().with_new(np.array([3, 7]), patches(2), np.eye(4))
     anchors = anchors.with_new(np.array([5, 7]), patches(2, 1.0), np.eye(4))
     assert anchors.ids.tolist() == [3, 5, 7]
     assert anchors.patches.images[:, 0, 0].tolist() == [0, 1, 1]
     known = anchors.known(rows(np.array([3, 4, 7]), np.array([0, 0, 50])))
     assert known.ids.tolist() == [3]  # 5 is not in the map, 7 was not measured for long
-    assert not len(anchors.known(LandmarkRows.empty(4)))
+    assert not len(anchors.known(LandmarkTable.empty(4)))
 
 
 SHIFT = np.array([1.0, 0.0])  # [px]
@@ -91,7 +91,7 @@ def frame(right: bool = True) -> slam.StereoFeatures:
     return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
 
 
-def align(features: slam.StereoFeatures, anchors: Anchors, seen: LandmarkMatches = SEEN, enabled: bool = True):
+def align(features: slam.StereoFeatures, anchors: PatchAnchors, seen: LandmarkMatches = SEEN, enabled: bool = True):
     landmarks = rows(IDS, np.zeros(4, np.int64))
     places = dict(zip(IDS.tolist(), POINTS))
     aligner = Aligner(RIG, enabled)
@@ -100,8 +100,8 @@ def align(features: slam.StereoFeatures, anchors: Anchors, seen: LandmarkMatches
     )
 
 
-def anchors_at(T: np.ndarray, size: float = 15.0) -> Anchors:
-    return Anchors.none().with_new(IDS, replace(patches(4), size=np.full(4, size)), T)
+def anchors_at(T: np.ndarray, size: float = 15.0) -> PatchAnchors:
+    return PatchAnchors.none().with_new(IDS, replace(patches(4), size=np.full(4, size)), T)
 
 
 @pytest.mark.parametrize("right", [True, False])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from slam.geometry.se3 import adjoint, exp, inverse, log
-from slam.mapping.atlas.chain import Chain, shared_out
+from slam.mapping.atlas.chain import Chain, spread_over
 from slam.mapping.atlas.keyframes import Loop
-from slam.mapping.atlas.loop_closer import says_more
+from slam.mapping.atlas.loop_closer import is_informative
 from slam.mapping.atlas.pose_graph import PoseGraph, solve
 
 SIGMAS = np.array([1e-3, 2e-3, 1e-3, 0.02, 0.01, 0.03])
@@ -199,7 +199,7 @@ def test_shared_out_keeps_the_ends(share: float):
     rng = np.random.default_rng(3)
     begin, motion, rest = (exp(rng.normal(size=(1, 6))) for _ in range(3))
     change = 0.1 * rng.normal(size=(1, 6))
-    out = shared_out(begin, motion, rest, share * change)
+    out = spread_over(begin, motion, rest, share * change)
     end = out @ rest
     np.testing.assert_allclose(end, begin @ motion @ rest @ exp(share * change), atol=1e-9)
 
@@ -219,5 +219,5 @@ def test_a_loop_says_little_where_earlier_ones_have_told_the_common_errors():
     before, loop = loops[:2]
     ends = before.second, loop.first, loop.second
     untold, told = (PoseGraph.solved(chain, some, true, ends) for some in ((), (before,)))
-    assert says_more(untold, before, loop)
-    assert not says_more(told, before, loop)
+    assert is_informative(untold, before, loop)
+    assert not is_informative(told, before, loop)

@@ -25,11 +25,11 @@ def test_rows_are_those_of_the_keyframes_however_many():
         shorter = rows if k == 99 else shorter
     number = np.arange(150)
     assert (rows.poses[:, 0, 3] == number).all() and (rows.steps[:, 2, 2] == number).all()
-    assert (rows.shares[:, 5, 2] == number).all() and (rows.travelled == 2 * number).all()
+    assert (rows.jacobian[:, 5, 2] == number).all() and (rows.travelled == 2 * number).all()
     assert len(shorter.stamps) == 100 and (shorter.poses == rows.poses[:100]).all()
 
 
 def test_shares_of_other_errors_count_as_none():
     rows = KeyframeRows().with_new(keyframe(1, 0)).with_new(keyframe(2, 3))
-    assert rows.shares.shape == (2, 6, 3) and not rows.shares[0].any() and (rows.shares[1] == 2).all()
+    assert rows.jacobian.shape == (2, 6, 3) and not rows.jacobian[0].any() and (rows.jacobian[1] == 2).all()
     assert (rows.travelled == [2, 4]).all()

@@ -16,11 +16,11 @@ from slam.geometry.se3 import Array, adjoint, exp, inverse, log, transform
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import (
     Keyframe,
+    covariance_growth,
     features_with_depth,
     kept_features,
     step_covariance,
     view_has_changed,
-    what_was_added,
 )
 from slam.mapping.atlas.verification import refined_pose, verify
 from slam.models import EstimatorModels
@@ -178,12 +178,12 @@ def test_covariance_of_a_step_is_what_was_added():
 def test_what_was_added_is_never_negative():
     a, b = np.random.default_rng(0).normal(size=(2, 6, 6))
     P, Q = a @ a.T, b @ b.T
-    np.testing.assert_allclose(what_was_added(P + Q, P), Q, atol=1e-10)
-    assert np.linalg.eigvalsh(what_was_added(P, P + 0.5 * Q)).max() < 1e-10
-    assert np.abs(what_was_added(P, P)).max() == 0
+    np.testing.assert_allclose(covariance_growth(P + Q, P), Q, atol=1e-10)
+    assert np.linalg.eigvalsh(covariance_growth(P, P + 0.5 * Q)).max() < 1e-10
+    assert np.abs(covariance_growth(P, P)).max() == 0
     P[2] = P[:, 2] = 0.0  # as where two huge covariances were subtracted
-    assert np.isfinite(what_was_added(P, Q)).all()
-    assert np.abs(what_was_added(0 * P, 0 * P)).max() == 0
+    assert np.isfinite(covariance_growth(P, Q)).all()
+    assert np.abs(covariance_growth(0 * P, 0 * P)).max() == 0
 
 
 def test_a_keyframe_whose_points_tell_no_pose_is_no_place_seen_again():

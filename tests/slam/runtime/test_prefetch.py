@@ -9,16 +9,16 @@ import time
 
 import pytest
 
-from slam.runtime.ahead import ahead
+from slam.runtime.prefetch import prefetch
 
 
 def threads() -> int:
-    return sum(thread.name == "ahead" for thread in threading.enumerate())
+    return sum(thread.name == "prefetch" for thread in threading.enumerate())
 
 
 def test_the_same_items_in_the_same_order():
-    assert list(ahead(range(100))) == list(range(100))
-    assert list(ahead([])) == []
+    assert list(prefetch(range(100))) == list(range(100))
+    assert list(prefetch([])) == []
     assert threads() == 0
 
 
@@ -30,7 +30,7 @@ def test_an_item_is_made_while_the_one_before_is_used():
         made.set()
         yield 1
 
-    for item in ahead(items()):
+    for item in prefetch(items()):
         if item == 0:
             assert made.wait(10)
 
@@ -43,7 +43,7 @@ def test_no_more_than_asked_for_is_made_beforehand():
             made.append(k)
             yield k
 
-    work = ahead(items(), depth=2)
+    work = prefetch(items(), depth=2)
     assert next(work) == 0
     assert len(made) <= 5
     work.close()
@@ -58,7 +58,7 @@ def test_with_a_depth_of_one_an_item_is_begun_when_the_one_before_is_taken():
             made.append(k)
             yield k
 
-    work = ahead(items(), depth=1)
+    work = prefetch(items(), depth=1)
     for k in range(3):
         assert next(work) == k
         time.sleep(0.05)
@@ -71,7 +71,7 @@ def test_an_exception_comes_where_its_item_would():
         yield 1
         raise ValueError("broken")
 
-    work = ahead(items())
+    work = prefetch(items())
     assert next(work) == 1
     with pytest.raises(ValueError, match="broken"):
         next(work)
@@ -79,19 +79,19 @@ def test_an_exception_comes_where_its_item_would():
 
 
 def test_a_caller_that_stops_early_leaves_no_thread():
-    for item in ahead(range(1000)):
+    for item in prefetch(range(1000)):
         if item == 3:
             break
     assert threads() == 0
 
 
-@pytest.mark.parametrize("source", ["ahead(endless())", "LiveFrames(endless(), paced=False)"])
+@pytest.mark.parametrize("source", ["prefetch(endless())", "LiveFrames(endless(), paced=False)"])
 def test_the_thread_ends_before_the_program_does(source):
     """Where an exception has left the work half done: a thread that runs on while Python is taken down may hang it."""
     program = f"""
 import atexit, sys, threading
 from types import SimpleNamespace
-from slam.runtime.ahead import ahead
+from slam.runtime.prefetch import prefetch
 from slam.sequences.live import LiveFrames
 
 def endless():

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import slam
 from slam.data import FrameResult, StereoFeatures
 from slam.geometry.se3 import inverse, log
-from slam.mapping.atlas.atlas import moved_unseen
+from slam.mapping.atlas.atlas import covariance_after_unseen_motion
 from slam.models import KINDS
 from slam.system import StereoSlam
 from tests.slam.mapping.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
@@ -118,7 +118,7 @@ def test_a_camera_that_sees_another_place_in_each_frame_goes_on(backend):
 @pytest.mark.parametrize("kind", ["handheld", "driving"])
 def test_nothing_is_more_uncertain_than_unknown(kind, duration):
     before = np.diag(np.repeat([0.1, 2.0], 3) ** 2)
-    P = moved_unseen(before, duration, KINDS[kind])
+    P = covariance_after_unseen_motion(before, duration, KINDS[kind])
     assert (np.linalg.eigvalsh(P) > 0).all()
     assert np.sqrt(P[0, 0]) < 1.9 and np.sqrt(P[3, 3]) < 1001.0
     assert duration or np.array_equal(P, before)

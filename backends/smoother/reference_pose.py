@@ -10,11 +10,11 @@ import numpy as np
 from slam.geometry.se3 import Array
 
 _FIRMER = 1e4  # numerics: information with which a pose is held, as a multiple of what is known of it
-_PULLED = 0.25  # squared standard deviations
+_STRAIN = 0.25  # squared standard deviations
 
 
 @dataclass(frozen=True)
-class Held:
+class ReferencePose:
     """A pose held by a prior much stronger than what is known of it, so that the whole problem does not drift.
 
     Measurements say next to nothing about where all variables together are in the world. With variables linearised at
@@ -33,7 +33,7 @@ class Held:
     information: Array
     covariance: Array
 
-    def informed(self, P: Array) -> Held:
+    def with_covariance_from(self, P: Array) -> ReferencePose:
         """With its true covariance, from its covariance P (6, 6) in a solver that holds it.
 
         All variables are linearised at the same values there.
@@ -47,12 +47,12 @@ class Held:
         noise = gtsam.noiseModel.Gaussian.Information(_FIRMER * self.information)
         return gtsam.PriorFactorPose3(self.key, gtsam.Pose3(self.T), noise)
 
-    def pulled(self, T: Array) -> bool:
+    def is_strained(self, T: Array) -> bool:
         """Whether it would move by half a standard deviation if released, when its value is T (4, 4) now."""
         x = gtsam.Pose3.Logmap(gtsam.Pose3(self.T).between(gtsam.Pose3(T)))
-        return bool(_FIRMER**2 * x @ self.information @ x > _PULLED)
+        return bool(_FIRMER**2 * x @ self.information @ x > _STRAIN)
 
-    def let_go(self, P: Array, by_held: Array, held: Array) -> Array:
+    def released(self, P: Array, by_held: Array, held: Array) -> Array:
         """A covariance P (..., n, n) as if the pose was not held.
 
         `by_held` (..., n, 6) is the covariance with the held pose, `held` (6, 6) the held pose's own in the solver.

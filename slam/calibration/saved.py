@@ -78,7 +78,7 @@ class RigNumbers:
 
 
 @dataclass(frozen=True)
-class KeptCalibration:
+class SavedCalibration:
     """The errors of a rig's calibration as self-calibration has estimated them, with covariance.
 
     Attributes:
@@ -94,7 +94,7 @@ class KeptCalibration:
     def __repr__(self) -> str:
         r = self.rig
         rig = f"{r.width:.0f}x{r.height:.0f}, focal length {r.focal:.1f} px, baseline {r.baseline:.4f} m"
-        return f"KeptCalibration({rig}; {self.posterior!r})"
+        return f"SavedCalibration({rig}; {self.posterior!r})"
 
     def require_fits(self, rig: StereoRig) -> None:
         """Raise if it is for another rig.
@@ -111,7 +111,7 @@ class KeptCalibration:
         return {"rig": asdict(self.rig), "residual_scale": self.residual, **self.posterior.to_json()}
 
     @classmethod
-    def from_json(cls, tree: Mapping[str, Any]) -> KeptCalibration:
+    def from_json(cls, tree: Mapping[str, Any]) -> SavedCalibration:
         """The inverse of `to_json`.
 
         Raises:
@@ -131,7 +131,7 @@ class KeptCalibration:
         return cls(posterior, RigNumbers.from_json(tree.get("rig")), float(residual))
 
 
-def load_calibration(path: str | Path) -> KeptCalibration:
+def load_calibration(path: str | Path) -> SavedCalibration:
     """Read the errors of a rig as self-calibration has estimated them.
 
     Args:
@@ -152,12 +152,12 @@ def load_calibration(path: str | Path) -> KeptCalibration:
     if not isinstance(tree, Mapping) or "parameters" not in tree:
         raise CalibrationError(f"{file}: {_NOT_KEPT}")
     try:
-        return KeptCalibration.from_json(tree)
+        return SavedCalibration.from_json(tree)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from error
 
 
-def save_calibration(path: str | Path, kept: KeptCalibration) -> None:
+def save_calibration(path: str | Path, kept: SavedCalibration) -> None:
     """Write a file that `load_calibration` reads.
 
     Raises:

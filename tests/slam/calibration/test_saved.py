@@ -8,7 +8,7 @@ import pytest
 import slam
 from slam.calibration import SelfCalibration, SelfCalibrationConfig
 from slam.calibration.joint import agreement, joint_calibration
-from slam.calibration.prior import as_delivered
+from slam.calibration.prior import factory_prior
 from slam.errors import CalibrationError, ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
@@ -114,7 +114,7 @@ def test_corrections_larger_than_the_rig_are_refused(first, name):
     else:
         tree["covariance"] = (1e300 * np.eye(len(tree["parameters"]))).tolist()
     with pytest.raises(CalibrationError, match="larger than the rig"):
-        slam.calibration.KeptCalibration.from_json(tree)
+        slam.calibration.SavedCalibration.from_json(tree)
 
 
 def test_one_recording_jointly_is_that_recording(first):
@@ -153,7 +153,7 @@ def test_recordings_that_say_more_and_less_are_never_worse_than_the_one_alone(fi
         joint_calibration(first.model, parts, first.config.systematic).posterior
         for parts in ([first.evidence()], [first.evidence(), other])
     )
-    delivered = np.sqrt(np.diag(as_delivered(first.model).covariances[-1]))
+    delivered = np.sqrt(np.diag(factory_prior(first.model).covariances[-1]))
     assert (both.sigma < 1.05 * np.maximum(alone.sigma, delivered)).all()
     assert np.abs((both.mean - TURNED) / both.sigma).max() < 3
 

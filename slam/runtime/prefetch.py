@@ -28,7 +28,7 @@ def _next(ready: queue.Queue[T]) -> T:
             return ready.get(timeout=_LOOK)
 
 
-def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+def prefetch(items: Iterable[T], depth: int = 2) -> Iterator[T]:
     """The same items in the same order, made in a thread that is at most `depth` items ahead of the one in use.
 
     An exception of the iterator is raised where its item would have come. The thread ends with the generator: after its
@@ -53,7 +53,7 @@ def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
         places.release()
         thread.join()
 
-    thread = threading.Thread(target=work, name="ahead", daemon=True)
+    thread = threading.Thread(target=work, name="prefetch", daemon=True)
     thread.start()
     atexit.register(end)  # a thread that runs on while Python is taken down may hang or abort it
     try:

@@ -17,15 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
+from slam.runtime.cores import available_cores
+
 _SCENE = "synthetic:street?frames=8&density=5"  # a body is found in the seventh frame
 _NEW = 50  # landmarks added in a frame at most
 _PATIENCE = 5.0  # for the end of the second process [s]
 
 
 @contextmanager
-def compiled_beside(backend: str) -> Iterator[None]:
+def compiled_in_background(backend: str) -> Iterator[None]:
     """The second process, where it is of use: it ends with the block, or when this process is killed."""
-    if _processors() < 2 or not _cold():
+    if available_cores() < 2 or not _cold():
         yield
         return
     command = [sys.executable, "-P", "-m", __name__, backend]  # -P: no module of the working folder
@@ -81,11 +83,6 @@ def compile_objects(backend: str) -> None:
         detector.update(estimator, features)
         estimator.add(new)
         known = np.union1d(known, new.ids)
-
-
-def _processors() -> int:
-    """How many of them this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _cold() -> bool:

@@ -9,7 +9,7 @@ from importlib import import_module
 
 import pytest
 
-from slam.commands import compile_beside
+from slam.commands import background_compilation
 
 
 @pytest.fixture
@@ -22,15 +22,15 @@ def started(monkeypatch):
         return processes[-1]
 
     subprocess_popen = subprocess.Popen
-    monkeypatch.setattr(compile_beside.subprocess, "Popen", start)
+    monkeypatch.setattr(background_compilation.subprocess, "Popen", start)
     return processes
 
 
 @pytest.mark.parametrize(("cold", "processors", "count"), [(True, 2, 1), (True, 1, 0), (False, 2, 0)])
 def test_runs_where_it_is_of_use_and_ends_with_the_block(started, monkeypatch, cold, processors, count):
-    monkeypatch.setattr(compile_beside, "_cold", lambda: cold)
-    monkeypatch.setattr(compile_beside, "_processors", lambda: processors)
-    with pytest.raises(KeyboardInterrupt), compile_beside.compiled_beside("ekf"):
+    monkeypatch.setattr(background_compilation, "_cold", lambda: cold)
+    monkeypatch.setattr(background_compilation, "available_cores", lambda: processors)
+    with pytest.raises(KeyboardInterrupt), background_compilation.compiled_in_background("ekf"):
         assert len(started) == count
         raise KeyboardInterrupt
     assert all(process.poll() is not None for process in started)
@@ -42,21 +42,21 @@ def test_modules_are_those_of_this_process_and_not_of_the_working_folder(started
     (tmp_path / "besides").mkdir()
     (tmp_path / "besides" / "found_here.py").write_text("open('found', 'w').close()")
     monkeypatch.chdir(tmp_path / "run")
-    monkeypatch.setattr(compile_beside, "_cold", lambda: True)
-    monkeypatch.setattr(compile_beside, "_processors", lambda: 2)
+    monkeypatch.setattr(background_compilation, "_cold", lambda: True)
+    monkeypatch.setattr(background_compilation, "available_cores", lambda: 2)
     monkeypatch.syspath_prepend(tmp_path / "besides")
-    monkeypatch.setattr(compile_beside, "__name__", "found_here")
-    with compile_beside.compiled_beside("ekf"):
+    monkeypatch.setattr(background_compilation, "__name__", "found_here")
+    with background_compilation.compiled_in_background("ekf"):
         assert started[0].wait(60) == 0
-    monkeypatch.setattr(compile_beside, "__name__", "slam.commands")  # a package without a main module
-    with compile_beside.compiled_beside("ekf"):
+    monkeypatch.setattr(background_compilation, "__name__", "slam.commands")  # a package without a main module
+    with background_compilation.compiled_in_background("ekf"):
         started[1].wait(60)
     assert [file.name for file in (tmp_path / "run").iterdir() if file.name != "slam.py"] == ["found"]
 
 
 def test_ends_when_its_parent_is_killed():
     """Its standard input ends then."""
-    command = [sys.executable, "-P", "-m", compile_beside.__name__, "ekf"]
+    command = [sys.executable, "-P", "-m", background_compilation.__name__, "ekf"]
     modules = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
     with subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, **modules}) as process:
         with pytest.raises(subprocess.TimeoutExpired):
@@ -78,8 +78,8 @@ def compiled():
 def test_compiles_all_that_a_run_needs_of_moving_objects():
     import slam
 
-    compile_beside.compile_objects("ekf")
-    assert not compile_beside._cold()
+    background_compilation.compile_objects("ekf")
+    assert not background_compilation._cold()
     before = compiled()
     assert before["members_ahead"]  # a body was found
     sequence = slam.open_sequence("synthetic:street?frames=8")

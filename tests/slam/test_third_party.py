@@ -12,12 +12,12 @@ from frontends.surf import SurfFrontend
 from slam.commands.cli import main
 from slam.data import StereoFrame
 from slam.errors import ConfigurationError, PartError
-from slam.foreign import named_failures
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
+from slam.third_party import named_failures
 from tests.frontends.scenes import stereo_pair
 from tests.fuzz.commands import elsewhere
-from tests.slam.tracking.test_answer_check import RIG
+from tests.slam.tracking.test_protocol_check import RIG
 
 LEFT, RIGHT = stereo_pair(12.25)
 

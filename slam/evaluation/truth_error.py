@@ -1,0 +1,146 @@
+"""How far off true relative poses may be, and which of them cannot be right: found from the truth alone.
+
+Measured truth has errors, and a sequence says how large (`TruthNoise`). It does not say how fast they change. Over a
+short stretch that is what counts, because an offset at both ends is no error of the relative pose. The truth tells it
+in two ways:
+
+- It is smooth. Errors that changed quickly would show as jitter, so the jitter of the steadiest axis bounds how quickly
+  they change.
+- A vehicle on wheels does not slip sideways. Where the true path does, by more the longer the stretch, the satellite
+  receiver drifts.
+
+Two signs make a stretch doubtful, so that it is left out:
+
+- It turns at a constant rate from pose to pose, far more evenly than elsewhere: it was interpolated over a gap.
+- A vehicle on wheels slips sideways by more than the truth's errors allow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry.arrays import Array, BoolArray
+from slam.geometry.se3 import inverse, log, so3_exp, so3_log
+from slam.geometry.trajectory import Trajectory, TruthNoise
+
+RowArray = NDArray[np.intp]
+
+_EVEN = 0.01  # of the large changes of the turn from step to step: chance makes this in one of some 100,000
+_LARGE = 0.9  # quantile of the changes: even where most of a short path was interpolated, some tenth was not
+_LEVER, _LEVER_SIGMA = 1.5, 1.0  # from the axle that does not steer forward to the camera [m]
+_SIGMAS = 3.0  # of what may seem to be a slip
+_MEDIAN = 0.6745  # derived: median of the absolute value of a Gaussian number of unit variance
+
+
+def truth_covariances(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray, A: Array) -> Array:
+    """Covariances (M, 6, 6) of the truth's errors in relative poses, ``e_j − A e_i``.
+
+    Attitude and position have errors of their own, constant in the world but for their change over time. The error of a
+    stamp is one along the motion, independent in each pose.
+
+    Args:
+        true: true poses of the left camera (N), x to the right and z forward.
+        noise: of the truth.
+        first: rows i at which stretches begin (M,).
+        last: rows j at which they end (M,).
+        A: adjoints (M, 6, 6) of the inverse relative poses.
+    """
+    rotated = np.zeros_like(A)
+    rotated[:, :3, :3], rotated[:, 3:, 3:] = A[:, :3, :3], A[:, 3:, 3:]
+    shared = np.repeat(_correlations(true, noise, true.stamps[last] - true.stamps[first]), 3, axis=1)
+    Q, Z = noise.covariance, _stamp_covariances(true, noise)
+    cross = rotated @ (shared[:, :, None] * Q)  # of the error at the end with that at the beginning
+    At = np.swapaxes(A, 1, 2)
+    out = Q + Z[last] + A @ (Q + Z[first]) @ At - cross @ At - A @ np.swapaxes(cross, 1, 2)
+    by_noise = 2 * noise.translation**2 * (1 - shared[:, 3])
+    out[:, [3, 4, 5], [3, 4, 5]] += np.maximum(_drift(true, noise, first, last) - by_noise, 0.0)[:, None]
+    return np.asarray(out)
+
+
+def doubtful(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray) -> BoolArray:
+    """Whether the truth is doubtful between rows `first` and `last` (M,); never where it has no noise."""
+    if len(true) < 3 or not noise.covariance.any():
+        return np.zeros(len(first), bool)
+    turn = so3_log((inverse(true.poses[:-1]) @ true.poses[1:])[:, :3, :3])
+    bad = _within(_interpolated(turn), first, last - 1)
+    if not noise.wheels:
+        return bad
+    slip, unknown = _slip(true, noise)
+    variance = np.maximum(_drift(true, noise, first, last), 2 * noise.translation**2)
+    variance += np.square(_between(unknown, first, last)).sum(axis=1)
+    return np.asarray(bad | (np.abs(_between(slip, first, last)) > _SIGMAS * np.sqrt(variance)))
+
+
+def _correlations(true: Trajectory, noise: TruthNoise, apart: Array) -> Array:
+    """Correlations (M, 2) of the errors of two attitudes, and of two positions, that are `apart` (M,) [s].
+
+    The errors are taken for first-order Markov processes that change as quickly as the truth's smoothness allows. Their
+    second difference has the variance ``s² (6 − 8 ρ + 2 ρ²)``, with s the noise and ρ the correlation of successive
+    poses. That of the true path, by its steadiest axis, is the most that it may be.
+    """
+    if len(true) < 3:
+        return np.zeros((len(apart), 2))
+    jitter = np.diff(log(inverse(true.poses[:-1]) @ true.poses[1:]), axis=0)
+    q = (np.median(np.abs(jitter), axis=0) / _MEDIAN).reshape(2, 3).min(axis=1)
+    s = np.array([noise.rotation, noise.translation])
+    ratio = np.divide(q, s, out=np.full(2, np.inf), where=s > 0)
+    of_step = np.clip(2 - np.sqrt(1 + np.square(ratio) / 2), 0.0, 1.0)
+    return np.asarray(of_step ** (np.abs(apart) / np.median(np.diff(true.stamps)))[:, None])
+
+
+def _stamp_covariances(true: Trajectory, noise: TruthNoise) -> Array:
+    """What errors of the stamps add to the covariances (N, 6, 6) of the true poses."""
+    if not noise.time or len(true) < 2:
+        return np.zeros((len(true), 6, 6))
+    rate = log(inverse(true.poses[:-1]) @ true.poses[1:]) / np.diff(true.stamps)[:, None]
+    moved = noise.time * np.concatenate([rate, rate[-1:]])
+    return moved[:, :, None] * moved[:, None]
+
+
+def _drift(true: Trajectory, noise: TruthNoise, first: RowArray, last: RowArray) -> Array:
+    """Variances (M,) [m²] of a drift of the truth between rows, by how far all stretches of as many frames slip."""
+    out = np.zeros(len(first))
+    if not noise.wheels or not noise.translation or len(true) < 3:
+        return out
+    total, unknown = (np.concatenate([x[:1] * 0, np.cumsum(x, axis=0)]) for x in _slip(true, noise))
+    for frames in np.unique(last - first)[np.unique(last - first) > 0].tolist():
+        slip = np.median(np.abs(total[frames:] - total[:-frames])) / _MEDIAN
+        known = np.median(np.square(unknown[frames:] - unknown[:-frames]).sum(axis=1))
+        out[last - first == frames] = max(float(slip**2 - known), 0.0)
+    return out
+
+
+def _slip(true: Trajectory, noise: TruthNoise) -> tuple[Array, Array]:
+    """How far a vehicle slips sideways in each step (N − 1,) [m], and what may seem to be a slip (N − 1, 2), to add up.
+
+    A camera ahead of the axle moves sideways by its lever times the turn. Its constant part is how the camera stands in
+    the vehicle: the median. What may seem to be a slip: the unknown part of the lever, and an error of the attitude.
+    """
+    motion = inverse(true.poses[:-1]) @ true.poses[1:]
+    turn = so3_log(motion[:, :3, :3])
+    middle = (np.swapaxes(so3_exp(0.5 * turn), 1, 2) @ motion[:, :3, 3:])[:, :, 0]
+    forward = np.where(middle[:, 2] > 0, middle[:, 2], np.nan)
+    unknown = np.column_stack([_LEVER_SIGMA * turn[:, 1], noise.rotation * np.linalg.norm(middle, axis=1)])
+    if not np.isfinite(forward).any():
+        return np.zeros(len(motion)), unknown
+    sideways = middle[:, 0] - _LEVER * turn[:, 1]
+    return sideways - np.nanmedian(sideways / forward) * middle[:, 2], unknown
+
+
+def _interpolated(turn: Array) -> BoolArray:
+    """Whether a step's turn (N, 3) [rad] and the next one's are the same to rounding (N − 1,)."""
+    change = np.linalg.norm(np.diff(turn, axis=0), axis=1)
+    return np.asarray(change < _EVEN * np.quantile(change, _LARGE))
+
+
+def _between(steps: Array, first: RowArray, last: RowArray) -> Array:
+    """Sums (M, ...) of steps (N, ...) between rows."""
+    total = np.concatenate([steps[:1] * 0, np.cumsum(steps, axis=0)])
+    return np.asarray(total[last] - total[first])
+
+
+def _within(flags: BoolArray, first: RowArray, last: RowArray) -> BoolArray:
+    """Whether any of the flags (N,) from `first` to before `last` (M,) is set."""
+    total = np.concatenate([[0], np.cumsum(flags)])
+    return np.asarray(total[np.maximum(last, first)] > total[first])
