@@ -3,8 +3,8 @@
     SLAM_DATA=/path/to/data python experiments/real_sequences.py [--quick] [--out DIR]
 
 Runs every sequence that the folder holds with the default settings of its kind, and prints a Markdown table: accuracy
-of the online and of the final path, share of frames tracked, NEES of relative poses over 10 m (6 is right), and the
-median time of a frame. Draws the paths from above with the true one.
+of the online and of the final path, share of frames tracked, NEES of relative poses over 1 and 10 m (6 is right), and
+the median time of a frame. Draws the paths from above with the true one.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SEQUENCES = {
     "EuRoC V1_01, 20 keyframes": "euroc/V1_01_keyframes_a",
 }
 BACKENDS = ("ekf", "smoother")
-HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 10 m",
+HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 1 m", "NEES over 10 m",
           "landmark lifetime, median [frames]", "ms per frame")  # fmt: skip
 
 
@@ -57,8 +57,9 @@ def row(name: str, summary: dict[str, Any]) -> list[str]:
     tracked = f"{summary['status'].get('tracked', 0) + summary['status'].get('started', 0)} of {summary['frames']}"
     figures = (online.get("ATE RMSE [m]"), final.get("ATE RMSE [m]"))
     texts = [f"{x:.3f}" if x is not None else "–" for x in figures]
-    nees = summary["consistency"].get("NEES over 10 m")
-    texts.append("–" if nees is None else f"{nees:.1f}")
+    for length in (1, 10):
+        nees = summary["consistency"].get(f"NEES over {length} m")
+        texts.append("–" if nees is None else f"{nees:.1f}")
     times = (f"{summary['lifetime']:.0f}", f"{summary['milliseconds']['median_total']:.0f}")
     return [name, summary["backend"], tracked, *texts, *times]
 

@@ -106,6 +106,7 @@ EXPERIMENTS = (
         "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
         arguments=("--wrong", "0", "0.05", "0.1", "0.2", "--seeds", "5", "--moved", "0", "-0.19"),
     ),
+    Experiment("calibration", "Self-calibration: wrong rigs, and one rig on two drives"),
     Experiment("perturbations", "Real drives many times over, and spoilt"),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip

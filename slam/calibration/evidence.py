@@ -9,6 +9,7 @@ import numpy as np
 from slam.geometry.se3 import Array
 
 _MOST_BLOCKS = 32  # cost: blocks of evidence kept separately, for their scatter
+_RANK = 1e-12  # numerics: least eigenvalue of an information that counts, as a share of the largest
 _PRIOR_TERMS = 20.0  # degrees of freedom that the configured inflation counts for
 
 
@@ -116,19 +117,25 @@ class Accumulator:
         return [whole.scaled(1 / self.inflation)]
 
     def update_inflation(self, mean: Array, covariance: Array) -> None:
-        """Estimate the inflation anew from the scatter of the blocks' gradients.
+        """Estimate the inflation from the scatter of the blocks' gradients about the solution of the blocks alone.
+
+        About a solution that the prior holds elsewhere all gradients point the same way, which is no scatter.
 
         Args:
-            mean: of the parameters (n,).
+            mean: of the parameters (n,), near that solution or not.
             covariance: of the parameters, residual fields left out (n, n).
         """
         count = len(self._blocks)
+        if count < 2:
+            return
+        total_S, total_e = (sum(block[i] for block in self._blocks) for i in (0, 1))
+        own = mean + np.linalg.lstsq(total_S, total_e - total_S @ mean, rcond=_RANK)[0]
         scatter = terms = 0.0
         for S, e, _ in self._blocks:
-            gradient = e - S @ mean
+            gradient = e - S @ own
             scatter += float(gradient @ covariance @ gradient)
             terms += float(np.sum(S * covariance))
-        if count < 2 or terms <= 0:
+        if terms <= 0:
             return
         ratio = scatter / (terms * (1 - 1 / count))
         weight = terms / self.inflation * (count - 1)  # parameters that the data determine, for each block

@@ -92,6 +92,18 @@ def test_errors_that_last_are_counted_as_such(length):
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.9
 
 
+def test_a_prior_that_contradicts_all_blocks_is_no_scatter():
+    """Else the information is divided by the square of the contradiction, and the prior keeps the parameter."""
+    rng, sums = np.random.default_rng(0), Accumulator(3.0, 4)
+    narrow, mean = Prior(NONE, np.full((1, 1, 1), 0.01)), NONE
+    for x in 5.0 + rng.standard_normal(400):
+        sums.add(evidence(x, 1.0))
+        sums.update_inflation(mean, np.full((1, 1), 0.01))
+        mean = solve(narrow, 0.0, sums.total()).mean
+    assert sums.inflation < 2.0
+    assert mean[0] > 2.5  # of 5, by 400 measurements against a prior worth 100
+
+
 def test_what_an_error_of_the_whole_recording_leaves():
     """Information (S⁻¹ + V)⁻¹, and the same mean."""
     S = np.array([[4.0, 1.0], [1.0, 2.0]])
