@@ -135,6 +135,16 @@ OF_ONE = {
         "largest error [sigma]": "of these four, in all seeds",
         "apart [sigma]": "difference without the prior; – where a drive says less than the prior",
     },
+    "residuals": {
+        "landmarks": "with four measurements or more",
+        "life, median [frames]": "number of measurements of these",
+        "after 1, after 2, after 5, after 10, after 20": (
+            "change of uL's error over so many frames, over √2 [px]: the same in all columns if errors are independent"
+        ),
+        "residual [px]": "root mean square error about the landmark that fits best",
+        "pixel_sigma [px]": "of the models, as if errors were independent",
+        "NIS/dof": "1 if pixels alone mattered; less is the price of errors that last",
+    },
     "real_sequences": {
         "NEES over 1 m, NEES over 10 m": (
             "of relative poses: squared errors over the claimed covariance; 6 is right, less is cautious"

@@ -107,6 +107,7 @@ EXPERIMENTS = (
         arguments=("--wrong", "0", "0.05", "0.1", "0.2", "--seeds", "5", "--moved", "0", "-0.19"),
     ),
     Experiment("calibration", "Self-calibration: wrong rigs, and one rig on two drives"),
+    Experiment("residuals", "Errors of pixels that last"),
     Experiment("perturbations", "Real drives many times over, and spoilt"),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip
