@@ -412,7 +412,7 @@ def table(root: Path) -> str:
 
 
 def page(text: str, root: Path) -> str:
-    """The page with its table made anew."""
+    """The page with its table rebuilt."""
     before, start, rest = text.partition(START)
     _, end, after = rest.partition(END)
     if not (start and end):

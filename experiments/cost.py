@@ -70,7 +70,7 @@ def printed_by(part: Part, quick: bool, out: Path) -> str:
 
 
 def main() -> int:
-    parser = script_options(__file__, __doc__, "every benchmark in its short form; nothing is compiled anew")
+    parser = script_options(__file__, __doc__, "every benchmark in its short form; nothing is compiled again")
     parser.add_argument("--only", nargs="+", choices=[p.script for p in PARTS], help="these benchmarks alone")
     given = parser.parse_args()
     for part in PARTS:

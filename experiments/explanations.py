@@ -131,24 +131,24 @@ OF_ONE = {
         "ATE, wrong [m]": "the same with the wrong one, which is corrected while the system runs",
         "ratio": "of the two",
         "ATE, not calibrated [m]": "with the wrong one and no self-calibration",
-        "focal length [%], pitch [mrad], yaw [mrad], roll [mrad]": "correction found, and its standard deviation",
+        "focal length [%]": "correction found, and its standard deviation, as in the three columns that follow",
         "largest error [sigma]": "of these four, in all seeds",
         "apart [sigma]": "difference without the prior; – where a drive says less than the prior",
     },
     "residuals": {
         "landmarks": "with four measurements or more",
         "life, median [frames]": "number of measurements of these",
-        "after 1, after 2, after 5, after 10, after 20": (
-            "change of uL's error over so many frames, over √2 [px]: the same in all columns if errors are independent"
+        "after 1": (
+            "change of uL's error over one frame, over √2 [px], as in the four columns that follow over so many: the same "
+            "in all if errors are independent"
         ),
         "residual [px]": "root mean square error about the landmark that fits best",
         "pixel_sigma [px]": "of the models, as if errors were independent",
         "NIS/dof": "1 if pixels alone mattered; less is the price of errors that last",
     },
     "real_sequences": {
-        "NEES over 1 m, NEES over 10 m": (
-            "of relative poses: squared errors over the claimed covariance; 6 is right, less is cautious"
-        ),
+        "NEES over 1 m": "of relative poses: squared errors over the claimed covariance; 6 is right, less is cautious",
+        "NEES over 10 m": "the same; the truth's own errors are counted, as the truth itself shows them",
         "landmark lifetime, median [frames]": "how long a landmark stays in the map",
         "ms per frame": "median, on the machine that made this page",
     },
@@ -163,7 +163,7 @@ OF_ONE = {
             "smallest and the largest"
         ),
         "path too long [%]": "length of the online path against the true one's",
-        "rebuilds": "how often the smoother was built anew",
+        "rebuilds": "how often the smoother was rebuilt",
     },
     "loops": {
         "path": "number of KITTI's recording whose true path is driven",

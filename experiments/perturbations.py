@@ -72,7 +72,7 @@ def noisy(sigma: float) -> Spoil:
 
 
 def flickering(left: Image, right: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-    """Both images up to 30 % brighter or darker, anew in each frame."""
+    """Both images up to 30 % brighter or darker, differently in each frame."""
     gain = rng.uniform(0.7, 1.3)
     return gain * left, gain * right
 

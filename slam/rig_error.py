@@ -48,5 +48,5 @@ class Revision(Protocol):
     """A change of the rig's correction during a run, for measurements that have the earlier correction."""
 
     def rows(self, z: Array) -> Array:
-        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected again."""
         ...

@@ -37,7 +37,7 @@ def test_the_first_frames_are_not_rejected(slam_data, name):
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
 @pytest.mark.parametrize("name", ["ekf", "smoother"])
 def test_far_tracks_alone_do_not_make_it_run_away(slam_data, name, wrong):
-    """Where all tracks were 80 m away, each frame was solved anew from frame 435 on, and was off by up to 16 m."""
+    """Where all tracks were 80 m away, each frame was solved again from frame 435 on, and was off by up to 16 m."""
     steps, backend, off = replayed(slam_data, name, 370, 450, wrong)
     assert {step.status for step in steps[1:]} == {"ok"}
     assert getattr(backend, "rebuilds", 0) == 0

@@ -5,7 +5,7 @@ be chosen; it is singular at φy = ±90°. With z forward, y down and the first 
 vertical would be that. So the angles refer to a world of their own, turned against the user's by a constant rotation:
 its x is where the camera looks at the start, its y the camera's right, its z down. Heading is then φz, looking up and
 down φx, and φy a roll about the optical axis: only a camera held on its side comes near the singularity. There the
-angles' world is chosen anew (`reanchor`), exactly for the state, to first order for the covariance.
+angles' world is chosen again (`reanchor`), exactly for the state, to first order for the covariance.
 
 What the Euler model costs: a constant ω is a constant rate of the angles, which is a constant body rate only for turns
 about one axis. Turning at w [rad/s] while another angle changes at u, the predicted body rate is off by about u w Δt

@@ -8,7 +8,7 @@ Guivant and Nebot, IEEE Transactions on Robotics and Automation 17 (2001)):
     P_bL = X_b Φᵀ,        P_bb = P⁰_bb − X_b Ψ X_bᵀ.
 
 P⁰ is the matrix as it was stored last, X its columns of the variables that were local then or became so since. Once the
-local part has grown too large all is stored anew (`_store`), by one ``dsyrk``. Nothing is neglected: it is the same
+local part has grown too large all is stored again (`_store`), by one ``dsyrk``. Nothing is neglected: it is the same
 matrix, to rounding.
 
 Of P⁰ only the lower triangle is kept, in Fortran order, so that BLAS updates it in place; above the diagonal stand
@@ -230,7 +230,7 @@ class Covariance:
             slots: of the landmarks (M,), each once.
 
         Returns:
-            the slots filled anew and the slots that they were filled from; all others keep their place.
+            the slots that were filled again and the slots that they were filled from; all others keep their place.
         """
         left = self.count - len(slots)
         gone = np.zeros(self.count, bool)

@@ -32,7 +32,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
-from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
+from slam.objects.points import MAX_REJECTIONS, MIN_POINTS, Shape, first_frame, points_to_replace, shape_of, with_shape
 from slam.tracking.agreement import INFLATION
 
 
@@ -182,8 +182,8 @@ class ObjectFilter:
         seen[rows] = self._now
         sights[rows] += used
         wanted = ~known
-        wanted[known] = failures[rows] >= REJECTIONS
-        body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= REJECTIONS)
+        wanted[known] = failures[rows] >= MAX_REJECTIONS
+        body = without(replace(body, failures=failures, seen=seen, sights=sights), failures >= MAX_REJECTIONS)
         body, new = self._join(body, o, wanted, camera)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([o.points[known][used], o.points[new]])
@@ -223,7 +223,7 @@ class ObjectFilter:
         As for the camera: the guess and wider motion noise are tried until most pass; if nothing helps, the gate at
         the prediction stands.
         """
-        most = max(ENOUGH, (len(z) + 1) // 2)
+        most = max(MIN_POINTS, (len(z) + 1) // 2)
         first: tuple[Body, Gathered, Problem, Gated] | None = None
         for factor in (0.0, *INFLATION):
             wider = widened(body, factor)
@@ -259,7 +259,7 @@ class ObjectFilter:
         deep = np.isfinite(h).all(axis=1)
         rows, h = rows[deep], h[deep]
         most = self._models.objects.points
-        body = without(body, room_makers(self._now - body.seen, body.sights, len(rows), most))
+        body = without(body, points_to_replace(self._now - body.seen, body.sights, len(rows), most))
         room = most - len(body.ids)
         rows, h = rows[:room], h[:room]
         if not len(rows):
@@ -271,7 +271,7 @@ class ObjectFilter:
 
     def _shape(self, body: Body, h: Array, T_left_body: Array) -> Shape:
         """The body's shape in camera coordinates, by the points it has, or else by the new ones at h (M, 3)."""
-        if len(body.ids) < ENOUGH:
+        if len(body.ids) < MIN_POINTS:
             return shape_of(h, self._rig.triangulation_covariance(h, self._models.pixel_sigma))
         D, rows = body.points.derivatives(), RIGID + np.arange(3 * len(body.ids)).reshape(-1, 3)
         own = body.covariance[rows[:, :, None], rows[:, None, :]]

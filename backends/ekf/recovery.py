@@ -6,7 +6,7 @@ Then the prediction is wrong, not the observations. There are three cases, tried
 - An impulse was larger than the motion model expects, or the camera turned as the Euler model cannot follow: the
   process noise is inflated.
 - The filter is lost, after a long gap or a stretch with hardly anything to see: the landmarks agree on a pose that no
-  impulse explains. The camera starts anew there, in the same map.
+  impulse explains. The camera restarts there, in the same map.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def agreement(problem: Problem, noises: Sequence[Array], search: Search, models:
         problem: the update.
         noises: motion noises (12, 12) that may have been there in addition, smallest first.
         search: finds the pose on which the landmarks agree; only called where nothing else helps.
-        models: how fast a camera may be that starts anew.
+        models: how fast a camera may be that restarts.
 
     Returns:
         the solution with its prior, or None where there is none.

@@ -16,7 +16,7 @@ class SmootherConfig:
             `track` and twice that, so that no frame finishes them all.
         explicit: most landmarks in view that become variables of their own when their smart factor is finished;
             they constrain the trajectory over any length of time. The others continue in a new smart factor.
-        relinearise: error of linearised pixels beyond which a variable is linearised anew [px], approximately: in
+        relinearise: error of linearised pixels beyond which a variable is relinearised [px], approximately: in
             every tenth frame. Ten times as much in the other frames; nearly zero when the whole path or map is
             requested.
         window: poses whose joint covariance is computed in every frame; older ones are taken as fixed to the oldest.

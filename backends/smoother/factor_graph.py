@@ -32,16 +32,16 @@ _STALE = 0.005
 #: revision is so many times as large.
 _SELDOM, _AT_ONCE = 0.01, 20
 
-#: cost: Linearising a variable anew eliminates all that was measured since it was first seen, so it is done for many
+#: cost: Relinearising a variable eliminates all that was measured since it was first seen, so it is done for many
 #: variables together every so many frames. A variable that is off by so many times the threshold does not wait.
 _EVERY, _OFF = 10, 10.0
 
 #: numerics: Gauss-Newton steps that move landmarks to where their changed measurements put them.
 _REFINED = 3
 
-#: numerics: When all is solved to convergence, variables are linearised anew until they are within so much [px].
+#: numerics: When all is solved to convergence, variables are relinearised until they are within so much [px].
 _LAST = 1e-4
-_ROUNDS = 6  # numerics: of linearising everything anew, at most
+_ROUNDS = 6  # numerics: of relinearising everything, at most
 
 
 class FactorGraph:
@@ -74,7 +74,7 @@ class FactorGraph:
         self.solver = self._new_solver()
         self._seconds = 0.0  # CPU time of former solvers, and of solving from scratch
         self.rebuilds = 0
-        self._rebuilt = -_EVERY  # number of frames when the solver was last made anew
+        self._rebuilt = -_EVERY  # number of frames when the solver was last rebuilt
         self._broken = False  # whether a call was interrupted since
         self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
@@ -305,7 +305,7 @@ class FactorGraph:
         change.factors.add(pose_factor(self._make, path, i))
         self._solved = False
         self.solutions += 1
-        thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver linearises all anew
+        thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver relinearises all
         return self.solver.update(change, self._seldom if thorough else self._often)
 
     # --- the lag ---

@@ -173,7 +173,7 @@ class MeasurementLog:
         local = (marks.position[relative] - T[:3, 3]) @ T[:3, :3]
         covariances = T[:3, :3].T @ marks.covariance[relative] @ T[:3, :3]
         marks.older[relative] = np.linalg.inv(marks.covariance[relative])
-        # What is not known by as much as its distance is measured anew, as if it were new.
+        # What is not known by as much as its distance is measured again, as if it were new.
         known = np.trace(covariances, axis1=1, axis2=2) < (local**2).sum(axis=1)
         relative, local, covariances = relative[known], local[known], covariances[known]
         for serial, position, covariance in zip(marks.serial[relative].tolist(), local, covariances):
@@ -202,7 +202,7 @@ class MeasurementLog:
         history.known = {serial: known for serial, known in history.known.items() if serial in kept}
 
     def _forget_unused_measurements(self) -> None:
-        """Number the measurements anew that a factor, a track or a landmark still refers to."""
+        """Number the measurements again that a factor, a track or a landmark still refers to."""
         marks, history = self.landmarks, self.history
         used = np.zeros(self.measurements.count + 1, bool)
         recent = marks.recent[marks.used()]

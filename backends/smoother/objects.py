@@ -30,7 +30,7 @@ from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
 from slam.object_models import ObjectModels
-from slam.objects.points import ENOUGH, REJECTIONS, Shape, first_frame, room_makers, shape_of, with_shape
+from slam.objects.points import MAX_REJECTIONS, MIN_POINTS, Shape, first_frame, points_to_replace, shape_of, with_shape
 
 _LAG = 4  # frames of a window at least
 _BATCH = 2  # cost: so many frames leave it together: that costs hardly more than for one
@@ -112,7 +112,11 @@ class ObjectSmoother:
         return window, Sight(True, np.sort(window.ids))
 
     def _step(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
-        """One more frame; without its observations where these cannot be solved or no body moves so; else anew."""
+        """The window with one more frame, and what was seen.
+
+        Without the frame's observations where these cannot be solved, or no body moves so; restarted if that
+        fails, too.
+        """
         for given in (seen, None):
             with suppress(np.linalg.LinAlgError):
                 after, sight = self._solved_step(window, given, path, camera)
@@ -185,9 +189,9 @@ class ObjectSmoother:
         unseen[rows] = 0
         sights[rows] += used
         wanted = ~known
-        wanted[known] = failures[rows] >= REJECTIONS
+        wanted[known] = failures[rows] >= MAX_REJECTIONS
         window = replace(window, failures=failures, unseen=unseen, sights=sights)
-        window = without_points(window, failures >= REJECTIONS)
+        window = without_points(window, failures >= MAX_REJECTIONS)
         window, new = self._join(window, camera, seen, wanted)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([seen.ids[known][used], seen.ids[new]])
@@ -201,7 +205,7 @@ class ObjectSmoother:
         rows = np.flatnonzero(wanted & seen.deep)
         if not len(rows):
             return window, rows
-        gone = room_makers(window.unseen, window.sights, len(rows), most)
+        gone = points_to_replace(window.unseen, window.sights, len(rows), most)
         if gone.any():
             window = without_points(self._solver.with_measured(window, camera, gone), gone)
         rows = rows[: most - len(window.ids)]
@@ -216,7 +220,7 @@ class ObjectSmoother:
     def _shape(self, window: Window, h: Array, T_body_left: Array) -> Shape:
         """The body's shape in body coordinates, by the points it has, or else by the new ones at h (M, 3)."""
         own = window.point_covariances()
-        if len(own) < ENOUGH:
+        if len(own) < MIN_POINTS:
             _, J = self._stereo.project(h)
             inverse_J = np.linalg.inv(J) * self._sigma
             return shape_of(h, inverse_J @ np.swapaxes(inverse_J, 1, 2)).seen_from(T_body_left)

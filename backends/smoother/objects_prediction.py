@@ -15,7 +15,7 @@ from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
 from slam.object_models import ObjectModels
-from slam.objects.points import ENOUGH
+from slam.objects.points import MIN_POINTS
 from slam.tracking.agreement import INFLATION
 
 
@@ -112,7 +112,7 @@ def agreement(
         z: the observations (M, 3).
         guess: T_world_object (4, 4) to start from, or None.
     """
-    most = max(ENOUGH, (len(rows) + 1) // 2)
+    most = max(MIN_POINTS, (len(rows) + 1) // 2)
     limit = chi_square_limit(6, probability)
     starts = [expected.T_body_left] + ([] if guess is None else [inverse(guess) @ expected.X])
     first = None

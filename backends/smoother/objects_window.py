@@ -1,6 +1,6 @@
 """The recent past of one body: its poses in the last frames and its points, estimated together.
 
-A fixed-lag smoother. All that is in the window is linearised anew in every frame; what leaves it (the oldest frame's
+A fixed-lag smoother. All that is in the window is relinearised in every frame; what leaves it (the oldest frame's
 poses and measurements) is marginalised into a prior on the rest. The points stay, so a body seen for long does not
 drift. The camera's poses in the window are unknowns too, with the joint covariance that the smoother's own graph has
 for them as their prior; where a frame leaves, its camera pose leaves with what the later ones say of it, so that
@@ -27,7 +27,7 @@ from slam.objects.points import Shape, drift
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _TURN = 0.01  # a point is seen from elsewhere by no less [rad]; what is less adds up
-_LINEAR = 0.01  # cost: a turn by less [rad] changes no derivative by much; the next frame linearises anew in any case
+_LINEAR = 0.01  # cost: a turn by less [rad] changes no derivative by much; the next frame relinearises in any case
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class Solver:
     """ISAM2 with the settings that hold for smart stereo factors.
 
     Args:
-        thresholds: how far each kind of variable may move before it is linearised anew.
+        thresholds: how far each kind of variable may move before it is relinearised.
         variables: expected number at most; None for no bound.
 
     Attributes:
@@ -85,7 +85,7 @@ class Solver:
             thresholds: how far each kind of variable may move from now on; None for the same as before.
 
         Raises:
-            SolverError: gtsam failed. The solver is then broken and has to be made anew.
+            SolverError: gtsam failed. The solver is then broken and has to be rebuilt.
         """
         if thresholds is not None:
             self._isam.params().setRelinearizeThreshold(thresholds)  # gtsam hands out its own, not a copy

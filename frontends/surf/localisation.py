@@ -31,7 +31,7 @@ _PLACES = np.array(
 )  # fmt: skip
 
 
-#: The corners' numbers, from an array because Numba compiles a helper anew for each literal number it is called with.
+#: The corners' numbers, from an array because Numba compiles a helper again for each literal number it is called with.
 _N = np.arange(10)
 
 

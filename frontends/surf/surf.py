@@ -122,7 +122,7 @@ class Surf:
     ) -> tuple[tuple[cv2.KeyPoint, ...], NDArray[np.float32]]:
         """Describe key points of any detector, as OpenCV's method of this name: those described, and descriptors.
 
-        Their orientation is measured anew, unless upright. Left out are those that cannot be oriented, whose centre is
+        Their orientation is measured again, unless upright. Left out are those that cannot be oriented, whose centre is
         not in the image, or that are larger than it. None is smaller than SURF's smallest filter, 9 px.
 
         Raises:

@@ -62,5 +62,5 @@ class Revision:
     after: RigCorrection
 
     def rows(self, z: Array) -> Array:
-        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected anew."""
+        """Rectified rows (uL, vL, uR) (N, 3) [px], corrected again."""
         return self.after.rows(self.before.undone(z))

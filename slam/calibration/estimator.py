@@ -31,7 +31,7 @@ from slam.geometry.se3 import Array
 _BLOCK_OF_ROWS, _BLOCK_OF_PAIRS = 8, 4  # frames, pairs: within a block of so many, errors are taken to be correlated
 _SPACING = 0.5  # cost: a new view is taken when the last one has lost this share of the features it may lose
 _FEW = 6  # with fewer pairs, an incomplete one counts provisionally
-_LATER = 1.25  # cost: an incomplete pair is solved anew after so many times the frames, as its parallax grows no faster
+_LATER = 1.25  # cost: an incomplete pair is solved again after so many times the frames: parallax grows no faster
 _MOST_ROWS = 250  # cost: features of a frame whose rows are used: more add little
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
 _KNOWN = 0.5  # pixels are first corrected once the prior variance of disparities has fallen to this share

@@ -34,7 +34,7 @@ class RemainingRigError:
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.
 
-        For a back end that can revise, a change means processing all its measurements anew, so it waits until the
+        For a back end that can revise, a change means processing all its measurements again, so it waits until the
         change is significant.
         """
         return self._calibration.apply(_REVISION if isinstance(backend, RevisingBackend) else 0.0)

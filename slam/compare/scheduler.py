@@ -63,7 +63,7 @@ class Scheduler(Protocol):
 class LocalScheduler:
     """Worker processes on this machine, each with one thread for linear algebra.
 
-    When a worker dies (killed, out of memory) the pool is made anew and goes on; the jobs that were running run again.
+    When a worker dies (killed, out of memory) the pool is rebuilt and goes on; the jobs that were running run again.
 
     Attributes:
         workers: number of processes.

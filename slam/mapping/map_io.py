@@ -249,7 +249,7 @@ def decode(data: bytes, source: str) -> SavedMap:
         raise SlamError(f"{source}: not a saved map")
     version = first[len(_MAGIC) :].decode("ascii", "replace")
     if version not in (_WITHOUT_PLACES, str(_VERSION)):
-        known = f"this program reads versions {_WITHOUT_PLACES} and {_VERSION}: make the map anew with --save-map"
+        known = f"this program reads versions {_WITHOUT_PLACES} and {_VERSION}: make the map again with --save-map"
         raise SlamError(f"{source}: a map of version {version!r}; {known}")
     if hashlib.sha256(body).hexdigest().encode() != digest:
         raise SlamError(f"{source}: the map was altered or cut short: its checksum is wrong")

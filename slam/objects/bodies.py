@@ -48,7 +48,7 @@ class Body:
         missed: number of frames since it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
-        proved: whether it has moved for certain.
+        confirmed: whether it has moved for certain.
         alike: for how many frames it has gone with an older body as if it were a part of that.
         age: number of frames since it was found.
         existence: probability that it exists.
@@ -81,7 +81,7 @@ class Body:
     missed: int = 0
     measured: bool = True
     moving: bool = True
-    proved: bool = False
+    confirmed: bool = False
     alike: int = 0
     age: int = 0
     existence: float = EVEN
@@ -200,16 +200,16 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A body found anew where it was known already in part: with its id and what has been learnt of its existence.
+    """A body found again that was known in part: with its id and what has been learnt of its existence.
 
-    The back end estimates it anew; its frame for it goes on as predicted, but for a shift from what was seen of it to
+    The back end estimates it again; its frame for it goes on as predicted, but for a shift from what was seen of it to
     what is now.
     """
     shift = np.eye(4)
     shift[:3, 3] = body.middle - known.middle
     T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
-        body, id=known.id, T_body_estimate=T_body_estimate, proved=known.proved, existence=known.existence,
+        body, id=known.id, T_body_estimate=T_body_estimate, confirmed=known.confirmed, existence=known.existence,
         age=known.age, reported=known.reported, reported_unmeasured=known.reported_unmeasured,
         measured_at=known.measured_at, estimate=None, refused=0,
     )  # fmt: skip

@@ -21,7 +21,7 @@ from slam.data import BoolArray, IdArray
 from slam.geometry.gauss_kernels import squared_distances
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array
-from slam.objects.points import ENOUGH
+from slam.objects.points import MIN_POINTS
 from slam.objects.tracks import AGREES, EXPLAINED, MOVES, ConstantVelocity
 
 _NEAR = 7.8  # derived: χ²(3) at 95 %, of tracks inside the region
@@ -93,7 +93,7 @@ class MovingTracks:
         return np.eye(3) * (self.radius**2 / 3.0)[:, None, None]
 
     @cached_property
-    def said(self) -> tuple[Array, Array, Array, Array]:
+    def stacked(self) -> tuple[Array, Array, Array, Array]:
         """What those that move say of a region: information (N, 3, 3) on its place and on its velocity, and vectors.
 
         The vectors (N, 3) are these times place and velocity. All are NaN for those that do not move.
@@ -150,7 +150,7 @@ class Candidate:
         Args:
             min_speed: of bodies [m/s].
         """
-        enough = len(self.members) >= MINIMAL_POINTS and self.frames >= _FRAMES and len(self.supporters) >= ENOUGH
+        enough = len(self.members) >= MINIMAL_POINTS and self.frames >= _FRAMES and len(self.supporters) >= MIN_POINTS
         if not (enough and self.agreeing > _SHARE * (self.agreeing + self.contradicting)):
             return False
         length = float(np.linalg.norm(self.state[:3] - self.start))
@@ -276,7 +276,7 @@ def _corrected(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp],
     """The regions after tracks have corrected them; see `_supported`."""
     weight = mine.astype(float)
     share = 1 / _share(mine.sum(axis=1))
-    places, velocities, at, towards = (part[moving] for part in tracks.said)
+    places, velocities, at, towards = (part[moving] for part in tracks.stacked)
     information = np.linalg.inv(before.covariance)
     vector = (information @ before.state[:, :, None])[:, :, 0]
     information[:, :3, :3] += (weight @ places.reshape(-1, 9)).reshape(-1, 3, 3)
@@ -305,7 +305,7 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
 
 def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
     P = np.zeros((6, 6))
-    places, velocities, at, towards = (part[rows] for part in tracks.said)
+    places, velocities, at, towards = (part[rows] for part in tracks.stacked)
     share = _share(len(rows))
     P[:3, :3], P[3:, 3:] = np.linalg.inv(places.sum(axis=0)), np.linalg.inv((velocities / share).sum(axis=0))
     place = P[:3, :3] @ at.sum(axis=0)

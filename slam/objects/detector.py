@@ -33,7 +33,7 @@ from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
 from slam.objects.estimates import BodyEstimates
 from slam.objects.following import follow
-from slam.objects.founding import Founding, MovingGroup
+from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
 from slam.objects.recovery import locate
@@ -104,12 +104,12 @@ class MovingObjectDetector:
         self._measure(tracks, features, local, T_world_left)
         tracks.assign_landmarks(landmark)
         self._fit(tracks, times)
-        founding = Founding(
+        initializer = BodyInitializer(
             self.rig, self.config, self.sigma, self.models, times, self.slot, features.stamp, T_world_left[:3, 3]
         )
-        self._change_members(founding)
-        self._find_bodies(founding, T_world_left)
-        self._follow_candidates(founding, T_world_left)
+        self._change_members(initializer)
+        self._find_bodies(initializer, T_world_left)
+        self._follow_candidates(initializer, T_world_left)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._motion_labels(features)
 
@@ -179,9 +179,9 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- bodies and members
 
-    def _find_bodies(self, founding: Founding, T_world_left: Array) -> None:
+    def _find_bodies(self, initializer: BodyInitializer, T_world_left: Array) -> None:
         """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
-        c, tracks, times = self.config, self.tracks, founding.times
+        c, tracks, times = self.config, self.tracks, initializer.times
         assert tracks is not None
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows, place = known_well(tracks, free, T_world_left, c.min_frames)
@@ -208,30 +208,30 @@ class MovingObjectDetector:
         for whole, members in [*parts, *((None, members) for members in alone)]:
             members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
-                new = founding.moving_group(tracks, members[tracks.streak[members] > 0])
+                new = initializer.moving_group(tracks, members[tracks.streak[members] > 0])
                 if new is not None:
-                    self._found(new, founding, whole)
+                    self._found(new, initializer, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
 
-    def _found(self, group: MovingGroup, founding: Founding, whole: int | None = None) -> None:
+    def _found(self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None) -> None:
         """Make a body of tracks with a common twist, or let them join the one that they belong to.
 
         They may be a part of the body `whole` that moves otherwise: then they do not join that one.
         """
         tracks, members = self.tracks, group.members
         assert tracks is not None
-        body = founding.body(self._next_body, tracks, group)
+        body = initializer.body(self._next_body, tracks, group)
         others = {id: other for id, other in self.bodies.items() if id != whole}
-        known = membership.overlapped(others, tracks, members, body)
-        known = known or membership.whole_of(others, tracks, members, body)
+        known = membership.body_around(others, tracks, members, body)
+        known = known or membership.body_with_part(others, tracks, members, body)
         if known is None:
             body = replace(self._again(self._grown(body, members), whole), apart_from=whole)
             self.bodies[body.id] = body
             self._next_body = max(self._next_body, body.id + 1)
         else:
-            body = self.bodies[known.id] = membership.reaching(known, tracks, members)
-        membership.enter(body, tracks, members, sure=True)
+            body = self.bodies[known.id] = membership.with_reach(known, tracks, members)
+        membership.add_members(body, tracks, members, sure=True)
 
     def _again(self, body: Body, whole: int | None) -> Body:
         """A new body, or in its place the one out of view that it is: that keeps its id, but not its points.
@@ -242,7 +242,7 @@ class MovingObjectDetector:
         assert tracks is not None
         if body.id not in self.bodies:
             parts = {id: b for id, b in self.bodies.items() if whole is None or b.apart_from == whole}
-            known = membership.returned(parts, body)
+            known = membership.reappeared(parts, body)
         if known is None:
             return body
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
@@ -255,7 +255,8 @@ class MovingObjectDetector:
         assert tracks is not None
         for known in self.bodies.values():
             mine = np.flatnonzero((tracks.body == known.id) & tracks.seen)
-            if known.measured and len(mine) < len(members) and membership.part_of(body, members, tracks, mine, known):
+            fewer = known.measured and len(mine) < len(members)
+            if fewer and membership.is_part_of(body, members, tracks, mine, known):
                 return self._in_place_of(known, body, mine)
         return body
 
@@ -266,18 +267,18 @@ class MovingObjectDetector:
         tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
         self._forgotten.append(known.id)
         grown = continued(body, known)
-        membership.enter(grown, tracks, mine, sure=True)
+        membership.add_members(grown, tracks, mine, sure=True)
         return grown
 
-    def _follow_candidates(self, founding: Founding, T_world_left: Array) -> None:
+    def _follow_candidates(self, initializer: BodyInitializer, T_world_left: Array) -> None:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
-        c, tracks, times = self.config, self.tracks, founding.times
+        c, tracks, times = self.config, self.tracks, initializer.times
         assert tracks is not None
         rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
         motion = constant_velocity(tracks, rows, times, c.max_speed)
         depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
-        noise = founding.depth_noise(depth)
+        noise = initializer.depth_noise(depth)
         moving = MovingTracks.of(rows, tracks.ids[rows], motion, depth, noise, c.size, c.min_speed)
         followed = follow_candidates(self._candidates, moving, self._dt(times), self.models.acceleration)
         self._candidates = []
@@ -289,7 +290,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), founding)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""
@@ -297,21 +298,21 @@ class MovingObjectDetector:
         R = T_world_left[:3, :3]
         return np.asarray(R @ J @ self._pose_covariance @ J.T @ R.T)
 
-    def _change_members(self, founding: Founding) -> None:
+    def _change_members(self, initializer: BodyInitializer) -> None:
         """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
         tracks = self.tracks
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
-        resolved = {body.id for body in self.bodies.values() if founding.resolves(body.T[:3, 3])}
-        gains = membership.regroup(measured, resolved, tracks, self.slot, self.config)
+        resolved = {body.id for body in self.bodies.values() if initializer.resolves(body.T[:3, 3])}
+        gains = membership.update_members(measured, resolved, tracks, self.slot, self.config)
         for id, body in list(self.bodies.items()):
             typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
             self.bodies[id] = with_evidence(body, typical)
         for id, gain in gains.items():
-            kept = membership.proved(self.bodies[id], gain)
+            kept = membership.confirmed(self.bodies[id], gain)
             mine = np.flatnonzero(tracks.body == id)
             if kept is None:
-                membership.leave(tracks, mine, self.bodies[id])
+                membership.remove_members(tracks, mine, self.bodies[id])
                 del self.bodies[id]
                 self._forgotten.append(id)
             else:
@@ -331,14 +332,14 @@ class MovingObjectDetector:
             if body is not None and body.measured:
                 mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
                 older = {id: b for id, b in self.bodies.items() if id < body.id and id not in body.distinct}
-                whole = membership.overlapped(older, tracks, mine, body)
+                whole = membership.body_around(older, tracks, mine, body)
                 alike = body.alike + 1 if whole is not None else 0
                 if alike != body.alike:
                     self.bodies[body.id] = replace(body, alike=alike)
                 young = body.seen < _MERGES and (whole is None or whole.id != body.apart_from)
                 if whole is not None and (young or alike > _MERGES):
-                    whole = self.bodies[whole.id] = membership.reaching(whole, tracks, mine)
-                    membership.enter(whole, tracks, mine, sure=True)
+                    whole = self.bodies[whole.id] = membership.with_reach(whole, tracks, mine)
+                    membership.add_members(whole, tracks, mine, sure=True)
                     self._forget(body.id)
                 elif whole is None and body.seen < _MERGES:
                     self._outgrow(body, len(mine), older)
@@ -350,7 +351,7 @@ class MovingObjectDetector:
         for known in older.values():
             theirs = np.flatnonzero((tracks.body == known.id) & tracks.seen)
             fewer = known.measured and len(theirs) < count and known.id != body.apart_from
-            if not fewer or not membership.goes_with(body, tracks, theirs):
+            if not fewer or not membership.moves_with(body, tracks, theirs):
                 continue
             mine = np.flatnonzero((tracks.body == body.id) & tracks.seen)
             distinctness = membership.distinctness(body, mine, known, theirs, tracks)
@@ -383,7 +384,7 @@ class MovingObjectDetector:
     def _motion_labels(self, features: StereoFeatures) -> MotionLabels:
         tracks = self.tracks
         assert tracks is not None
-        on, near = membership.on_bodies(self.bodies, tracks, self.config.margin)
+        on, near = membership.tracks_on_bodies(self.bodies, tracks, self.config.margin)
         doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
         landmarks = np.unique(tracks.landmark[tracks.body >= 0])
         tracks.landmark[tracks.body >= 0] = -1

@@ -17,7 +17,7 @@ from slam.objects import membership
 from slam.objects.bodies import CUT, Body, counted, from_estimate, outermost
 from slam.objects.config import ObjectsConfig
 from slam.objects.existence import EVEN
-from slam.objects.points import REJECTIONS
+from slam.objects.points import MAX_REJECTIONS
 from slam.objects.tracks import Tracks
 
 
@@ -45,7 +45,7 @@ class BodyEstimates:
             tracks: all tracks.
             backend: estimates the bodies.
             features: of the frame.
-            forgotten: ids of bodies that are no more, or start anew.
+            forgotten: ids of bodies that are no more, or restart.
         """
         gone = [id for id in forgotten if id in self._known]
         if gone:
@@ -68,15 +68,15 @@ class BodyEstimates:
                 bodies[body.id] = replace(body, estimate=None, refused=0)
                 continue
             bodies[body.id] = body
-            membership.reject(tracks, estimate.rejected)
-            if body.proved and self._worth_reporting(body, estimate):
+            membership.count_rejections(tracks, estimate.rejected)
+            if body.confirmed and self._worth_reporting(body, estimate):
                 bodies[body.id] = counted(body)
                 reported.append(_report(body, estimate, tracks))
         return tuple(reported)
 
     def _believed(self, body: Body, estimate: ObjectEstimate) -> bool:
-        """Whether the back end still knows a body; if not, it starts anew under its id once it is measured again."""
-        return body.refused < REJECTIONS and self._models.known(estimate.covariance, estimate.velocity_covariance)
+        """Whether the back end still knows a body; if not, it restarts under its id once it is measured again."""
+        return body.refused < MAX_REJECTIONS and self._models.known(estimate.covariance, estimate.velocity_covariance)
 
     def _worth_reporting(self, body: Body, estimate: ObjectEstimate) -> bool:
         """Whether a body is reported: if not measured, for a short while and seldom, and where it likely exists."""
@@ -90,19 +90,19 @@ def _restarted(
     bodies: dict[int, Body], backend: ObjectBackend, estimates: list[ObjectEstimate],
     observations: list[ObjectObservations],
 ) -> list[ObjectEstimate]:  # fmt: skip
-    """The estimates; bodies of which nothing was used, though their points agree here, start anew under their id.
+    """The estimates; bodies of which nothing was used, though their points agree here, restart under their id.
 
     They bring the velocity that they had: what was wrong is where the back end has their points.
     """
     refused = {e.id for e in estimates if not e.measured}
-    anew = [o for o in observations if o.id in refused and o.has_stereo.sum() >= MINIMAL_POINTS]
-    if not anew:
+    again = [o for o in observations if o.id in refused and o.has_stereo.sum() >= MINIMAL_POINTS]
+    if not again:
         return estimates
-    ids = sorted(o.id for o in anew)
+    ids = sorted(o.id for o in again)
     backend.remove_objects(ids)
     for id in ids:
         bodies[id] = replace(bodies[id], estimate=None, refused=0)
-    begun = {e.id: e for e in backend.update_objects(anew) if e.id in ids}
+    begun = {e.id: e for e in backend.update_objects(again) if e.id in ids}
     return [begun.get(e.id, e) for e in estimates]
 
 

@@ -45,7 +45,8 @@ def follow(
     is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes
     it on which it lies, and then as far as `max_speed` allows.
     Members of a body that was not measured in the last frame have no claim: a free track may follow their feature, too,
-    until the body is located. Else a body that has turned out of sight hides from the detector what is seen of it anew.
+    until the body is located. Else a body that has turned out of sight hides from the detector what is newly seen of
+    it.
     `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     tracks.row[:] = -1

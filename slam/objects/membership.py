@@ -19,7 +19,7 @@ from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
-from slam.objects.points import REJECTIONS
+from slam.objects.points import MAX_REJECTIONS
 from slam.objects.track_kernels import (
     improve_members,
     squares,
@@ -57,7 +57,7 @@ def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class MembershipTest:
     """How tracks go with a body, a row each.
 
     Attributes:
@@ -71,13 +71,13 @@ class Verdict:
     count: NDArray[np.int64]
 
 
-def verdict(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Verdict:
+def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
     """How tracks go with a body and with the still world, over the window."""
     t = tracks
     fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
     limit = _limits(3 * t.dof.shape[1])[np.maximum(numbers - 3, 1)]
     fits = (fixed < limit) | ((fixed < EXPLAINED * still) & (fixed < _LOOSE * limit))
-    return Verdict(still - fixed, fits, count)
+    return MembershipTest(still - fixed, fits, count)
 
 
 @cache
@@ -109,7 +109,7 @@ def _with_poses_fitted(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Bo
     return body
 
 
-def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
+def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False) -> None:
     """Make tracks members of a body, in place; their points in it are what they measured over the window."""
     if not len(rows):
         return
@@ -119,8 +119,8 @@ def enter(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool = False
     tracks.sure[rows] = sure
 
 
-def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
-    """Make members free tracks again, in place; they must show anew how they move."""
+def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
+    """Make members free tracks again, in place; they must show again how they move."""
     if not len(rows):
         return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
@@ -128,13 +128,13 @@ def leave(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
     tracks.missed[rows] = 1
 
 
-def _go_their_own_way(tracks: Tracks, rows: NDArray[np.intp]) -> None:
+def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
     """Make seen members free tracks, in place, tested by what they have measured so far."""
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
     fit_positions(tracks, rows)
 
 
-def regroup(
+def update_members(
     bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
 ) -> dict[int, Array]:
     """Tracks that go with a body join it, those that do not leave it, in place.
@@ -162,7 +162,7 @@ def regroup(
     for body in bodies.values():
         mine = free[whose == body.id]
         streak = tracks.streak[mine]
-        enter(body, tracks, mine)
+        add_members(body, tracks, mine)
         tracks.streak[mine] = streak  # they may be of a part that is about to be found
     return gains
 
@@ -171,7 +171,7 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[n
     """By how much χ² a body explains tracks (N,) better than the still world; −∞ for those that may not join it."""
     inside = _distances(body, tracks, rows, _EDGE) < _INSIDE
     proof = tracks.expelled[rows] | (not resolved)
-    v = verdict(body, tracks, rows)
+    v = membership_test(body, tracks, rows)
     may = (
         v.fits
         & (v.count >= np.where(proof, _ENOUGH, 2))
@@ -183,40 +183,42 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[n
 def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     """Members that do not go with the body leave it, in place; the gain of those that are seen and stay (K,).
 
-    It is the `Verdict.gain` less what the body's poses, fitted to its members, would gain by chance.
+    It is the `MembershipTest.gain` less what the body's poses, fitted to its members, would gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
-    v, seen = verdict(body, tracks, mine), tracks.seen[mine]
+    v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
-    wrong = (tracks.misfit[mine] >= REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
+    wrong = (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
-        leave(tracks, mine[wrong & ~seen], body)
+        remove_members(tracks, mine[wrong & ~seen], body)
         tracks.expelled[mine[wrong]] = True
-        _go_their_own_way(tracks, mine[wrong & seen])
+        _release(tracks, mine[wrong & seen])
         mine = mine[~wrong]
     if len(mine) > config.max_points:
         worth = np.trace(tracks.local_information[mine], axis1=1, axis2=2)
         order = np.lexsort((worth, -tracks.missed[mine]))
-        leave(tracks, mine[order[: len(mine) - config.max_points]], body)
+        remove_members(tracks, mine[order[: len(mine) - config.max_points]], body)
     stay = seen & ~wrong
     return v.gain[stay] - _FREEDOM * float(body.known.sum()) / max(int(stay.sum()), 1)
 
 
-def reject(tracks: Tracks | None, ids: IdArray) -> None:
+def count_rejections(tracks: Tracks | None, ids: IdArray) -> None:
     """Count members whose observations the back end rejected as misfits."""
     if tracks is not None and len(ids):
         tracks.misfit[np.isin(tracks.ids, ids)] += 1
 
 
-def on_bodies(bodies: Mapping[int, Body], tracks: Tracks, margin: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def tracks_on_bodies(
+    bodies: Mapping[int, Body], tracks: Tracks, margin: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
 
     What lies inside a body's extent lies on it, unless it is known to stand still. All that lies on a body which is not
-    proved yet only may.
+    confirmed yet only may.
     """
-    certain = np.isin(tracks.body, [body.id for body in bodies.values() if body.proved])
+    certain = np.isin(tracks.body, [body.id for body in bodies.values() if body.confirmed])
     on, near = tracks.seen & certain, tracks.seen & (tracks.body >= 0) & ~certain
     free = np.flatnonzero(tracks.seen & (tracks.body < 0))
     for body in bodies.values():
@@ -225,9 +227,9 @@ def on_bodies(bodies: Mapping[int, Body], tracks: Tracks, margin: float) -> tupl
         close = free[_distances(body, tracks, free, margin) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
-        if len(inside) and body.proved:
+        if len(inside) and body.confirmed:
             asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
-            on[inside[verdict(body, tracks, inside).gain > asked]] = True
+            on[inside[membership_test(body, tracks, inside).gain > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
 
 
@@ -238,7 +240,7 @@ def tracks_on(body: Body, tracks: Tracks, margin: float) -> NDArray[np.intp]:
     return np.concatenate([np.flatnonzero(tracks.seen & (tracks.body == body.id)), near])
 
 
-def overlapped(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
     """The body in whose extent most of these tracks lie, if their past fits its motion, too; else None.
 
     Args:
@@ -281,20 +283,20 @@ def _spread_of_place(body: Body, y: Array) -> Array:
     return np.asarray(J @ body.covariance @ J.T + _WEAK * np.eye(3))
 
 
-def reaching(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
+def with_reach(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
     """The body known to reach as far as tracks that have moved with it."""
     away = np.linalg.norm(tracks.position[rows] - body.T[:3, 3], axis=1)
     return replace(body, reach=max(body.reach, float(away.max(initial=0.0))))
 
 
-def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
+def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
     """The body out of view that a new one is by its place and its velocity, perhaps seen from another side; else None.
 
     Where the middle of what is seen lies in the body is known to within the body's half.
     """
     best, least = None, _RETURNED
     for body in bodies.values():
-        if body.measured or not body.proved:
+        if body.measured or not body.confirmed:
             continue
         y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
         place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
@@ -307,15 +309,16 @@ def returned(bodies: Mapping[int, Body], new: Body) -> Body | None:
     return best
 
 
-def part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> bool:
+def is_part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> bool:
     """Whether the members `rows` of the body `own`, near another one, make one rigid body with its members `theirs`."""
-    return goes_with(whole, tracks, rows) and distinctness(whole, theirs, own, rows, tracks) < 1.0
+    return moves_with(whole, tracks, rows) and distinctness(whole, theirs, own, rows, tracks) < 1.0
 
 
-def goes_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
+def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
     """Whether the members `rows` of another body, near this one, have moved about as it has all the time.
 
-    Much more is asked for than of `overlapped`: next to nothing of what the still world leaves unexplained may be left.
+    Much more is asked for than of `body_around`: of what the still world leaves unexplained, next to nothing may be
+    left.
     """
     near = _distances(replace(whole, reach=np.inf), tracks, rows, _PART) < _NEAR
     if not len(rows) or 2 * near.sum() <= len(rows):
@@ -346,19 +349,19 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
     return more / max(chi_square_limit(6 * max(int(both.sum()), 1), 0.99), _UNLIKE**2 * still)
 
 
-def whole_of(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
+def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
     """The measured body of which tracks are a part, if it has more of them that are seen; else None.
 
     `own` is a body made of them alone.
     """
     for body in bodies.values():
         theirs = np.flatnonzero(tracks.seen & (tracks.body == body.id))
-        if body.measured and len(theirs) >= len(rows) and part_of(body, theirs, tracks, rows, own):
+        if body.measured and len(theirs) >= len(rows) and is_part_of(body, theirs, tracks, rows, own):
             return body
     return None
 
 
-def proved(body: Body, gain: Array) -> Body | None:
+def confirmed(body: Body, gain: Array) -> Body | None:
     """The body, known to have moved once its members say so; None where they say that it stands still and always did.
 
     A young one may lose what it seemed to be.
@@ -367,11 +370,11 @@ def proved(body: Body, gain: Array) -> Body | None:
         body: the body.
         gain: by how much χ² it explains its members better than the still world (K,).
     """
-    if body.proved and body.seen >= _PROBATION:
+    if body.confirmed and body.seen >= _PROBATION:
         return body
     typical = median(gain) if len(gain) else 0.0
     if typical > _PROOF:
-        return replace(body, proved=True)
+        return replace(body, confirmed=True)
     return body if typical > 0 and body.seen < _PROBATION else None
 
 

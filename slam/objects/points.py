@@ -15,8 +15,8 @@ from slam.geometry.se3 import Array, transform
 Projection = Callable[[Array], tuple[Array, Array]]
 
 _FAR = 4.0  # so many times the median distance from the median point is no part of the body
-ENOUGH = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
-REJECTIONS = 3  #: so many running, and a point starts anew
+MIN_POINTS = MINIMAL_POINTS + 1  #: points whose agreement can be tested: three agree with a pose in any case
+MAX_REJECTIONS = 3  #: so many running, and a point restarts
 _STEPS = 3  # numerics: of Gauss-Newton; the prior is weak where depth is known well
 
 
@@ -66,7 +66,7 @@ def shape_of(points: Array, covariances: Array) -> Shape:
     No extent is taken to be less than half the middle one: a body is seldom flatter than that, and would be taken for
     flat wrongly where depth is all noise. Fewer than four points show no shape: then next to nothing is said.
     """
-    if len(points) < ENOUGH:
+    if len(points) < MIN_POINTS:
         return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
     offset = points - points.mean(axis=0)
     total = offset.T @ offset / max(1, len(points) - 1)
@@ -125,7 +125,7 @@ def drift(points: Array, first: Array, now: Array, turned: Array, density: float
     return angle, np.nan_to_num(density * np.sqrt(angle - turned)[:, None, None] * distance * across)
 
 
-def room_makers(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
+def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:
     """Which points of a full body leave to make room for new ones.
 
     Those that have not been seen for more frames than they ever were; a point that is only missed now and then is worth

@@ -12,7 +12,7 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
-from slam.objects.points import ENOUGH
+from slam.objects.points import MIN_POINTS
 from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks, times_vectors
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
@@ -89,13 +89,13 @@ def _fit(
     T_world_left: Array, rig: StereoRig, sigma: float, seed: int,
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
     """Pose T_body_left, and which tracks agree with it as the features of these rows."""
-    if len(mine) < ENOUGH:
+    if len(mine) < MIN_POINTS:
         return None
     z = measurement_rows(features.uv_left[rows], features.uv_right[rows])
     guess = inverse(body.T) @ T_world_left
     fit = find_consensus(rig, tracks.local[mine], z, guess, _SIGMAS * sigma, _HYPOTHESES, seed)
     stereo = np.isfinite(z[fit.inliers, 2])
-    return None if stereo.sum() < ENOUGH else (fit.T_world_left, fit.inliers)
+    return None if stereo.sum() < MIN_POINTS else (fit.T_world_left, fit.inliers)
 
 
 def _predicted(
@@ -152,7 +152,7 @@ def _by_descriptors(
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
-    if len(mine) < ENOUGH or len(free) < ENOUGH:
+    if len(mine) < MIN_POINTS or len(free) < MIN_POINTS:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     local = measured[free]
     points = transform(T_world_left, local)

@@ -20,7 +20,7 @@ CorrectRows = Callable[[Array], Array]
 def revise_tracks(
     tracks: Tracks, bodies: Mapping[int, Body], poses: Array, slot: int, rig: StereoRig, correct: CorrectRows
 ) -> None:
-    """Move the points of all tracks to where their pixels say that they are, corrected anew; in place.
+    """Move the points of all tracks to where their pixels say that they are, corrected again; in place.
 
     Args:
         tracks: the tracks.
@@ -28,7 +28,7 @@ def revise_tracks(
         poses: T_world_left (W, 4, 4) in the frames of the window's slots.
         slot: of the newest frame.
         rig: the cameras.
-        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] anew, as of `slam.calibration.correction.Revision`.
+        correct: corrects rectified rows (uL, vL, uR) (N, 3) [px] again, as of `slam.calibration.correction.Revision`.
     """
     rows, slots = np.nonzero(tracks.dof)
     points = tracks.anchor[rows] + tracks.p[rows, slots]

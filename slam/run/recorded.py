@@ -30,7 +30,7 @@ class RecordedFrame:
         observed: landmarks of the map, as measured.
         added: landmarks that joined the map, at their first sight.
         removed: ids of those that left it (R,).
-        revision: before the frame, the pixels of all earlier ones were corrected anew; None where they were not.
+        revision: before the frame, the pixels of all earlier ones were corrected again; None where they were not.
     """
 
     number: int
@@ -105,7 +105,7 @@ class Recording:
         removed_frame, removed: row of `stamps`, ascending, and id of each landmark that left the map (R,).
         ground_truth: the left camera's true path, where it is known.
         corrections: parameters of the correction that each frame's pixels have, and all earlier frames' with it (F, n),
-            see `slam.calibration`; None where nothing was ever corrected anew.
+            see `slam.calibration`; None where nothing was ever corrected again.
         kind: of motion, which chooses a back end's default options.
 
     Raises:
@@ -160,7 +160,7 @@ class Recording:
         return RecordedFrame(number, stamp, self.observed.at(k), self.added.at(k), gone, self._revision(k))
 
     def _revision(self, k: int) -> Revision | None:
-        """How frames before k are corrected anew; None where they are not."""
+        """How frames before k are corrected again; None where they are not."""
         if self.corrections is None or not k or (self.corrections[k] == self.corrections[k - 1]).all():
             return None
         model = RigModel(self.rig)

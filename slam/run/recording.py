@@ -2,7 +2,7 @@
 
 Keys: ``format``, ``version``, ``name``, ``kind``, ``rig`` and ``models`` (JSON), ``numbers``, ``stamps``,
 ``observed_…`` and ``added_…`` (``frame``, ``ids``, ``uv_left``, ``uv_right``), ``removed_frame``, ``removed``, where
-earlier frames were corrected anew ``corrections``, and, where the true path is known, ``truth_stamps`` and
+earlier frames were corrected again ``corrections``, and, where the true path is known, ``truth_stamps`` and
 ``truth_poses``. Meanings: `slam.run.recorded.Recording`.
 """
 

@@ -38,7 +38,7 @@ def replay(
     Args:
         recording: what to give.
         backend: a new back end for the recording's rig.
-        guess: give `Backend.update` the pose on which the observations agree, as the system does; it is found anew
+        guess: give `Backend.update` the pose on which the observations agree, as the system does; it is found again
             from this back end's own map. All observations are given, also those that do not agree.
         association: settings of that search; None for the defaults.
 

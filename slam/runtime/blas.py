@@ -22,7 +22,7 @@ def _libraries() -> tuple[list[LibController], list[LibController]]:
 
 @lru_cache(maxsize=1)
 def _found(modules: int) -> tuple[list[LibController], list[LibController]]:
-    """Looked up anew whenever `modules`, their number, has changed: any of them may have brought a library."""
+    """Looked up again whenever `modules`, their number, has changed: any of them may have brought a library."""
     found = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
     own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
     return [library for library in found if library not in own], own

@@ -1,4 +1,4 @@
-"""Memory that was freed stays with the process, so that each frame does not have to be given its pages anew.
+"""Memory that was freed stays with the process, so that not each frame has to ask for it again.
 
 The C library of most Linux systems (glibc) returns the end of its heap to the system as soon as some megabytes of it
 are free. Arrays that live for a part of a step are as large as that, so in every frame the system would take thousands

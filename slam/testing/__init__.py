@@ -120,7 +120,7 @@ def findings(factory: Factory, tier: str = "good") -> Iterator[Finding]:
     """Put a back end through all checks up to a tier, one after another.
 
     Args:
-        factory: called as ``factory(rig, models=...)``, for each check anew; usually the back end's class.
+        factory: called as ``factory(rig, models=...)``, once for each check; usually the back end's class.
         tier: ``"runs"``, ``"right"`` or ``"good"``.
 
     Raises:

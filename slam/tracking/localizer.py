@@ -267,11 +267,11 @@ class Localizer:
         seed: int,
     ) -> tuple[Matches, PoseConsensus]:
         """Search again in small windows around the consensus pose's predictions; returns the better matches of both."""
-        matches_anew = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
-        consensus_anew = self._consensus(matches_anew, positions, features, consensus.T_world_left, seed)
-        if consensus_anew.inliers.sum() < consensus.inliers.sum():
+        matches_again = self._in_windows(expected, landmarks, landmarks.rows(expected.ids), features)
+        consensus_again = self._consensus(matches_again, positions, features, consensus.T_world_left, seed)
+        if consensus_again.inliers.sum() < consensus.inliers.sum():
             return matches, consensus
-        return matches_anew, consensus_anew
+        return matches_again, consensus_again
 
 
 def _select(prediction: Prediction, keep: BoolArray) -> Prediction:

@@ -2,7 +2,7 @@
 
 As the view changes, a detector finds a feature at another point of the surface. So the patch seen at first, warped as a
 small surface that faces the camera, is aligned with the present image, and the feature moved there. The patch is taken
-anew, at the aligned position, once its size has changed by a fifth or it no longer fits.
+again, at the aligned position, once its size has changed by a fifth or it no longer fits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from slam.tracking.localizer import LandmarkMatches
 from slam.tracking.protocol_check import require_aligned, require_patches
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
-_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken anew, so that another such change stays below the largest
+_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that another such change stays below the largest
 _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 

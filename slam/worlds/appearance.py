@@ -113,7 +113,7 @@ class Appearance:
         return clean + self.errors[rng.integers(0, _POOL, len(landmark))]
 
     def _visit(self, landmark: IdArray, time: float) -> IdArray:
-        """Numbers (N,) drawn anew for each landmark about once a minute, each at a time of its own."""
+        """Numbers (N,) drawn again for each landmark about once a minute, each at a time of its own."""
         own = landmark.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         minute = (time / _VISIT + (own >> np.uint64(40)).astype(float) / 2**24).astype(np.uint64)
         mixed = (own ^ (minute * np.uint64(0xC2B2AE3D27D4EB4F))) * np.uint64(0xFF51AFD7ED558CCD)

@@ -14,7 +14,7 @@ from tests.backends.scenes import RIG, path, run, scene
 @pytest.mark.parametrize("name", [name for name in backends.names() if name != "ekf"])
 def test_the_pose_and_its_covariance_are_the_filters(name):
     # With so little noise the measurements are linear over their uncertainty; what differed would be the models. The
-    # start is known better than they could tell: else what a filter believes to learn of it by linearising anew counts.
+    # start is known better than they could tell: else what a filter believes to learn by linearising again counts.
     sigma = 0.003
     models = EstimatorModels(
         MotionModel(0.3, 0.3), pixel_sigma=sigma, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7

@@ -229,7 +229,7 @@ def test_what_nothing_measures_stays_unknown(drive, landmarks, iterations):
     """A displacement of camera and landmarks together stays as uncertain as the first pose was.
 
     The information (the inverse of the covariance) on it is that of the prior, 1 in units of its sigmas, and so it is
-    after any number of updates, also of those that are linearised anew; the plain filter believes to have measured it.
+    after any number of updates, also of those that are relinearised; the plain filter believes to have measured it.
     """
     sigma = 0.01
     models = replace(MODELS, initial_position_sigma=sigma, initial_rotation_sigma=sigma)

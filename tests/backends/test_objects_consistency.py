@@ -19,7 +19,7 @@ from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from slam.object_data import ObjectObservations
 from slam.object_models import ObjectModels
-from slam.objects.points import Shape, drift, first_frame, room_makers, shape_of, with_shape
+from slam.objects.points import Shape, drift, first_frame, points_to_replace, shape_of, with_shape
 from tests.backends import scenes
 from tests.backends.objects_scene import HANDHELD, KITTI, SIGMA, box_points, box_scene, car_scene, follow, score
 
@@ -307,16 +307,16 @@ def test_noise_added_to_unknowns_is_that_of_their_covariance():
 
 def test_points_unseen_for_longer_than_they_were_seen_make_room():
     unseen, sights = np.array([0, 3, 1, 9, 0]), np.array([5, 2, 20, 8, 1])
-    np.testing.assert_array_equal(room_makers(unseen, sights, 0, 5), False)
-    np.testing.assert_array_equal(room_makers(unseen, sights, 1, 5), [0, 1, 0, 0, 0])
-    np.testing.assert_array_equal(room_makers(unseen, sights, 4, 5), [0, 1, 0, 1, 0])  # seldom missed: stays
+    np.testing.assert_array_equal(points_to_replace(unseen, sights, 0, 5), False)
+    np.testing.assert_array_equal(points_to_replace(unseen, sights, 1, 5), [0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(points_to_replace(unseen, sights, 4, 5), [0, 1, 0, 1, 0])  # seldom missed: stays
 
 
 def test_a_body_that_has_turned_round_takes_up_new_points():
     unseen, sights = np.full(10, 2), np.full(10, 50)
-    assert room_makers(unseen, sights, 8, 10).sum() == 5  # half of its points at least shall be in view
-    assert room_makers(unseen, sights, 3, 10).sum() == 3
-    assert not room_makers(np.zeros(10, np.int64), sights, 8, 10).any()
+    assert points_to_replace(unseen, sights, 8, 10).sum() == 5  # half of its points at least shall be in view
+    assert points_to_replace(unseen, sights, 3, 10).sum() == 3
+    assert not points_to_replace(np.zeros(10, np.int64), sights, 8, 10).any()
 
 
 # --- bodies and the camera ---

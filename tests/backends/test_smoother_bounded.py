@@ -140,7 +140,7 @@ def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
         gone = sorted(known - set(seen.ids.tolist()))
         backend.remove(gone)
         known.difference_update(gone)
-    assert max(off) < 0.3, "where everything is linearised anew piece by piece, it runs away by metres"
+    assert max(off) < 0.3, "where everything is relinearised piece by piece, it runs away by metres"
     deviations = np.sqrt(np.diag(backend.estimate(landmarks=False).covariance))
     assert deviations[:3].min() > 0.09 and deviations[:3].max() < 0.15, "the start's uncertainty stays"
     assert deviations[3:].min() > 9

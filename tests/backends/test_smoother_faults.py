@@ -108,7 +108,7 @@ def test_one_failure_costs_nothing(break_isam, name):
     reports = run(backend, data)
     assert BrokenIsam.failed == 1
     assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"
-    # The same measurements and models; what is left is how far ISAM2 lets a variable move before it linearises anew.
+    # The same measurements and models; what is left is how far ISAM2 lets a variable move before it relinearises.
     off = se3.log(se3.inverse(untouched.trajectory().poses) @ backend.trajectory().poses)
     assert np.abs(off).max() < 1e-3
     near_the_truth(backend, data)

@@ -1,4 +1,4 @@
-"""A camera that has lost its way is seated anew among the landmarks, by the smoother itself and without a guess."""
+"""A camera that has lost its way is seated again among the landmarks, by the smoother itself and without a guess."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_same_bytes_whatever_the_threads(options):
 def test_nothing_to_see():
     frontend = SurfFrontend(RIG)
     assert len(frontend.extract(StereoFrame(0, 0.0, BLACK, BLACK))) == 0
-    # The next image does not suffer from it: D_threshold is found anew at once.
+    # The next image does not suffer from it: D_threshold is found again at once.
     assert len(frontend.extract(StereoFrame(1, 0.1, LEFT, RIGHT))) > 100
     assert not SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, BLACK)).has_stereo.any()
 

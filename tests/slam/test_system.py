@@ -146,7 +146,7 @@ def test_a_long_blackout_keeps_the_map(backend):
     system, results, truth = run(backend, frames=45, change=nothing_at(*range(12, 32)))
     before, after = results[11][0], results[32][0]
     assert after.map_size >= before.map_size
-    assert np.isin(after.matched, before.matched).mean() > 0.5  # recognised, not made anew
+    assert np.isin(after.matched, before.matched).mean() > 0.5  # recognised, not rebuilt
     assert np.linalg.norm(system.trajectory().positions[-1] - truth[-1, :3, 3]) < 0.012
 
 

@@ -55,7 +55,7 @@ class Keyframe:
         return len(self.points)
 
     def corrected(self, correction: Correction | None, rig: StereoRig) -> Keyframe:
-        """The same keyframe, its points triangulated anew with the present correction of the rectified rig's error."""
+        """The same keyframe, its points triangulated again with the present correction of the rectified rig's error."""
         if self.correction is None or correction is None or self.correction is correction:
             return self
         pixels, _ = rig.project_stereo(self.points.astype(float), jacobian=False)

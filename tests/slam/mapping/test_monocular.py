@@ -42,7 +42,7 @@ def test_without_noise_the_points_are_exact(rig):
 
 
 def test_the_covariance_fits_the_errors():
-    """Pixel noise and an uncertain motion, drawn anew each time: squared distances as χ² with three degrees."""
+    """Pixel noise and an uncertain motion, drawn again each time: squared distances as χ² with three degrees."""
     rng, distances, misfits = np.random.default_rng(1), [], []
     for _ in range(300):
         motion = np.linalg.cholesky(NOISE) @ rng.standard_normal(6)

@@ -57,8 +57,8 @@ def seen_from(poses: Array, local: Array, seed: int) -> Array:
 def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
     """A settled body with these poses whose members are these rows."""
     body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    body = replace(body, T=poses[SLOT], history=poses, seen=50, proved=True)
-    membership.enter(body, tracks, members, sure=True)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, confirmed=True)
+    membership.add_members(body, tracks, members, sure=True)
     return with_extent(body, tracks.local[members])
 
 
@@ -83,13 +83,13 @@ def test_a_part_that_turns_otherwise_leaves_and_comes_back_only_on_proof() -> No
     seen = np.concatenate([seen_from(poses, local[:12], 2), seen_from(path(LID), local[12:], 3)])
     tracks = table(seen)
     body = body_along(poses, np.arange(16), tracks)
-    gains = membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    gains = membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     lid = np.arange(12, 16)
     assert (tracks.body[:12] == 1).all()
     assert (tracks.body[lid] == -1).all() and tracks.expelled[lid].all()
     assert len(gains[1]) == 12
     record(tracks, lid, SLOT, seen[lid, SLOT], np.broadcast_to(np.eye(3) / SIGMA**2, (4, 3, 3)), np.full(4, 3, np.int8))
-    membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     assert (tracks.body[lid] == -1).all()
 
 
@@ -102,11 +102,11 @@ def test_a_group_is_part_of_a_body_only_where_it_has_no_motion_of_its_own(veloci
     group = np.arange(10, 16)
     own = new_body(2, path(velocity)[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
     own = membership.fitted(replace(own, history=path(velocity)), tracks, group, SLOT)
-    assert (membership.overlapped({1: whole}, tracks, group, own) is whole) == same
+    assert (membership.body_around({1: whole}, tracks, group, own) is whole) == same
 
 
 def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own() -> None:
-    """An error of the pose that all frames bring anew is taken for the part's motion only where the pose is certain."""
+    """An error of the pose that all frames share is taken for the part's motion only where the pose is certain."""
     local = corners(16, 9)
     true = path(MOVING)
     off = true.copy()
@@ -118,7 +118,7 @@ def test_parts_of_a_body_whose_pose_is_poorly_known_have_no_motion_of_their_own(
     whole = body_along(off, np.arange(10), tracks)
     for sigma, same in ((1e-4, False), (0.01, True)):
         known = replace(whole, covariance=sigma**2 * np.eye(6))
-        assert (membership.overlapped({1: known}, tracks, group, own) is known) == same
+        assert (membership.body_around({1: known}, tracks, group, own) is known) == same
 
 
 def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() -> None:
@@ -140,7 +140,7 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
     grown = detector.bodies[1]
     np.testing.assert_allclose(grown.T, more.T)
     np.testing.assert_allclose(grown.history, more.history)
-    assert grown.estimate is None and grown.refused == 0  # the back end begins anew with it
+    assert grown.estimate is None and grown.refused == 0  # the back end begins again with it
     np.testing.assert_allclose(transform(more.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
@@ -153,8 +153,8 @@ def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, on
     few = body_along(path(other), np.arange(4), tracks, id=1)
     more = body_along(path(MOVING), np.arange(4, 12), tracks, id=2)
     theirs, mine = np.arange(4), np.arange(4, 12)
-    assert membership.goes_with(more, tracks, theirs)
-    assert membership.part_of(more, mine, tracks, theirs, few) == one
+    assert membership.moves_with(more, tracks, theirs)
+    assert membership.is_part_of(more, mine, tracks, theirs, few) == one
     none = np.zeros(0, np.int64)
     believed = ObjectEstimate(2, 0.0, more.T, np.eye(6), MOVING, np.eye(6), True, none, none)
     detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
@@ -175,8 +175,8 @@ def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
         new = new_body(
             2, body.middle + shift * np.array([1.0, 0, 0]), np.array([0, 0, 0, velocity, 0, 0]), TIMES, 0.0, 0.1
         )
-        assert (membership.returned({1: body}, new) is body) == same
-        assert membership.returned({1: replace(body, measured=True)}, new) is None
+        assert (membership.reappeared({1: body}, new) is body) == same
+        assert membership.reappeared({1: replace(body, measured=True)}, new) is None
     again = continued(new_body(2, body.middle, MOVING, TIMES, 0.0, 0.1), body)
     assert again.id == 1
     frame = again.T @ again.T_body_estimate
@@ -190,10 +190,10 @@ def test_poses_fitted_to_still_points_prove_nothing() -> None:
         tracks = table(seen_from(STILL, corners(6, seed) + AHEAD, 100 + seed))
         body = new_body(1, AHEAD, np.zeros(6), TIMES, 0.0, 0.0)
         body = membership.fitted(body, tracks, np.arange(6), SLOT)
-        membership.enter(body, tracks, np.arange(6), sure=True)
-        gain = membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1]
-        kept = membership.proved(body, gain)
-        proofs.append(kept is not None and kept.proved)
+        membership.add_members(body, tracks, np.arange(6), sure=True)
+        gain = membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1]
+        kept = membership.confirmed(body, gain)
+        proofs.append(kept is not None and kept.confirmed)
     assert sum(proofs) <= 1  # 5 % of the bodies
 
 
@@ -201,9 +201,9 @@ def test_poses_fitted_to_moving_points_prove_a_body() -> None:
     tracks = table(seen_from(path(MOVING), corners(6, 7), 8))
     body = new_body(1, AHEAD, MOVING, TIMES, 0.0, 0.0)
     body = membership.fitted(body, tracks, np.arange(6), SLOT)
-    membership.enter(body, tracks, np.arange(6), sure=True)
-    kept = membership.proved(body, membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1])
-    assert kept is not None and kept.proved
+    membership.add_members(body, tracks, np.arange(6), sure=True)
+    kept = membership.confirmed(body, membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1])
+    assert kept is not None and kept.confirmed
 
 
 def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
@@ -212,5 +212,5 @@ def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:
     still = np.tile(path(MOVING)[SLOT], (WINDOW, 1, 1))
     tracks = table(seen_from(still, local, 10))
     body = body_along(still, np.arange(8), tracks)
-    membership.regroup({1: body}, {1}, tracks, SLOT, ObjectsConfig())
+    membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())
     assert tracks.sure[:8].all() and not tracks.sure[8]

@@ -36,7 +36,7 @@ def scene(seen, off, rng):
     rows = tracks.begin(np.arange(seen), features, np.arange(seen), transform(T, POINTS[:seen]))
     body = new_body(1, T[:3, 3], np.zeros(6), np.zeros(WINDOW), 0.0, 2.0)
     body = with_extent(replace(body, covariance=np.diag([0.05**2] * 3 + [0.5**2] * 3)), POINTS)
-    membership.enter(body, tracks, rows)
+    membership.add_members(body, tracks, rows)
     tracks.local[rows], tracks.local_information[rows] = POINTS[:seen], 1e4 * np.eye(3)
     return body, tracks, features, truth
 

@@ -105,7 +105,7 @@ def test_carried_off_to_a_known_place(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
-    """The way it was carried is no motion: the back end begins anew in the map, and the path keeps every frame."""
+    """The way it was carried is no motion: the back end begins again in the map, and the path keeps every frame."""
     jump = se3.exp(np.array([0, 0.3, 0, 0.4, 0, 0.2]))
     poses = [*path(25), *(T @ jump for T in path(60)[25:])]
     system, results, points = run(backend, poses)

@@ -43,7 +43,7 @@ class Run:
 
     @property
     def begins(self) -> int:
-        """The frame in which the map begins anew."""
+        """The frame in which the map begins again."""
         (frame,) = self.system.restarted
         return frame
 

@@ -18,7 +18,7 @@ from slam.objects.points import compact
 from slam.objects.tracks import Tracks, constant_velocity
 from slam.objects.twists import fit_twist
 
-_ROUNDS = 3  # of leaving out what rather stands still, and fitting anew
+_ROUNDS = 3  # of leaving out what rather stands still, and fitting again
 _FAR = 3.0  # so many times the median distance from the median point is no part of a new body
 
 
@@ -38,7 +38,7 @@ class MovingGroup(NamedTuple):
     covariance: Array
 
 
-class Founding(NamedTuple):
+class BodyInitializer(NamedTuple):
     """Founds bodies in one frame.
 
     Attributes:
@@ -70,7 +70,7 @@ class Founding(NamedTuple):
             group = self._group(tracks, members)
             if not self.resolves(group.centre):
                 return None  # what stands still beside it could not be told from it
-            moves = membership.verdict(self.body(0, tracks, group), tracks, members).gain > 0
+            moves = membership.membership_test(self.body(0, tracks, group), tracks, members).gain > 0
             if moves.all():
                 return group
             members = members[moves]  # what lies among them and rather stands still slows them down
