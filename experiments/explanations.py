@@ -139,8 +139,8 @@ OF_ONE = {
         "landmarks": "with four measurements or more",
         "life, median [frames]": "number of measurements of these",
         "after 1": (
-            "change of uL's error over one frame, over √2 [px], as in the four columns that follow over so many: the same "
-            "in all if errors are independent"
+            "change of uL's error over one frame, over √2 [px]; the four columns that follow: over so many. The "
+            "same in all if errors are independent"
         ),
         "residual [px]": "root mean square error about the landmark that fits best",
         "pixel_sigma [px]": "of the models, as if errors were independent",

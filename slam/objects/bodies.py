@@ -49,13 +49,13 @@ class Body:
         measured: whether it was in this frame.
         moving: whether it moves now.
         confirmed: whether it has moved for certain.
-        alike: for how many frames it has gone with an older body as if it were a part of that.
+        alike: number of frames in which it moved as an older body did, as a part of that would.
         age: number of frames since it was found.
-        existence: probability that it exists.
-        refused: number of frames running in which the back end did not use what was measured of it.
+        existence: probability that it exists, see `slam.objects.existence`.
+        refused: number of successive frames in which the back end rejected all its measurements.
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
-        apart_from: id of the body as whose part it was found, which moves otherwise; None where there is none.
+        apart_from: id of the body of which it is a part with a motion of its own; None for none.
         distinct: ids of bodies that it is known not to be a part of.
         estimate: of the back end; None where there is none yet.
     """
@@ -137,7 +137,7 @@ def new_body(
 
 
 def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
-    """The body moved on evenly over `dt` [s] to the next frame, not measured yet.
+    """The body predicted over `dt` [s] with constant velocity, not measured yet.
 
     Impulses on its velocities, of the variances that the motion model gives, add `dt` times themselves to the pose.
     """
@@ -155,11 +155,10 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
 
 
 def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:
-    """The body with the back end's belief taken over.
+    """The body with the back end's estimate.
 
-    A measured body stays where its points were located: the back end has a frame of its own for it, and points of its
-    own. One that was not measured goes where the back end's goes, once that has measured it often enough to know how
-    fast it is.
+    A measured body keeps the pose that was fitted to its points here, as the back end has a body frame and points of
+    its own. A body that was not measured moves as the back end predicts, once its velocity is well known there.
     """
     before = estimate if body.estimate is None else body.estimate
     found = estimate.T_world_object if body.estimate is None else body.T_found
@@ -200,10 +199,10 @@ def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
 
 
 def continued(body: Body, known: Body) -> Body:
-    """A body found again that was known in part: with its id and what has been learnt of its existence.
+    """A new body that turns out to be a known one: it takes over that one's id and probability of existence.
 
-    The back end estimates it again; its frame for it goes on as predicted, but for a shift from what was seen of it to
-    what is now.
+    The back end's estimate of it starts again. Its body frame stays as predicted, but for a shift from the part seen
+    before to the part seen now.
     """
     shift = np.eye(4)
     shift[:3, 3] = body.middle - known.middle
@@ -248,7 +247,7 @@ def outermost(points: Array) -> tuple[Array, Array]:
 
 
 def in_body_axes(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> tuple[Array, Array, BoolArray]:
-    """What tracks measured, in the body's coordinates: points, information, both by slot.
+    """What tracks measured in each slot of the window, in the body's coordinates.
 
     Returns:
         points (N, W, 3) in body coordinates, information (N, W, 3, 3), and whether there is any (N, W).

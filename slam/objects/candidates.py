@@ -1,7 +1,7 @@
 """Regions that may be a moving body: neighbouring tracks with agreeing velocities, followed over time.
 
-A body of which few tracks are seen at a time, and each for a few frames only (a cyclist, a car far off), never brings
-together as many long tracks as `slam.objects.regions` asks for. Here the region is followed instead of its tracks:
+A body that shows few tracks at a time, and each for a few frames only (a cyclist, a distant car), never has as many
+long tracks as `slam.objects.regions` needs. Here the region is followed instead of its tracks:
 tracks come and go, the region's place and velocity stay in a Kalman filter with constant velocity. A region that is
 followed over more than its own size, supported all the way by tracks that move as it does, and contradicted by few
 inside it, cannot be still: where velocities are wrong (false matches, depth noise) the region walks away from the
@@ -94,9 +94,9 @@ class MovingTracks:
 
     @cached_property
     def stacked(self) -> tuple[Array, Array, Array, Array]:
-        """What those that move say of a region: information (N, 3, 3) on its place and on its velocity, and vectors.
+        """Measurements of a region by moving tracks: information (N, 3, 3) on position and velocity, and vectors.
 
-        The vectors (N, 3) are these times place and velocity. All are NaN for those that do not move.
+        The vectors (N, 3) are the information times position and velocity. All are NaN for those that do not move.
         """
         m, rows = self.motion, np.flatnonzero(self.moves)
         out = []
@@ -246,7 +246,7 @@ def _claimed(regions: _Regions, tracks: MovingTracks, moving: NDArray[np.intp]) 
 
 
 def _supported(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp], mine: BoolArray) -> list[Candidate]:
-    """The regions after tracks, of each a row of `mine` (C, M), have corrected them, and those inside are counted."""
+    """The regions corrected by the tracks that support them (`mine`, (C, M)), with those inside counted."""
     after = _corrected(before, tracks, moving, mine)
     inside = after.near(tracks, _ALL, tracks.spread)
     which, within = np.nonzero(inside)
@@ -317,7 +317,7 @@ def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
 
 
 def _share(count: Any) -> Any:
-    """By how much less velocities, so many, say together: they share a window with the last frame's, and a camera's."""
+    """Factor on the information of so many velocities: they share errors with the last frame's, and with each other."""
     return _OVERLAP * np.sqrt(count)
 
 

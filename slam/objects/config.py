@@ -19,26 +19,25 @@ class ObjectsConfig:
         mode: ``"detect"`` finds moving bodies without being told; ``"procedure1"`` is the papers' detector with a
             database of known features (paper B, 3); ``"off"``.
         window: number of frames over which a feature is classified.
-        patience: a track that belongs to no body is given up after so many frames without a match.
-        max_speed: no point of a body is faster [m/s]; bounds the search for features that are not where a still point
-            would be.
-        min_speed: no body is taken for moving that is slower [m/s].
+        patience: number of frames without a match after which a track that belongs to no body is dropped.
+        max_speed: largest speed of a point of a body [m/s]; bounds the search for moving features.
+        min_speed: slower bodies are not detected [m/s].
         search_radius, search_limit: least and largest half size of the search windows of tracks [px].
         d_match: largest descriptor distance in the search windows.
         ratio: largest ratio of the best to the second best descriptor distance.
         wide_d_match, wide_ratio: as `d_match` and `ratio`, for features far from where a still point would be.
-        min_frames: a feature is classified from so many measurements on.
-        doubtful: χ²(3) of a track's displacement from which it becomes no landmark.
-        suspect: χ²(6) of a large cluster's motion against the rest of the scene's from which its landmarks measure the
-            camera no more.
-        group_test: the same χ²(6) from which a large cluster moves; of small clusters more is asked for.
-        min_support: features that must move alike before a body is made of them.
-        confirm: frames for which they must move alike, less those in which they did not; one feature may be newer.
+        min_frames: number of measurements from which on a feature is classified.
+        doubtful: χ²(3) of a track's displacement above which it does not become a landmark.
+        suspect: χ²(6) of a large group's motion relative to the rest of the scene above which its landmarks are not
+            used to measure the camera's pose.
+        group_test: the same χ²(6) above which a large group moves; it is higher for small groups.
+        min_support: fewest features with a common motion that make a body.
+        confirm: number of frames with that common motion, less those without; one of the features may be newer.
         max_points: most points kept of a body.
-        forget_after: a body not seen for so long is forgotten [s].
-        report_unmeasured: a body is reported for so long after it was last measured [s].
-        unmeasured_share: a body is reported as not measured in no more frames than this share of those in which it was
-            reported as measured.
+        forget_after: time after which an unseen body is forgotten [s].
+        report_unmeasured: time for which a body is still reported after its last measurement [s].
+        unmeasured_share: most frames in which a body is reported without being measured, as a share of those in which
+            it was measured.
         database: file of the object's features for ``"procedure1"``, see `slam.objects.procedure1`.
         least_side: of the triangle of features in ``"procedure1"``, its shortest side [m].
         least_sine: of the triangle of features in ``"procedure1"``, the least sine of its angles.

@@ -154,7 +154,7 @@ class MovingObjectDetector:
     # ------------------------------------------------------------------------------------------- measuring
 
     def _measure(self, tracks: Tracks, features: StereoFeatures, local: Array, T_world_left: Array) -> None:
-        """Find the bodies by their members, and enter this frame's pixels into the tracks, in world coordinates."""
+        """Locate the bodies by their members, and add this frame's measurements to the tracks, in world coordinates."""
         c = self.config
         for body in list(self.bodies.values()):
             located = locate(body, tracks, features, local, T_world_left, self.rig, self.sigma, c, self._frame)
@@ -215,9 +215,9 @@ class MovingObjectDetector:
         self.suspects = suspected[suspected >= 0]
 
     def _found(self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None) -> None:
-        """Make a body of tracks with a common twist, or let them join the one that they belong to.
+        """Make a body of tracks with a common twist, or add them to the body that they belong to.
 
-        They may be a part of the body `whole` that moves otherwise: then they do not join that one.
+        If they are a part of the body `whole` with a motion of its own, they are not added to that one.
         """
         tracks, members = self.tracks, group.members
         assert tracks is not None
@@ -234,9 +234,9 @@ class MovingObjectDetector:
         membership.add_members(body, tracks, members, sure=True)
 
     def _again(self, body: Body, whole: int | None) -> Body:
-        """A new body, or in its place the one out of view that it is: that keeps its id, but not its points.
+        """A new body, or a known one that was out of view and reappears: that keeps its id, but not its points.
 
-        A part of the body `whole` can only be what was a part of that before.
+        A part of the body `whole` is compared with earlier parts of that body only.
         """
         tracks, known = self.tracks, None
         assert tracks is not None
@@ -250,7 +250,7 @@ class MovingObjectDetector:
         return continued(body, known)
 
     def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
-        """A new body, or in its place the one of which it shows more: that keeps its id, and its members go over."""
+        """A new body, or a known one that is a part of it: then it keeps that one's id and takes over its members."""
         tracks = self.tracks
         assert tracks is not None
         for known in self.bodies.values():
@@ -299,7 +299,7 @@ class MovingObjectDetector:
         return np.asarray(R @ J @ self._pose_covariance @ J.T @ R.T)
 
     def _change_members(self, initializer: BodyInitializer) -> None:
-        """Tracks that go with a body join it, those that do not leave it; what does not move is no body."""
+        """Update the bodies' members; bodies that do not move are dropped."""
         tracks = self.tracks
         assert tracks is not None
         measured = {body.id: body for body in self.bodies.values() if body.measured}
@@ -320,10 +320,10 @@ class MovingObjectDetector:
         self._merge()
 
     def _merge(self) -> None:
-        """A body whose members go with an older one is a part of that: at once while young, later only after a while.
+        """Merge bodies that move as an older one does: young ones at once, others only if that lasts.
 
-        The parts of an articulated one go together now and then. An older body of which fewer members are seen may be
-        the part as well.
+        It has to last because the parts of an articulated body move alike now and then. If fewer members of the older
+        body are seen, that one is merged into the younger.
         """
         tracks = self.tracks
         assert tracks is not None
@@ -345,7 +345,7 @@ class MovingObjectDetector:
                     self._outgrow(body, len(mine), older)
 
     def _outgrow(self, body: Body, count: int, older: Mapping[int, Body]) -> None:
-        """Let a young body, of which `count` members are seen, take the place of an older one that moves alike."""
+        """Let a young body, of which `count` members are seen, replace an older one with the same motion."""
         tracks = self.tracks
         assert tracks is not None
         for known in older.values():

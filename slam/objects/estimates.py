@@ -90,9 +90,9 @@ def _restarted(
     bodies: dict[int, Body], backend: ObjectBackend, estimates: list[ObjectEstimate],
     observations: list[ObjectObservations],
 ) -> list[ObjectEstimate]:  # fmt: skip
-    """The estimates; bodies of which nothing was used, though their points agree here, restart under their id.
+    """The estimates, with bodies restarted whose measurements were all rejected although their points agree here.
 
-    They bring the velocity that they had: what was wrong is where the back end has their points.
+    They keep id and velocity: what was wrong are the back end's points.
     """
     refused = {e.id for e in estimates if not e.measured}
     again = [o for o in observations if o.id in refused and o.has_stereo.sum() >= MINIMAL_POINTS]
@@ -119,7 +119,7 @@ def _observations(body: Body, tracks: Tracks, features: StereoFeatures) -> Objec
 def _enclosing(points: Array) -> Array:
     """Lower and upper corner (2, 3) of a box about points (K, 3), false ones among them left out.
 
-    What the outermost percentiles cut off points that are spread evenly is added again, up to the last point.
+    The percentiles are widened by what they cut off evenly spread points, at most to the outermost point.
     """
     lower, upper = outermost(points)
     more = CUT / (1.0 - 2.0 * CUT) * (upper - lower)

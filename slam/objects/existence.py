@@ -1,8 +1,8 @@
 """How sure it is that a body exists, from the frames in which it was measured and those in which it was not.
 
 The recursion of integrated probabilistic data association (Mušicki, Evans and Stanković, IEEE Transactions on Automatic
-Control 39, 1994). That a body is measured says the more, the better its motion explains its points than a still world
-does.
+Control 39, 1994). A measurement counts the more, the better the body's motion explains its points compared with a still
+world.
 """
 
 from __future__ import annotations

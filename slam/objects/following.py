@@ -37,16 +37,15 @@ def follow(
 ) -> None:
     """Find each track's feature in this frame; sets rows, descriptors and misses, in place.
 
-    Members of bodies take over the descriptor of their feature also where `slam.objects.recovery.locate` does not
-    confirm it afterwards: it is the body's pose that is wrong more often than the match. Those of a body that was not
-    measured in the last frame do not: out of sight, they would come to look like what hides it.
+    Members of bodies take over their feature's descriptor even if `slam.objects.recovery.locate` does not confirm the
+    match afterwards, because the body's pose is wrong more often than the match. Members of a body that was not
+    measured in the last frame keep theirs: otherwise they would take over descriptors of what occludes the body.
 
     Tracks are looked for where their fit (or their body's motion) says, in windows as wide as that is uncertain. What
     is left, and was not known for long enough to have a velocity, is looked for where the body or the candidate takes
     it on which it lies, and then as far as `max_speed` allows.
-    Members of a body that was not measured in the last frame have no claim: a free track may follow their feature, too,
-    until the body is located. Else a body that has turned out of sight hides from the detector what is newly seen of
-    it.
+    Features matched with members of a body that was not measured in the last frame stay available to free tracks until
+    the body is located. Otherwise nothing that newly comes into view of such a body would be detected.
     `measured` are the features' points in camera coordinates (N, 3), NaN where there is no depth.
     """
     tracks.row[:] = -1

@@ -1,4 +1,4 @@
-"""What a new body is founded on: tracks that lie together and share a twist that standing still does not explain."""
+"""Initialization of bodies: from tracks that lie together and share a twist that a still scene does not explain."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class MovingGroup(NamedTuple):
 
 
 class BodyInitializer(NamedTuple):
-    """Founds bodies in one frame.
+    """Initializes bodies in one frame.
 
     Attributes:
         rig: the cameras.
@@ -94,7 +94,7 @@ class BodyInitializer(NamedTuple):
         return membership.fitted(body, tracks, group.members, self.slot)
 
     def resolves(self, place: Array) -> bool:
-        """Whether the noise of a depth is less than the region that a body at a place (3,) may fill."""
+        """Whether the noise of a measured depth at a place (3,) is less than the size of a body there."""
         depth = float(np.linalg.norm(place - self.eye))
         return bool(self.depth_noise(depth) < region_radius(depth, self.config.size))
 

@@ -16,11 +16,11 @@ _STEPS = 4  # numerics: of Gauss-Newton at most
 def measure(
     rig: StereoRig, T_world_left: Array, points: Array, measured: Array, sigma: float
 ) -> tuple[Array, Array, NDArray[np.int8]]:
-    """Points (N, 3) that the pixels say, their information (N, 3, 3), and how many numbers each rests on (N,).
+    """Points (N, 3) measured by pixels, their information (N, 3, 3), and the number of measured values of each (N,).
 
     Each is linearised on the measured ray, at the depth of the expected point: so the left pixel is met exactly, and
     the depth is linear in the disparity and therefore free of bias; only where the expected point is far off, at the
-    measured depth. Rows whose uR is NaN know nothing along the ray; rows that cannot be used have no information.
+    measured depth. Rows whose uR is NaN have no information along the ray; unusable rows have none at all.
 
     Args:
         rig: the cameras.

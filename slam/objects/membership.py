@@ -1,7 +1,7 @@
-"""Which tracks belong to a body: who founds it, who joins, who leaves, and which features lie on it.
+"""Which tracks belong to a body, and which features lie on it.
 
-What a track measured is held against two fixed points: one in the world, and one in the body. The difference of the
-two χ² over the window says which of them it is.
+A track's measurements are compared with a fixed point in the world and with a fixed point in the body. The difference
+of the two χ² over the window, a log-likelihood ratio, decides.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
 
 @dataclass(frozen=True)
 class MembershipTest:
-    """How tracks go with a body, a row each.
+    """How well tracks fit a body, a row each.
 
     Attributes:
         gain: by how much χ² the body explains them better than the still world (N,).
@@ -72,7 +72,7 @@ class MembershipTest:
 
 
 def membership_test(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> MembershipTest:
-    """How tracks go with a body and with the still world, over the window."""
+    """Compare the fit of tracks to a body with that to the still world, over the window."""
     t = tracks
     fixed, still, numbers, count = squares_of_both(t.A, t.p, t.dof, t.anchor, rows, body.history, body.known)
     limit = _limits(3 * t.dof.shape[1])[np.maximum(numbers - 3, 1)]
@@ -120,7 +120,7 @@ def add_members(body: Body, tracks: Tracks, rows: NDArray[np.intp], sure: bool =
 
 
 def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
-    """Make members free tracks again, in place; they must show again how they move."""
+    """Make members free tracks without measurements, in place."""
     if not len(rows):
         return
     tracks.position[rows] = transform(body.T, tracks.local[rows])
@@ -129,7 +129,7 @@ def remove_members(tracks: Tracks, rows: NDArray[np.intp], body: Body) -> None:
 
 
 def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
-    """Make seen members free tracks, in place, tested by what they have measured so far."""
+    """Make seen members free tracks that keep their measurements, in place."""
     tracks.body[rows], tracks.misfit[rows], tracks.streak[rows], tracks.expelled[rows] = -1, 0, 0, True
     fit_positions(tracks, rows)
 
@@ -137,10 +137,10 @@ def _release(tracks: Tracks, rows: NDArray[np.intp]) -> None:
 def update_members(
     bodies: Mapping[int, Body], resolved: Set[int], tracks: Tracks, slot: int, config: ObjectsConfig
 ) -> dict[int, Array]:
-    """Tracks that go with a body join it, those that do not leave it, in place.
+    """Add the tracks that fit a body to its members, and remove those that do not, in place.
 
-    What lies inside a body joins without proof where the body is `resolved`: farther off, all that is around it seems
-    to lie inside.
+    Inside a `resolved` body no proof of motion is needed. For bodies farther away depth noise is larger than the body,
+    so that all around it seems to lie inside.
 
     Returns:
         by body, by how much χ² it explains its seen members better than the still world (K,).
@@ -181,9 +181,9 @@ def _gain_of_joining(body: Body, resolved: bool, tracks: Tracks, rows: NDArray[n
 
 
 def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
-    """Members that do not go with the body leave it, in place; the gain of those that are seen and stay (K,).
+    """Remove members that do not fit the body, in place; returns the gain of the seen ones that stay (K,).
 
-    It is the `MembershipTest.gain` less what the body's poses, fitted to its members, would gain by chance.
+    That is the `MembershipTest.gain` less what the body's poses, fitted to its members, gain by chance.
     """
     mine = np.flatnonzero(tracks.body == body.id)
     v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
@@ -215,8 +215,8 @@ def tracks_on_bodies(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
 
-    What lies inside a body's extent lies on it, unless it is known to stand still. All that lies on a body which is not
-    confirmed yet only may.
+    A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not confirmed
+    yet belong to the second group.
     """
     certain = np.isin(tracks.body, [body.id for body in bodies.values() if body.confirmed])
     on, near = tracks.seen & certain, tracks.seen & (tracks.body >= 0) & ~certain
@@ -284,15 +284,15 @@ def _spread_of_place(body: Body, y: Array) -> Array:
 
 
 def with_reach(body: Body, tracks: Tracks, rows: NDArray[np.intp]) -> Body:
-    """The body known to reach as far as tracks that have moved with it."""
+    """The body with a reach that includes tracks that have moved with it."""
     away = np.linalg.norm(tracks.position[rows] - body.T[:3, 3], axis=1)
     return replace(body, reach=max(body.reach, float(away.max(initial=0.0))))
 
 
 def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
-    """The body out of view that a new one is by its place and its velocity, perhaps seen from another side; else None.
+    """The body out of view that a new one is, by position and velocity, perhaps seen from another side; else None.
 
-    Where the middle of what is seen lies in the body is known to within the body's half.
+    The middle of the part that is seen may be off the body's middle by half its size.
     """
     best, least = None, _RETURNED
     for body in bodies.values():
@@ -315,10 +315,10 @@ def is_part_of(whole: Body, theirs: NDArray[np.intp], tracks: Tracks, rows: NDAr
 
 
 def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
-    """Whether the members `rows` of another body, near this one, have moved about as it has all the time.
+    """Whether the members `rows` of another body, near this one, have moved with it all the time.
 
-    Much more is asked for than of `body_around`: of what the still world leaves unexplained, next to nothing may be
-    left.
+    The test is much stricter than that of `body_around`: nearly all that the still world leaves unexplained must be
+    explained.
     """
     near = _distances(replace(whole, reach=np.inf), tracks, rows, _PART) < _NEAR
     if not len(rows) or 2 * near.sum() <= len(rows):
@@ -331,10 +331,9 @@ def moves_with(whole: Body, tracks: Tracks, rows: NDArray[np.intp]) -> bool:
 def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray[np.intp], tracks: Tracks) -> float:
     """How far tracks of two bodies are from having moved like one rigid body; from 1 on they have not.
 
-    By the χ² that the poses of one body for all tracks leave more than those of two bodies, in the frames that both are
-    known in: as a share of what it is by chance (99 %), and of what it is where the motions differ by `_UNLIKE` of the
-    motion itself. The lesser one counts: errors of stereo are alike in successive frames, so chance alone is no measure
-    for a fast body.
+    It is the increase of χ² if all tracks share the poses of one body, in the frames in which both bodies are known,
+    relative to the larger of two limits: the increase by chance (99 %), and that by motions that differ by the share
+    `_UNLIKE`. The second is needed for fast bodies, because errors of stereo are correlated over successive frames.
     """
     both = one.known & other.known
     one, other = replace(one, known=both), replace(other, known=both)
@@ -350,7 +349,7 @@ def distinctness(one: Body, ones: NDArray[np.intp], other: Body, others: NDArray
 
 
 def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.intp], own: Body) -> Body | None:
-    """The measured body of which tracks are a part, if it has more of them that are seen; else None.
+    """The measured body of which tracks are a part, if it has more seen members than they are; else None.
 
     `own` is a body made of them alone.
     """
@@ -362,9 +361,9 @@ def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.
 
 
 def confirmed(body: Body, gain: Array) -> Body | None:
-    """The body, known to have moved once its members say so; None where they say that it stands still and always did.
+    """The body, confirmed once its members show that it has moved; None if they show that it never did.
 
-    A young one may lose what it seemed to be.
+    A body that is confirmed and older than `_PROBATION` stays so.
 
     Args:
         body: the body.

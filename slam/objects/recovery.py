@@ -146,8 +146,8 @@ def _by_descriptors(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:  # fmt: skip
     """Members matched by descriptor, and the features' rows, no farther off than the body can have gone.
 
-    A body that may be anywhere has been out of view for long and looks otherwise: more is tried, and the fit decides.
-    Free tracks have no claim to their features: where the body was out of view, they follow its points.
+    For a body whose position is unknown, because it was out of view for long, weaker matches are accepted, and the fit
+    decides. Features of free tracks may be matched, too: such tracks may have started on the body's points.
     """
     taken = np.zeros(len(features), bool)
     taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True

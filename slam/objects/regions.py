@@ -8,8 +8,8 @@ says and the one that the rest says are compared with the covariance of both,
 
     (ξ_w − ξ_r)ᵀ (Λ_w⁻¹ + Λ_r⁻¹)⁻¹ (ξ_w − ξ_r)  ~  χ²(6),
 
-Λ being sums of ``Jᵀ W J`` over the tracks. It matters where a body is nearer than all else: then it rules the camera's
-pose, the estimate follows it, and it is the still world that seems to move.
+Λ being sums of ``Jᵀ W J`` over the tracks. It matters if a body fills most of the near view: then the camera's
+estimated pose follows the body, and the still world seems to move.
 """
 
 from __future__ import annotations

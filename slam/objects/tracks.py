@@ -45,13 +45,13 @@ class Tracks:
         covariance: of the position (N, 3, 3).
         velocity: of those that a fixed point does not explain (N, 3) [m/s]; zero for the others.
         velocity_covariance: (N, 3, 3), of those that have one.
-        streak: frames in which it was part of a group that moves alike, less those since in which it was not (N,).
+        streak: number of frames in which it was part of a moving group, less those since in which it was not (N,).
         doubtful: not still for certain (N,).
         local: point in the body's coordinates (N, 3), and
         local_information: its information (N, 3, 3).
         misfit: how often lately it disagreed with its body (N,).
-        sure: whether it moved with its body where the still world cannot have (N,).
-        expelled: whether a body's motion did not fit it (N,): it joins one again only on proof.
+        sure: whether its motion with the body is certain (N,).
+        expelled: whether it was removed from a body (N,): then it needs proof of its motion to become a member again.
     """
 
     ids: IdArray
