@@ -232,9 +232,9 @@ class Landmarks:
 
 
 def distant_anchors(points: Array, covariances: Array) -> Array:
-    """Charts (M, 3, 4) for points (M, 3) that are known as Gaussians in the world, by their covariances (M, 3, 3).
+    """Anchor frames (M, 3, 4) of points (M, 3) that are known as Gaussians in the world, by their covariances (M, 3, 3).
 
-    They stand off by so many standard deviations that all coordinates are linear in the position: the Gaussian stays.
+    They are so many standard deviations away that the coordinates are linear in the position: it stays Gaussian.
     """
     anchors = np.tile(np.eye(3, 4), (len(points), 1, 1))
     anchors[:, :, 3] = points

@@ -194,9 +194,11 @@ class TruthNoise:
     """How far a sequence's true poses may be off.
 
     Attributes:
-        rotation: standard deviation of each rotation axis [rad], independent in each pose.
+        rotation: standard deviation of each rotation axis [rad]; how fast this error and that of the translation change
+            is found from the path, see `slam.evaluation.truth_error`.
         translation: the same of each coordinate [m].
-        time: the same of the stamps [s]: a pose is that of a moment before or after.
+        time: the same of the stamps [s]: a pose is that of a moment before or after; independent in each
+            pose.
         mounting: standard deviation of a rotation between the truth's axes and the camera's [rad] that is the same in
             all poses: how the other sensor is mounted, and its own slow errors.
         wheels: the camera is on a vehicle that does not slip sideways, and looks ahead.
