@@ -46,7 +46,7 @@ FIGURES = ("ATE ekf [m]", "ATE smoother [m]", "frames", "lost ekf", "lost smooth
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
-_MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
+MEASURED = (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 Image = np.ndarray
 #: Spoils the two images of a frame.
@@ -192,12 +192,16 @@ def frames_of(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -
         yield replace(frame, left=left, right=right)
 
 
+def features_of(sequence: Drive | Sequence, trial: int) -> int:
+    """How many features the front end is asked for in one trial."""
+    usual = create("surf", sequence.rig, **SystemConfig.for_kind(sequence.kind).frontend).config.features
+    return round(np.random.default_rng([trial, 1]).uniform(1 - _FEATURES, 1 + _FEATURES) * usual)
+
+
 def extracted(sequence: Drive | Sequence, fault: Fault, last: int, trial: int) -> list[StereoFeatures]:
     """Features of one trial, for all back ends."""
-    options = SystemConfig.for_kind(sequence.kind).frontend
-    plain = create("surf", sequence.rig, **options)
-    more = np.random.default_rng([trial, 1]).uniform(1 - _FEATURES, 1 + _FEATURES)
-    frontend = create("surf", sequence.rig, **{**options, "features": round(more * plain.config.features)})
+    options = {**SystemConfig.for_kind(sequence.kind).frontend, "features": features_of(sequence, trial)}
+    frontend = create("surf", sequence.rig, **options)
     return [frontend.extract(frame) for frame in frames_of(sequence, fault, last, trial)]
 
 
@@ -205,7 +209,7 @@ def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str
     """One back end on one trial."""
     system = StereoSlam(sequence.rig, None, backend, config=SystemConfig.for_kind(sequence.kind, "surf", backend))
     results = [system.process_features(one) for one in features]
-    measured = [r.estimate for r in results if r.status in _MEASURED]
+    measured = [r.estimate for r in results if r.status in MEASURED]
     path = Trajectory(np.array([e.stamp for e in measured]), np.array([e.T_world_left for e in measured]))
     ate = evaluate(path, sequence).get("ATE RMSE [m]") if len(measured) > 2 else None
     return Outcome(float("nan") if ate is None else float(ate), len(results), len(results) - len(measured))

@@ -108,6 +108,7 @@ EXPERIMENTS = (
     ),
     Experiment("calibration", "Self-calibration: wrong rigs, and one rig on two drives"),
     Experiment("residuals", "Errors of pixels that last"),
+    Experiment("whole_drives", "Real drives many times over, to their end"),
     Experiment("perturbations", "Real drives many times over, and spoilt"),
     Experiment("real_sequences", "Real sequences"),
 )  # fmt: skip
