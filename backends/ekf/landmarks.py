@@ -232,7 +232,7 @@ class Landmarks:
 
 
 def distant_anchors(points: Array, covariances: Array) -> Array:
-    """Anchor frames (M, 3, 4) of points (M, 3) that are known as Gaussians in the world, by their covariances (M, 3, 3).
+    """Anchor frames (M, 3, 4) of points (M, 3) known as Gaussians in the world, by their covariances (M, 3, 3).
 
     They are so many standard deviations away that the coordinates are linear in the position: it stays Gaussian.
     """
