@@ -272,7 +272,9 @@ class StereoSlam:
         if aligned.features is not features:
             corrected = self.calibration.correct(aligned.features)
         corrected = replace(corrected, images=None)
-        held = self.objects.suspects
+        pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
+        moving = self.objects.newly_moving(corrected, matches.ids, matches.rows, self._positions, pose)
+        held = np.union1d(self.objects.suspects, moving)
         rows = matches.rows[isin(matches.ids, held)]
         return AssociatedFrame(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
 

@@ -124,6 +124,7 @@ class Candidate:
         unseen: number of frames without a track.
         members: rows of the tracks that support it in this frame.
         radius: of the region [m].
+        way: how far its velocity has taken it since (3,) [m].
     """
 
     state: Array
@@ -137,6 +138,7 @@ class Candidate:
     unseen: int = 0
     members: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     radius: float = 0.0
+    way: Array = field(default_factory=lambda: np.zeros(3))
 
     def twist(self, turn: float) -> tuple[Array, Array]:
         """Its twist [ω, v] (6,), and the covariance (6, 6) of it; `turn` [rad/s] is the deviation of ω."""
@@ -147,13 +149,15 @@ class Candidate:
     def may_be_body(self, min_speed: float) -> bool:
         """Whether the region has moved far enough, and is seen well enough in this frame, to found a body.
 
+        Its velocity must have taken it that far: a region can also get there by taking up other still tracks.
+
         Args:
             min_speed: of bodies [m/s].
         """
         enough = len(self.members) >= MINIMAL_POINTS and self.frames >= _FRAMES and len(self.supporters) >= MIN_POINTS
         if not (enough and self.agreeing > _SHARE * (self.agreeing + self.contradicting)):
             return False
-        length = float(np.linalg.norm(self.state[:3] - self.start))
+        length = min(float(np.linalg.norm(self.state[:3] - self.start)), float(np.linalg.norm(self.way)))
         return bool(length > max(2.0 * self.radius, 1e-9) and np.linalg.norm(self.state[3:]) > min_speed)
 
     def is_body(self, min_speed: float, camera: Array) -> bool:
@@ -202,19 +206,24 @@ def follow_candidates(
 
 @dataclass(frozen=True)
 class _Regions:
-    """Candidates whose states (C, 6) with covariances (C, 6, 6) are others now."""
+    """Candidates whose states (C, 6) with covariances (C, 6, 6), and ways (C, 3), are others now."""
 
     candidates: list[Candidate]
     state: Array
     covariance: Array
+    way: Array
 
     def select(self, rows: NDArray[np.intp]) -> _Regions:
         """Some of them."""
-        return _Regions([self.candidates[i] for i in rows.tolist()], self.state[rows], self.covariance[rows])
+        return _Regions(
+            [self.candidates[i] for i in rows.tolist()], self.state[rows], self.covariance[rows], self.way[rows]
+        )
 
     def candidate(self, i: int, **changes: Any) -> Candidate:
         """One of them, with other changes."""
-        return replace(self.candidates[i], state=self.state[i], covariance=self.covariance[i], **changes)
+        return replace(
+            self.candidates[i], state=self.state[i], covariance=self.covariance[i], way=self.way[i], **changes
+        )
 
     def near(self, tracks: MovingTracks, rows: NDArray[np.intp] | slice, places: Array) -> BoolArray:
         """Which tracks lie in each region (C, M), given the covariances (N, 3, 3) of its middle as each sees it."""
@@ -230,11 +239,12 @@ class _Regions:
 def _advanced(candidates: list[Candidate], dt: float, acceleration: float) -> _Regions:
     state = np.array([candidate.state for candidate in candidates])
     P = np.array([candidate.covariance for candidate in candidates])
+    way = np.array([candidate.way for candidate in candidates]) + dt * state[:, 3:]
     state[:, :3] += dt * state[:, 3:]
     P[:, :3] += dt * P[:, 3:]
     P[:, :, :3] += dt * P[:, :, 3:]
     P.reshape(-1, 36)[:, 21::7] += acceleration**2 * dt
-    return _Regions(candidates, state, P)
+    return _Regions(candidates, state, P, way)
 
 
 def _claimed(regions: _Regions, tracks: MovingTracks, moving: NDArray[np.intp]) -> BoolArray:
@@ -284,7 +294,7 @@ def _corrected(before: _Regions, tracks: MovingTracks, moving: NDArray[np.intp],
     vector[:, :3] += weight @ at
     vector[:, 3:] += share[:, None] * (weight @ towards)
     P = np.linalg.inv(information)
-    return _Regions(before.candidates, (P @ vector[:, :, None])[:, :, 0], P)
+    return _Regions(before.candidates, (P @ vector[:, :, None])[:, :, 0], P, before.way)
 
 
 def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:

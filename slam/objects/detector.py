@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
-from slam.geometry.arrays import median
+from slam.geometry.arrays import IndexArray, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend, ObjectBackend
@@ -32,6 +32,7 @@ from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
 from slam.objects.estimates import BodyEstimates
+from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
@@ -66,6 +67,7 @@ class MovingObjectDetector:
         self._stamps = np.full(config.window, np.nan)
         self._poses = np.tile(np.eye(4), (config.window, 1, 1))  # of the left camera in the window's frames
         self._frame = -1
+        self._first = FirstSights.none()
         self._next_track = 0
         self._next_body = 1
         self._forgotten: list[int] = []
@@ -78,13 +80,23 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._candidates = [], []
+        self._forgotten, self._candidates, self._first = [], [], FirstSights.none()
         self._estimates = BodyEstimates(self.config, self.models)
 
     def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
         if self.tracks is not None:
             revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
+
+    def newly_moving(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """See `slam.objects.modes.ObjectDetector`."""
+        if not 0 <= self._frame < self.config.window - 1:
+            return np.zeros(0, np.int64)
+        self._first = self._first.after(ids, places, self._frame)
+        pixels, now = membership.measured(features, rows), self._frame + 1
+        return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
     # ------------------------------------------------------------------------------------------- a step, first part
 

@@ -7,11 +7,14 @@ from typing import Protocol
 import numpy as np
 
 from slam.data import Estimate, IdArray, StereoFeatures
+from slam.geometry.arrays import IndexArray
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects.config import ObjectsConfig
+from slam.objects.first_frames import Places
 from slam.objects.revision import CorrectRows
 
 
@@ -21,6 +24,20 @@ class ObjectDetector(Protocol):
     @property
     def suspects(self) -> IdArray:
         """Ids of landmarks that may move: they do not measure the camera's next pose."""
+        ...
+
+    def newly_moving(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
+
+        Args:
+            features: of the frame, before the back end's update.
+            ids: of the landmarks found in it (K,).
+            rows: of their features (K,).
+            places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
+            T_world_left: the camera's pose (4, 4), as far as it is known.
+        """
         ...
 
     def restart(self) -> None:
@@ -54,6 +71,12 @@ class NoDetector:
     """Takes everything for still."""
 
     suspects: IdArray = np.zeros(0, np.int64)
+
+    def newly_moving(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """None does."""
+        return self.suspects
 
     def restart(self) -> None:
         """There is nothing to forget."""

@@ -18,6 +18,7 @@ from slam.archives import array, unpack
 from slam.data import Estimate, IdArray, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.files import read_bytes, whole_file
+from slam.geometry.arrays import IndexArray
 from slam.geometry.euler import angles
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, log, pose, transform
@@ -25,6 +26,7 @@ from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject, ObjectEstimate
 from slam.objects.config import ObjectsConfig
+from slam.objects.first_frames import Places
 from slam.objects.matching import match_far
 from slam.objects.revision import CorrectRows
 
@@ -254,6 +256,12 @@ class Procedure1Detector:
         self._rows = np.zeros(0, np.intp)
         self._covariance: Array = np.eye(6)
         self._last: tuple[float, Array] | None = None
+
+    def newly_moving(
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
+    ) -> IdArray:
+        """None is known to."""
+        return self.suspects
 
     def restart(self) -> None:
         """The database goes on; the last pose does not."""

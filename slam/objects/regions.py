@@ -14,7 +14,7 @@ estimated pose follows the body, and the still world seems to move.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ _BETTER = 4.0  # by how much χ² a member must fit its group's motion better th
 _BETTER_AROUND = 6.0  # where it lies outside the window
 _EXPLAINED = 0.25  # share of χ² that the common motion may leave: an uneven motion is seen by tracks unevenly
 _TAIL = 3.0  # tracks; see `limit`
-_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3)
+_MEDIAN = chi_square_limit(3, 0.5)  # of χ²(3), and
+_UPPER_QUARTILE = chi_square_limit(3, 0.75)  # its upper quartile
 _SIZES = np.array([[0.1, 0.1, 0.2], [0.2, 0.2, 0.4], [0.4, 0.4, 0.8]])  # of windows: x/z, y/z, logarithm of the depth
 _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in widths of the window
 _MOST = 20  # cost: windows looked into for the next group
@@ -79,7 +80,7 @@ def limit(test: float, size: NDArray[np.intp] | int) -> Array:
     return test * (1.0 + _TAIL / np.maximum(size, 1.0))
 
 
-def classify_scene(moved: Displacements, place: Array, test: float, support: int) -> Scene:
+def classify_scene(moved: Displacements, place: Array, test: float, support: int, least_scale: float = 1.0) -> Scene:
     """Groups that moved on their own, and every track's displacement against the rest.
 
     Args:
@@ -87,6 +88,7 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
         place: where tracks are seen (N, 3): x/z, y/z, and log z.
         test: χ²(6) from which a large group moved; see `limit`.
         support: least number of tracks in a group.
+        least_scale: of χ², by which that of the rest is divided where its median is larger than it should be.
     """
     n = len(moved.d)
     if n < 3 * support:
@@ -97,15 +99,27 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
     groups: list[Group] = []
     while True:
         alone = problem.squares(problem.common_motion(rest))
-        scale = max(1.0, median(alone[rest]) / _MEDIAN)
+        scale = max(least_scale, median(alone[rest]) / _MEDIAN)
         alone = alone / scale
         group = _next_group(problem, windows, place, alone, scale, rest, test, support)
         if group is None:
             return Scene(groups, alone)
-        groups.append(group)
         rest[group.members] = False
+        group = replace(group, test=group.test / tail(alone[rest]))
+        if group.test < limit(test, len(group.members)):  # nor would the next ones pass
+            return Scene(groups, alone)
+        groups.append(group)
         if rest.sum() < n / 3:
             return Scene(groups, alone)
+
+
+def tail(alone: Array) -> float:
+    """How much heavier the tail of tracks' χ²(3) is than it should be, 1 at least.
+
+    The errors of a track last for some frames where a camera goes around what it sees, and those of false tracks are
+    of any size. Where that is so in the whole scene, small groups of such tracks agree by chance.
+    """
+    return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE)
 
 
 def _next_group(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,3 +100,13 @@ def test_tracks_from_everywhere_are_no_region():
     (after, *_) = follow_candidates(candidates, tracks, gap, 2.0)
     away = np.linalg.norm(points - after.state[:3], axis=1)
     assert len(after.members) < 6 and (away[after.members] < 2 * SIZE).all()
+
+
+def test_a_region_that_takes_up_other_still_tracks_has_not_gone_there_by_its_velocity():
+    """It is found 0.3 m farther in every frame, where other tracks are; its velocity takes it half as far."""
+    rng = np.random.default_rng(5)
+    steps = list(run(12, lambda k: np.array([5.0 + 0.3 * k, 0, 20]), np.array([1.5, 0.0, 0.0]), rng))
+    (candidate,) = [c for c in steps[-1] if c.frames == 12]
+    assert np.linalg.norm(candidate.state[:3] - candidate.start) > 2 * candidate.radius
+    assert not candidate.may_be_body(SPEED)
+    assert replace(candidate, way=candidate.state[:3] - candidate.start).may_be_body(SPEED)
