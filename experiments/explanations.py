@@ -79,6 +79,10 @@ OF_ONE = {
         "car": "number in KITTI's labels",
         "speed within 25 m [m/s]": "median while it is nearer than that",
         "GPS distance RMSE [m]": "of the camera's path in the plane from GPS positions",
+        "first frame": "of the recording with which the run begins",
+        "cyclist": "number in KITTI's labels",
+        "frames within 25 m": "in which the middle of the label's bottom is in the image and nearer than that",
+        "not measured [rows]": "rows of objects.csv that are predicted only, of so many rows",
     },
     "consistency": {
         "online [mm]": "RMSE of the newest pose, over the runs",

@@ -5,7 +5,7 @@
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
 paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
-movers), street, people (cyclists, walkers), kitti (two overtaking cars).
+movers), street, people (cyclists, walkers), kitti (two overtaking cars), cyclists (KITTI raw 0001, several starts).
 Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
 they give noisy observations without images.
 """
@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
 from experiments.common import script_options
-from experiments.labelled_cars import Labels, hidden, labelled_speed, nearest_car, read_labels
+from experiments.labelled_cars import Car, Labels, hidden, labelled_speed, nearest_car, read_labels, read_tracklets
 from experiments.object_runs import (
     body_row,
     camera_figures,
@@ -43,22 +43,28 @@ from slam.compare.statistics import difference
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.summary import evaluate
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, rotation_angle
+from slam.object_data import MovingObject
 from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother")
-PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti")
+PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti", "cyclists")
 TITLES = {
     "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
     "paired": "Both back ends on the same measurements", "boxes": "Four boxes", "occlusion": "The box is hidden",
     "still": "Nothing moves", "street": "A street", "people": "People", "kitti": "Cars of KITTI raw 0013",
+    "cyclists": "Cyclists of KITTI raw 0001",
 }  # fmt: skip
 # The box moves in frames 60 to 105: from which frame it is watched, when it vanishes, and for how many frames.
 WATCHED_FROM, HIDDEN_AT, HIDDEN_FOR, WATCHED_AFTER = 50, 85, (15, 60), 15
 PLACES_AT = (1.0, 5.0, 8.5, 12.0)  # when the box has stood at B0 to B3 for a while [s]
 KITTI = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
 MOVING_CARS = (0, 1, 5)  # two that overtake, and a van that comes towards the camera
+CYCLISTS = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
+STARTS = (0, 3, 5, 8)  # first frames of its runs: one run tells little of what has few features
+NEAR = 25.0  # objects nearer than this are judged [m]
 
 
 # ------------------------------------------------------------------------------------------- the parts
@@ -247,10 +253,8 @@ def people(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
 
 def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Two cars overtake, a van comes; parked cars must not be made objects."""
-    data = os.environ.get("SLAM_DATA")
-    folder = Path(data or "") / KITTI
-    if not data or not folder.is_dir():
-        print("kitti: set SLAM_DATA to the folder that holds it; left out", file=sys.stderr)
+    folder = recording(KITTI)
+    if folder is None:
         return []
     labels = read_labels(folder / "label_02_0003.txt")
     sequence = slam.open_sequence(folder)
@@ -273,6 +277,76 @@ def kitti(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def recording(name: str) -> Path | None:
+    """Folder of a recording; None, with a message, where it is not there."""
+    data = os.environ.get("SLAM_DATA")
+    folder = Path(data or "") / name
+    if data and folder.is_dir():
+        return folder
+    print(f"{name}: set SLAM_DATA to the folder that holds it; left out", file=sys.stderr)
+    return None
+
+
+def cyclists(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
+    """Of all labelled objects the cyclists and a far tram move; whatever else is reported is wrong."""
+    folder = recording(CYCLISTS)
+    if folder is None:
+        return []
+    labels = read_tracklets(folder / "tracklet_labels.xml", folder.parent)
+    sequence = slam.open_sequence(folder)
+    system = system_for(sequence, "ekf", True, [])
+    features = [system.frontend.extract(frame) for frame in sequence.frames(0, 12 if quick else len(sequence))]
+    rows = []
+    for first in STARTS[: 1 if quick else None]:
+        for backend in BACKENDS:
+            results = drive(sequence, backend, features[first:])
+            rows += cyclist_rows(backend, first, results, labels, sequence.rig)
+    return rows
+
+
+def cyclist_rows(
+    backend: str, first: int, results: list[FrameResult], labels: Labels, rig: StereoRig
+) -> list[dict[str, Any]]:
+    """A row per cyclist that comes near: in how many frames it is measured there, and what is none."""
+    near = {
+        number: [k for k in range(first, first + len(results)) if is_near_cyclist(labels.get(k, {}).get(number), rig)]
+        for number in sorted({number for cars in labels.values() for number in cars})
+    }
+    measured, ids, false = {number: set[int]() for number in near}, {number: set[int]() for number in near}, set[int]()
+    unmeasured = count = 0
+    for k, result in enumerate(results, first):
+        for thing in result.objects:
+            count += 1
+            unmeasured += not thing.estimate.measured
+            if thing.estimate.measured:
+                number = nearest_car(labels.get(k, {}), seen_centre(result, thing))
+                if number < 0 or labels[k][number].kind not in ("Cyclist", "Tram"):
+                    false.add(k)
+                else:
+                    ids[number].add(thing.id)
+                    measured[number] |= {k} & set(near[number])
+    return [
+        {
+            "back end": backend, "first frame": first, "cyclist": number, f"frames within {NEAR:.0f} m": len(frames),
+            "measured": len(measured[number]), "ids": len(ids[number]), "false objects [frames]": len(false),
+            "not measured [rows]": unmeasured, "rows": count,
+        }
+        for number, frames in near.items() if frames
+    ]  # fmt: skip
+
+
+def is_near_cyclist(label: Car | None, rig: StereoRig) -> bool:
+    """Whether a label is that of a cyclist nearer than `NEAR` and in the image."""
+    near = label is not None and label.kind == "Cyclist" and label.place[2] < NEAR
+    return bool(near and label is not None and rig.left.in_view(label.place[None])[0])
+
+
+def seen_centre(result: FrameResult, thing: MovingObject) -> np.ndarray:
+    """Middle (3,) of an object's extent in left-camera coordinates [m]."""
+    place = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
+    return place[:3, :3] @ thing.extent.mean(axis=0) + place[:3, 3]
+
+
 def drive(sequence: Any, backend: str, features: list[StereoFeatures], *settings: str) -> list[FrameResult]:
     """A run on features that are extracted already."""
     system = system_for(sequence, backend, True, list(settings))
@@ -286,8 +360,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
     for k, result in enumerate(results):
         for thing in result.objects:
             if thing.estimate.measured:
-                place = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
-                centre = place[:3, :3] @ thing.extent.mean(axis=0) + place[:3, 3]
+                centre = seen_centre(result, thing)
                 speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
                 car = nearest_car(labels.get(k, {}), centre)
                 seen.setdefault(thing.id, []).append((k, car, speed, float(centre[2])))
@@ -295,7 +368,7 @@ def car_rows(backend: str, results: list[FrameResult], labels: Labels) -> list[d
     for id, history in seen.items():
         cars = [car for _, car, _, _ in history]
         car = max(set(cars), key=cars.count)
-        near = [(k, speed) for k, _, speed, depth in history if depth < 25]
+        near = [(k, speed) for k, _, speed, depth in history if depth < NEAR]
         own = np.median([speed for _, speed in near]) if near else np.nan
         true = np.nanmedian([labelled_speed(labels, poses, stamps, car, k) for k, _ in near] or [np.nan])
         rows.append({
@@ -369,6 +442,7 @@ def main() -> int:
         "street": street,
         "people": people,
         "kitti": kitti,
+        "cyclists": cyclists,
     }
     for name in arguments.only.split(","):
         kept = arguments.out / f"{name}.json"
