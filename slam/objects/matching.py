@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.pixel_kernels import best_in_windows, best_of_products
-
-_NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
+from slam.objects.pixel_kernels import best_of_products
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
@@ -23,7 +21,8 @@ class ByLine:
     Attributes:
         features: of the frame.
         order: their rows (N,), by ascending v.
-        pixels, descriptors, laplacian: of the left image, in that order.
+        pixels, descriptors, laplacian: of the left image, in that order, and
+        right: columns of the right image (N,), NaN where there is none.
     """
 
     features: StereoFeatures
@@ -31,41 +30,13 @@ class ByLine:
     pixels: Array
     descriptors: NDArray[np.float32]
     laplacian: NDArray[np.int8]
+    right: Array
 
     @classmethod
     def of(cls, features: StereoFeatures) -> ByLine:
         """A frame's features, sorted."""
         f, order = features, np.argsort(features.uv_left[:, 1], kind="stable")
-        return cls(f, order, f.uv_left[order], f.descriptors[order], f.laplacian[order])
-
-
-def match_near(
-    uv: Array,
-    radius: Array,
-    descriptors: NDArray[np.float32],
-    laplacian: NDArray[np.int8],
-    among: ByLine,
-    d_match: float,
-    ratio: float,
-) -> Pairs:
-    """Rows of tracks and of features that are each other's best inside windows.
-
-    Args:
-        uv: predicted left pixels (N, 2); NaN where there is none.
-        radius: half sizes of the windows (N,) [px].
-        descriptors: of the tracks (N, D).
-        laplacian: of the tracks (N,).
-        among: features of the frame.
-        d_match: largest descriptor distance.
-        ratio: largest ratio of the best to the second best in the window.
-    """
-    first = np.searchsorted(among.pixels[:, 1], uv[:, 1] - radius)
-    best = best_in_windows(
-        np.ascontiguousarray(uv), radius, first, descriptors, laplacian, among.pixels, among.descriptors,
-        among.laplacian, _NEIGHBOURS, d_match, ratio,
-    )  # fmt: skip
-    rows = np.flatnonzero(best >= 0)
-    return rows, among.order[best[rows]]
+        return cls(f, order, f.uv_left[order], f.descriptors[order], f.laplacian[order], f.uv_right[order, 0])
 
 
 def match_far(
