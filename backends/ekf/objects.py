@@ -28,6 +28,7 @@ from backends.ekf.objects_measurement import BodyMeasurement, change_between
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
+from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
@@ -187,7 +188,7 @@ class ObjectFilter:
         body, new = self._join(body, o, wanted, camera)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([o.points[known][used], o.points[new]])
-        return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~np.isin(bad, new)]]))
+        return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~isin(bad, new)]]))
 
     def _correct(
         self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief,

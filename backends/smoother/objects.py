@@ -26,6 +26,7 @@ from backends.smoother.pose_set import PoseSet
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
+from slam.geometry.arrays import isin
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
@@ -195,7 +196,7 @@ class ObjectSmoother:
         window, new = self._join(window, camera, seen, wanted)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([seen.ids[known][used], seen.ids[new]])
-        return window, Sight(bool(used.any()), np.sort(good), np.sort(seen.ids[bad[~np.isin(bad, new)]]))
+        return window, Sight(bool(used.any()), np.sort(good), np.sort(seen.ids[bad[~isin(bad, new)]]))
 
     def _join(
         self, window: Window, camera: CameraWindow, seen: _Measured, wanted: BoolArray

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.arrays import among
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
@@ -57,11 +58,14 @@ def locate(
     depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
     if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
         return None
-    tracks.row[members] = np.where(np.isin(followed, tracks.row[tracks.seen]), -1, followed)
+    taken = among(len(features), tracks.row[tracks.seen])
+    tracks.row[members] = np.where(taken[followed], -1, followed)  # those that were not seen stay at −1
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, matched = mine[agrees], rows[agrees]
-    tracks.row[members[np.isin(followed, matched)]] = -1
-    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.seen & np.isin(tracks.row, matched)))
+    measured_now = among(len(features), matched)
+    tracks.row[members[measured_now[followed] & (followed >= 0)]] = -1
+    free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+    tracks.give_up(free[measured_now[tracks.row[free]]])
     tracks.row[good], tracks.missed[good] = matched, 0
     tracks.descriptors[good] = features.descriptors[matched]
     return T
@@ -149,8 +153,7 @@ def _by_descriptors(
     For a body whose position is unknown, because it was out of view for long, weaker matches are accepted, and the fit
     decides. Features of free tracks may be matched, too: such tracks may have started on the body's points.
     """
-    taken = np.zeros(len(features), bool)
-    taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True
+    taken = among(len(features), tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)])
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if len(mine) < MIN_POINTS or len(free) < MIN_POINTS:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
