@@ -218,8 +218,8 @@ class _Regions:
 
     def near(self, tracks: MovingTracks, rows: NDArray[np.intp] | slice, places: Array) -> BoolArray:
         """Which tracks lie in each region (C, M), given the covariances (N, 3, 3) of its middle as each sees it."""
-        P = self.covariance[:, :3, :3]
-        return near_pairs(_NEAR, self.state[:, :3], P, tracks.motion.position[rows], places[rows])
+        middles, P = np.ascontiguousarray(self.state[:, :3]), np.ascontiguousarray(self.covariance[:, :3, :3])
+        return np.asarray(near_pairs(_NEAR, middles, P, tracks.motion.position[rows], places[rows]))
 
     def unexplained(self, tracks: MovingTracks, regions: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
         """χ²(3) of the velocities of tracks (K,), each less that of one of the regions (K,)."""

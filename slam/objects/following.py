@@ -15,7 +15,7 @@ from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.bodies import Body
 from slam.objects.candidates import Candidate, region_radius
 from slam.objects.config import ObjectsConfig
-from slam.objects.matching import ByLine, match_far
+from slam.objects.matching import match_far
 from slam.objects.pixel_kernels import continue_tracks
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import LEAST_INFORMATION, Tracks
@@ -57,7 +57,7 @@ def follow(
         if body.missed > 1:
             lost |= tracks.body[alive] == body.id
     if len(alive) and len(features):
-        search = _Search(tracks, T_world_left, ByLine.of(features), dt, config, rig, sigma)
+        search = _Search.of(tracks, T_world_left, features, dt, config, rig, sigma)
         taken = np.zeros(len(features), bool)
         search.expected(alive[~lost], taken)
         held = tracks.row[tracks.seen & (tracks.body >= 0)]
@@ -87,15 +87,36 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
 
 @dataclass(frozen=True)
 class _Search:
-    """The search for tracks in a frame, in windows about expected places."""
+    """The search for tracks in a frame, in windows about expected places.
+
+    Attributes:
+        tracks: all tracks.
+        T_world_left: the camera's pose (4, 4).
+        order: rows of the frame's features (F,) by ascending line of the left image.
+        features: their left and right pixels (F, 2), descriptors (F, D), and signs of the Laplacian (F,).
+        dt: time since the previous frame [s].
+        config: settings.
+        rig: the cameras.
+        sigma: pixel noise [px].
+    """
 
     tracks: Tracks
     T_world_left: Array
-    among: ByLine
+    order: NDArray[np.intp]
+    features: tuple[NDArray, ...]
     dt: float
     config: ObjectsConfig
     rig: StereoRig
     sigma: float
+
+    @classmethod
+    def of(
+        cls, tracks: Tracks, T_world_left: Array, f: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig,
+        sigma: float,
+    ) -> _Search:  # fmt: skip
+        """Among the features f of a frame."""
+        arrays = tuple(map(np.ascontiguousarray, (f.uv_left, f.uv_right, f.descriptors, f.laplacian)))
+        return cls(tracks, T_world_left, np.argsort(arrays[0][:, 1], kind="stable"), arrays, dt, config, rig, sigma)
 
     def expected(self, rows: NDArray[np.intp], taken: BoolArray) -> None:
         """Look for tracks where their fit or their body's motion says; see `_look`."""
@@ -115,14 +136,14 @@ class _Search:
 
         Features that are `taken` (F,) are not found; those that are found are entered there.
         """
-        c, tracks, among, rig = self.config, self.tracks, self.among, self.rig
+        c, tracks, rig = self.config, self.tracks, self.rig
         local = (places - self.T_world_left[:3, 3]) @ self.T_world_left[:3, :3]
         z, J = rig.project_stereo(local)
         tracks.row[rows] = continue_tracks(
             z, J, local[:, 2], self.T_world_left, tracks.covariance, covariance, rows, self.sigma, SIGMAS, least,
             c.search_limit, tracks.descriptors, tracks.laplacian, tracks.dof,
-            _UNEVEN * c.max_speed * self.dt * rig.left.fu, 1.0 / _UNEVEN, c.min_frames, among.order, among.pixels,
-            among.right, among.descriptors, among.laplacian, c.d_match, c.ratio, taken,
+            _UNEVEN * c.max_speed * self.dt * rig.left.fu, 1.0 / _UNEVEN, c.min_frames, self.order, *self.features,
+            c.d_match, c.ratio, taken,
         )  # fmt: skip
 
 

@@ -92,7 +92,7 @@ def information_in_world(points, usable, J, measured, T_world_left, sigma):
 @kernel
 def continue_tracks(
     z, J, depth, T_world_left, P, more, rows, sigma, sigmas, least, limit, descriptors, signs, dof, uneven, sudden,
-    enough, order, feature_uv, feature_right, feature_descriptors, feature_signs, d_match, ratio, taken,
+    enough, order, feature_uv, feature_uv_right, feature_descriptors, feature_signs, d_match, ratio, taken,
 ):  # fmt: skip
     """Features that continue tracks: the best inside a track's window, and that track the best of the feature's.
 
@@ -118,13 +118,13 @@ def continue_tracks(
         sudden: factor on it for tracks with fewer measurements than
         enough: so many.
         order: rows of the features (F,) by ascending v.
-        feature_uv: their left pixels (F, 2) in that order.
-        feature_right: columns of the right pixels (F,) in that order; NaN where there is none.
-        feature_descriptors: the descriptors (F, D) in that order.
-        feature_signs: the signs of the Laplacians (F,) in that order.
+        feature_uv: their left pixels (F, 2).
+        feature_uv_right: their right pixels (F, 2); NaN where there is none.
+        feature_descriptors: their descriptors (F, D).
+        feature_signs: the signs of their Laplacians (F,).
         d_match: largest descriptor distance.
         ratio: largest ratio of the best to the second best.
-        taken: which features have a track already (F,), by row; those found are entered.
+        taken: which features have a track already (F,); those found are entered.
 
     Returns:
         rows of the features (M,), −1 where there is none.
@@ -143,7 +143,7 @@ def continue_tracks(
         radius = least[m]
         if not (np.isnan(deviations[0]) or np.isnan(deviations[1])):
             radius = max(sigmas * max(deviations[0], deviations[1]), radius)
-        count = _nearest(z[m], min(radius, limit), feature_uv, near, gaps)
+        count = _nearest(z[m], min(radius, limit), order, feature_uv, near, gaps)
         second = np.inf
         for c in range(count):
             k = near[c]
@@ -163,14 +163,14 @@ def continue_tracks(
     for m in range(len(rows)):
         k = best[m]
         best[m] = -1
-        if k < 0 or owner[k] != m or taken[order[k]]:
+        if k < 0 or owner[k] != m or taken[k]:
             continue
         count = 0
         for w in range(dof.shape[1]):
             count += dof[rows[m], w] > 0
         allowance = uneven / max(depth[m], _NEAREST) * (sudden if count < enough else 1.0)
-        if not abs(feature_right[k] - z[m, 2]) > _RIGHT_SIGMAS * right[m] + allowance:  # nor where one is NaN
-            best[m] = order[k]
+        if not abs(feature_uv_right[k, 0] - z[m, 2]) > _RIGHT_SIGMAS * right[m] + allowance:  # nor where one is NaN
+            best[m] = k
     for m in range(len(rows)):
         if best[m] >= 0:
             taken[best[m]] = True
@@ -225,20 +225,21 @@ def best_of_products(products, allowed, signs, feature_signs, d_match, ratio):
 
 
 @helper
-def _nearest(middle, radius, uv, near, gaps):
-    """Places of the pixels nearest to `middle` into `near`, the nearest first; how many, up to its length.
+def _nearest(middle, radius, order, uv, near, gaps):
+    """Rows of the pixels nearest to `middle` into `near`, the nearest first; how many there are, up to its length.
 
-    The pixels `uv` (F, 2) stand by ascending v.
+    `order` (F,) has the rows of the pixels `uv` (F, 2) by ascending v.
     """
     first, end = 0, len(uv)
     while first < end:
         half = (first + end) // 2
-        if uv[half, 1] < middle[1] - radius:
+        if uv[order[half], 1] < middle[1] - radius:
             first = half + 1
         else:
             end = half
     count = 0
-    for m in range(first, len(uv)):
+    for at in range(first, len(uv)):
+        m = order[at]
         if uv[m, 1] > middle[1] + radius:
             break
         gap = (uv[m, 0] - middle[0]) ** 2 + (uv[m, 1] - middle[1]) ** 2
