@@ -9,12 +9,13 @@ from slam.data import BoolArray, StereoFeatures
 from slam.geometry.arrays import among
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, exp, inverse, transform
 from slam.objects.bodies import Body
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
 from slam.objects.points import MIN_POINTS
-from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks, times_vectors
+from slam.objects.recovery_kernels import agreed_correction
+from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again
@@ -108,40 +109,25 @@ def _predicted(
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
-    A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
-    the other. At least two points must agree, and the body must be expected to within what it measures across: else
-    any two agree with one of its poses.
+    See `slam.objects.recovery_kernels.agreed_correction`. At least two points must agree, and the body must be expected
+    to within what it measures across: else any two agree with one of its poses.
     """
     local = measured[rows]
     deep = np.flatnonzero(np.isfinite(local).all(axis=1))
     if len(deep) < _LEAST_PREDICTED or not _is_expected(body):
         return None
-    y, R = tracks.local[mine[deep]], body.T[:3, :3]
-    axes = R.T @ T_world_left[:3, :3]
-    gaps = transform(inverse(body.T) @ T_world_left, local[deep]) - y
-    noise = axes @ rig.triangulation_covariance(local[deep], sigma) @ axes.T
-    noise += np.linalg.inv(tracks.local_information[mine[deep]] + LEAST_INFORMATION * np.eye(3))
-    information, J = np.linalg.inv(noise), -points_by_pose(y)
-    spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
-    # `_squares` takes matrices: all are (3, 3) but that of the body's pose.
-    agrees = _squares(gaps, np.linalg.inv(spread)) < AGREES
-    known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
-    while agrees.sum() >= _LEAST_PREDICTED:
-        normal = known + (JA[agrees] @ J[agrees]).sum(axis=0)
-        change = np.linalg.solve(normal, (JA[agrees] @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
-        off = np.where(agrees, _squares(gaps - J @ change, information), 0.0)
-        worst = int(np.argmax(off))
-        if off[worst] < AGREES:
-            which = np.zeros(len(rows), bool)
-            which[deep[agrees]] = True
-            return inverse(body.T @ exp(change)) @ T_world_left, which
-        agrees[worst] = False
-    return None
-
-
-def _squares(gaps: Array, information: Array) -> Array:
-    """χ² (N,) of gaps (N, 3) with information (N, 3, 3)."""
-    return np.asarray((gaps * times_vectors(information, gaps)).sum(axis=1))
+    local, known = local[deep], mine[deep]
+    T_body_left = inverse(body.T) @ T_world_left
+    _, J = rig.project_stereo(local)
+    change, agrees, enough = agreed_correction(
+        tracks.local[known], tracks.local_information[known], local, J, T_body_left[:3, :3], T_body_left[:3, 3],
+        body.covariance, np.linalg.inv(body.covariance), sigma, LEAST_INFORMATION, AGREES, _LEAST_PREDICTED,
+    )  # fmt: skip
+    if not enough:
+        return None
+    which = np.zeros(len(rows), bool)
+    which[deep[agrees]] = True
+    return inverse(body.T @ exp(change)) @ T_world_left, which
 
 
 def _by_descriptors(
