@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
+from slam.objects.body_kernels import drift_roots
 
 Projection = Callable[[Array], tuple[Array, Array]]
 
@@ -118,14 +119,8 @@ def drift(points: Array, first: Array, now: Array, turned: Array, density: float
     Returns:
         the angles with this sight (p,), and symmetric roots (p, 3, 3) of the covariances to be added [m].
     """
-    sight = now - points
-    (a, b, c), (x, y, z) = (first - points).T, sight.T
-    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
-    angle = np.arctan2(np.sqrt(u * u + v * v + w * w), a * x + b * y + c * z)
-    angle = np.fmax(angle, turned)  # NaN where a point is nowhere
-    distance = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-9)[:, None, None]
-    across = np.eye(3) - sight[:, :, None] * sight[:, None, :] / distance**2
-    return angle, np.nan_to_num(density * np.sqrt(angle - turned)[:, None, None] * distance * across)
+    angles, roots = drift_roots(points, first, now, turned, density)
+    return angles, roots
 
 
 def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:

@@ -11,10 +11,10 @@ from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, transform
 from slam.objects.bodies import Body
+from slam.objects.body_kernels import agreed_correction
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
 from slam.objects.points import MIN_POINTS
-from slam.objects.recovery_kernels import agreed_correction
 from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
@@ -109,7 +109,7 @@ def _predicted(
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
-    See `slam.objects.recovery_kernels.agreed_correction`. At least two points must agree, and the body must be expected
+    See `slam.objects.body_kernels.agreed_correction`. At least two points must agree, and the body must be expected
     to within what it measures across: else any two agree with one of its poses.
     """
     local = measured[rows]
