@@ -66,13 +66,15 @@ class ObjectFilter:
     # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
 
     def update(
-        self, observations: Sequence[ObjectObservations], stamp: float, camera: CameraBelief
+        self, observations: Sequence[ObjectObservations], stamp: float, belief: Callable[[], CameraBelief]
     ) -> list[ObjectEstimate]:
-        """See `slam.interfaces.ObjectBackend.update_objects`."""
+        """See `slam.interfaces.ObjectBackend.update_objects`; the camera's belief is asked for if need be."""
         seen = {o.id: o for o in observations}
         self._require_usable(observations)
         dt, self._stamp, self._now = stamp - self._stamp, stamp, self._now + 1
-        out = []
+        if not (self._bodies or seen):
+            return []
+        camera, out = belief(), []
         for number in sorted({*self._bodies, *seen}):
             body, sight = self._bodies.get(number), Sight()
             if body is None:
