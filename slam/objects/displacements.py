@@ -64,6 +64,6 @@ def known_well(
     Returns:
         rows (K,), and x/z, y/z, log z of each (K, 3).
     """
-    t = tracks
-    known, place = places_known(t.position, t.covariance, t.dof, rows, T_world_left, min_frames, _FARTHEST)
+    rows = rows[tracks.count(rows) >= min_frames]
+    known, place = places_known(tracks.position, tracks.covariance, rows, T_world_left, _FARTHEST)
     return known, place

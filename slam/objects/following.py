@@ -139,11 +139,11 @@ class _Search:
         c, tracks, rig = self.config, self.tracks, self.rig
         local = (places - self.T_world_left[:3, 3]) @ self.T_world_left[:3, :3]
         z, J = rig.project_stereo(local)
+        allowance = _UNEVEN * c.max_speed * self.dt * rig.left.fu / np.maximum(local[:, 2], 1e-3)
+        allowance *= np.where(tracks.count(rows) < c.min_frames, 1.0 / _UNEVEN, 1.0)
         tracks.row[rows] = continue_tracks(
-            z, J, local[:, 2], self.T_world_left, tracks.covariance, covariance, rows, self.sigma, SIGMAS, least,
-            c.search_limit, tracks.descriptors, tracks.laplacian, tracks.dof,
-            _UNEVEN * c.max_speed * self.dt * rig.left.fu, 1.0 / _UNEVEN, c.min_frames, self.order, *self.features,
-            c.d_match, c.ratio, taken,
+            z, J, self.T_world_left, tracks.covariance, covariance, rows, self.sigma, SIGMAS, least, c.search_limit,
+            tracks.descriptors, tracks.laplacian, allowance, self.order, *self.features, c.d_match, c.ratio, taken,
         )  # fmt: skip
 
 

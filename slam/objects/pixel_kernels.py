@@ -8,7 +8,6 @@ from slam.runtime.compilation import helper, kernel
 
 _NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
-_NEAREST = 1e-3  # numerics: no depth below this [m] is divided by
 
 
 @helper
@@ -91,8 +90,8 @@ def information_in_world(points, usable, J, measured, T_world_left, sigma):
 
 @kernel
 def continue_tracks(
-    z, J, depth, T_world_left, P, more, rows, sigma, sigmas, least, limit, descriptors, signs, dof, uneven, sudden,
-    enough, order, feature_uv, feature_uv_right, feature_descriptors, feature_signs, d_match, ratio, taken,
+    z, J, T_world_left, P, more, rows, sigma, sigmas, least, limit, descriptors, signs, allowance, order, feature_uv,
+    feature_uv_right, feature_descriptors, feature_signs, d_match, ratio, taken,
 ):  # fmt: skip
     """Features that continue tracks: the best inside a track's window, and that track the best of the feature's.
 
@@ -102,7 +101,6 @@ def continue_tracks(
     Args:
         z: expected pixels (M, 3) = (uL, vL, uR); NaN where there are none.
         J: their derivatives (M, 3, 3) by the points, in camera axes.
-        depth: of the points in the camera (M,) [m].
         T_world_left: pose (4, 4) of the camera.
         P: covariances of all tracks (N, 3, 3), in world axes, and
         more: what is added to each (3, 3).
@@ -113,10 +111,7 @@ def continue_tracks(
         limit: at most so much [px].
         descriptors: of all tracks (N, D).
         signs: of their Laplacians (N,).
-        dof: numbers that they measured by slot (N, W).
-        uneven: change of the right pixel by an uneven motion, times the depth [px m], and
-        sudden: factor on it for tracks with fewer measurements than
-        enough: so many.
+        allowance: how far right pixels may be off besides, by an uneven motion (M,) [px].
         order: rows of the features (F,) by ascending v.
         feature_uv: their left pixels (F, 2).
         feature_uv_right: their right pixels (F, 2); NaN where there is none.
@@ -165,11 +160,7 @@ def continue_tracks(
         best[m] = -1
         if k < 0 or owner[k] != m or taken[k]:
             continue
-        count = 0
-        for w in range(dof.shape[1]):
-            count += dof[rows[m], w] > 0
-        allowance = uneven / max(depth[m], _NEAREST) * (sudden if count < enough else 1.0)
-        if not abs(feature_uv_right[k, 0] - z[m, 2]) > _RIGHT_SIGMAS * right[m] + allowance:  # nor where one is NaN
+        if not abs(feature_uv_right[k, 0] - z[m, 2]) > _RIGHT_SIGMAS * right[m] + allowance[m]:  # nor where one is NaN
             best[m] = k
     for m in range(len(rows)):
         if best[m] >= 0:

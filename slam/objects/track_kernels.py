@@ -108,16 +108,14 @@ def measurements(dof, rows):
 
 
 @kernel
-def places_known(position, covariance, dof, rows, T_world_left, least, farthest):
-    """Tracks that were measured in enough slots and whose depth is known well, and where they are seen.
+def places_known(position, covariance, rows, T_world_left, farthest):
+    """Tracks whose depth is known well, and where they are seen.
 
     Args:
         position: of the tracks, in world coordinates.
         covariance: of the positions.
-        dof: numbers measured by slot.
         rows: of the tracks.
         T_world_left: pose (4, 4) of the camera.
-        least: slots in which a track was measured.
         farthest: least ratio of the depth to its deviation.
 
     Returns:
@@ -125,13 +123,11 @@ def places_known(position, covariance, dof, rows, T_world_left, least, farthest)
     """
     known, place, away, count = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
     for m in range(len(rows)):
-        n, times = rows[m], 0
-        for w in range(dof.shape[1]):
-            times += dof[n, w] > 0
+        n = rows[m]
         for i in range(3):
             away[i] = position[n, i] - T_world_left[i, 3]
         depth = _column_times(T_world_left, 2, away)
-        if times >= least and depth > farthest * np.sqrt(_trace(covariance[n])):
+        if depth > farthest * np.sqrt(_trace(covariance[n])):
             known[count] = n
             for i in range(2):
                 place[count, i] = _column_times(T_world_left, i, away) / depth
