@@ -220,7 +220,7 @@ class EkfBackend:
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
-        return self._state.objects.update(observations, self._stamps[-1], self._state.camera_belief())
+        return self._state.objects.update(observations, self._stamps[-1], self._state.camera_belief)
 
     @all_or_nothing
     def remove_objects(self, ids: IdArray | Sequence[int]) -> None:

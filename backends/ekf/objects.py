@@ -28,6 +28,7 @@ from backends.ekf.objects_measurement import BodyMeasurement, change_between
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
+from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
@@ -65,13 +66,15 @@ class ObjectFilter:
     # --- the protocol (documented in slam.interfaces.ObjectBackend) ---
 
     def update(
-        self, observations: Sequence[ObjectObservations], stamp: float, camera: CameraBelief
+        self, observations: Sequence[ObjectObservations], stamp: float, belief: Callable[[], CameraBelief]
     ) -> list[ObjectEstimate]:
-        """See `slam.interfaces.ObjectBackend.update_objects`."""
+        """See `slam.interfaces.ObjectBackend.update_objects`; the camera's belief is asked for if need be."""
         seen = {o.id: o for o in observations}
         self._require_usable(observations)
         dt, self._stamp, self._now = stamp - self._stamp, stamp, self._now + 1
-        out = []
+        if not (self._bodies or seen):
+            return []
+        camera, out = belief(), []
         for number in sorted({*self._bodies, *seen}):
             body, sight = self._bodies.get(number), Sight()
             if body is None:
@@ -187,7 +190,7 @@ class ObjectFilter:
         body, new = self._join(body, o, wanted, camera)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([o.points[known][used], o.points[new]])
-        return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~np.isin(bad, new)]]))
+        return body, Sight(bool(used.any()), np.sort(good), np.sort(o.points[bad[~isin(bad, new)]]))
 
     def _correct(
         self, body: Body, o: ObjectObservations, known: BoolArray, rows: NDArray[np.intp], camera: CameraBelief,

@@ -292,6 +292,8 @@ def _learnt(body: Body, change: Array, W: Array, gain: Array, rows: Array) -> Bo
 def transported(body: Body, before: BodyPoints, camera: CameraBelief) -> Body:
     """Transport the covariance to the points as they are now, from those before, `before` (p), for which it holds.
 
+    In place: nobody else has the covariances of a body that has just been corrected.
+
     No measurement says where in the body its frame lies, nor where in the world camera and body are together. If the
     pose is off by ``[θ, τ]`` and the camera by c, such a displacement changes the points by ``N η``, where ``η =
     [θ, τ] − Ad c`` (see `gathered`), and no prediction. N depends on the points; were the covariance kept in the
@@ -305,9 +307,9 @@ def transported(body: Body, before: BodyPoints, camera: CameraBelief) -> Body:
     with_body = body.covariance[:6] - by_state @ body.cross[:, :6].T  # covariance (6, n) of η with the body
     with_filter = body.cross[:6] - A @ camera.cross  # and with the filter's state (6, N)
     own = with_body[:, :6] - with_filter[:, :6] @ by_state.T
-    P, cross = body.covariance.copy(), body.cross.copy(order="K")
+    P = body.covariance
     P[RIGID:] += K @ with_body
     P[:, RIGID:] += with_body.T @ K.T
     P[RIGID:, RIGID:] += K @ own @ K.T
-    cross[RIGID:] += K @ with_filter
-    return replace(body, covariance=P, cross=cross)
+    dgemm(1.0, with_filter.T, K.T, beta=1.0, c=body.cross[RIGID:].T, overwrite_c=1)
+    return body

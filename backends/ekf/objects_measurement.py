@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backends.ekf.measurement import Linearisation
+from backends.ekf.objects_kernels import point_geometry
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat, pose, so3_exp, so3_left_jacobian, so3_log
 
@@ -59,53 +60,25 @@ class BodyPoints:
 
     def cartesian(self) -> Array:
         """Positions (M, 3) in body coordinates [m]; NaN for a point that came to lie behind its first camera."""
-        return self._positions
+        return self._geometry[0]
 
     def derivatives(self) -> Array:
         """Derivatives (M, 3, 3) of the positions by the coordinates."""
-        return self._derivatives
+        return self._geometry[1]
 
     def by_position(self) -> Array:
         """Derivatives (M, 3, 3) of the coordinates by the positions."""
-        return self._by_position
+        return self._geometry[2]
 
     def by_frame(self) -> Array:
         """Change (3M, 6) of the coordinates with a change [θ, τ] of the body's frame that leaves points in place."""
-        return self._by_frame
-
-    # The arrays never change, so that all of this is computed once.
+        return self._geometry[3]
 
     @cached_property
-    def _positions(self) -> Array:
-        c, inverse_depth = self.coordinates, self.coordinates[:, 2:]
-        h = np.empty_like(c)
-        h[:, :2], h[:, 2] = c[:, :2], 1
-        h /= np.where(inverse_depth > 0, inverse_depth, np.nan)
-        return np.asarray((self.T_body_anchor[:, :3, :3] @ h[:, :, None])[:, :, 0] + self.T_body_anchor[:, :3, 3])
-
-    @cached_property
-    def _derivatives(self) -> Array:
-        depth = 1 / self.coordinates[:, 2]
-        D = np.zeros((len(depth), 3, 3))
-        D[:, 0, 0] = D[:, 1, 1] = depth
-        D[:, :2, 2] = -self.coordinates[:, :2] * (depth * depth)[:, None]
-        D[:, 2, 2] = -depth * depth
-        return np.asarray(self.T_body_anchor[:, :3, :3] @ D)
-
-    @cached_property
-    def _by_position(self) -> Array:
-        w = self.coordinates[:, 2]
-        D = np.zeros((len(w), 3, 3))
-        D[:, 0, 0] = D[:, 1, 1] = w
-        D[:, :, 2] = -w[:, None] * self.coordinates
-        return np.asarray(D @ np.swapaxes(self.T_body_anchor[:, :3, :3], 1, 2))
-
-    @cached_property
-    def _by_frame(self) -> Array:
-        out = np.empty((len(self), 3, 6))
-        np.matmul(self._by_position, hat(self._positions), out=out[:, :, :3])
-        np.negative(self._by_position, out=out[:, :, 3:])
-        return out.reshape(-1, 6)
+    def _geometry(self) -> tuple[Array, Array, Array, Array]:
+        """All of this; the arrays never change, so that it is computed once."""
+        positions, derivatives, by_position, by_frame = point_geometry(self.T_body_anchor, self.coordinates)
+        return positions, derivatives, by_position, by_frame.reshape(-1, 6)
 
 
 class BodyMeasurement:

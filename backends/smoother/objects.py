@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.smoother.objects_factors import VelocityPrior, velocities
+from backends.smoother.objects_factors import VelocityPrior
 from backends.smoother.objects_kernels import FRAME
 from backends.smoother.objects_prediction import Agreement, PredictedBody, agreement, predicted
 from backends.smoother.objects_window import (
@@ -26,6 +26,7 @@ from backends.smoother.pose_set import PoseSet
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
+from slam.geometry.arrays import isin
 from slam.geometry.se3 import Array, adjoint, inverse, transform
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
@@ -127,7 +128,7 @@ class ObjectSmoother:
     def _possible(self, before: Window, after: Window) -> bool:
         """Whether a body can move as its window says after a further frame."""
         dt = float(after.stamps[-1] - before.stamps[-1])
-        return self._models.objects.possible(*self._motion(after), *self._motion(before), dt)
+        return self._models.objects.possible(*after.motion, *before.motion, dt)
 
     def _restarted(self, window: Window, seen: _Measured | None, path: Path, camera: PoseSet) -> tuple[Window, Sight]:
         """The body without its points, velocity and past, where it was last or where the guess has it."""
@@ -195,7 +196,7 @@ class ObjectSmoother:
         window, new = self._join(window, camera, seen, wanted)
         bad = np.flatnonzero(known)[~used]
         good = np.concatenate([seen.ids[known][used], seen.ids[new]])
-        return window, Sight(bool(used.any()), np.sort(good), np.sort(seen.ids[bad[~np.isin(bad, new)]]))
+        return window, Sight(bool(used.any()), np.sort(good), np.sort(seen.ids[bad[~isin(bad, new)]]))
 
     def _join(
         self, window: Window, camera: CameraWindow, seen: _Measured, wanted: BoolArray
@@ -229,20 +230,11 @@ class ObjectSmoother:
     def _estimate(self, number: int, window: Window, sight: Sight) -> ObjectEstimate:
         last = FRAME * (len(window) - 1)
         covariance = window.covariance[last : last + 6, last : last + 6].copy()
+        velocity, P = window.motion
         return ObjectEstimate(
-            number, float(window.stamps[-1]), window.T[-1].copy(), covariance, *self._motion(window),
+            number, float(window.stamps[-1]), window.T[-1].copy(), covariance, velocity.copy(), P.copy(),
             sight.measured, sight.used, sight.rejected,
         )  # fmt: skip
-
-    def _motion(self, window: Window) -> tuple[Array, Array]:
-        """Velocity [ω, v] (6,) in the newest step, and its covariance (6, 6); of a first frame what is expected."""
-        if len(window) == 1 and window.first_velocity is not None:
-            return window.first_velocity.mean.copy(), np.diag(window.first_velocity.sigmas**2)
-        last = FRAME * (len(window) - 1)
-        (velocity,), (before,), (after,) = velocities(window.T[-2:], window.stamps[-2:])
-        mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
-        J = np.concatenate([before, after], axis=1)
-        return velocity, J @ window.covariance[np.ix_(mine, mine)] @ J.T
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from backends.smoother import objects_kernels as kernels
 from backends.smoother.stereo import RectifiedStereo
@@ -40,13 +41,15 @@ class System:
 
     def diffused(self, unknowns: IndexArray, roots: Array) -> System:
         """With independent noise added to triples of unknowns (3M,), given symmetric roots (M, 3, 3) of covariances."""
-        M = (self.information[:, unknowns].reshape(-1, len(roots), 1, 3) @ roots).reshape(-1, len(unknowns))
-        S = (M[unknowns].reshape(len(roots), 3, -1).transpose(0, 2, 1) @ roots).transpose(0, 2, 1)
-        inner = np.eye(len(unknowns)) + S.reshape(len(unknowns), -1)
+        count, size = len(unknowns), len(self.vector)
+        M = (roots @ self.information[unknowns].reshape(-1, 3, size)).reshape(count, size)
+        inner = np.eye(count) + (roots @ M.T[unknowns].reshape(-1, 3, count)).reshape(count, count)
         right = (roots @ self.vector[unknowns].reshape(-1, 3, 1)).reshape(-1)
-        lost = np.linalg.solve(inner, np.column_stack([M.T, right]))
-        information = self.information - M @ lost[:, :-1]
-        return System(0.5 * (information + information.T), self.vector - M @ lost[:, -1])
+        L, failed = dpotrf(inner, lower=1)
+        if failed:
+            raise np.linalg.LinAlgError("the equations are not finite")
+        W = dtrtrs(L, np.column_stack([M, right]), lower=1)[0]
+        return System(self.information - W[:, :-1].T @ W[:, :-1], self.vector - W[:, :-1].T @ W[:, -1])
 
 
 def add_measurements(

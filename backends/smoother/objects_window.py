@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion
+from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_kernels import FRAME
 from backends.smoother.pose_kernels import moved
 from backends.smoother.stereo import RectifiedStereo
@@ -123,6 +123,17 @@ class Window:
     def first_point(self) -> int:
         """Where the points' unknowns begin."""
         return FRAME * len(self.frames)
+
+    @cached_property
+    def motion(self) -> tuple[Array, Array]:
+        """Velocity [ω, v] (6,) in the newest step, and its covariance (6, 6); of a first frame what is expected."""
+        if len(self) == 1 and self.first_velocity is not None:
+            return self.first_velocity.mean, np.diag(self.first_velocity.sigmas**2)
+        last = FRAME * (len(self) - 1)
+        (velocity,), (before,), (after,) = velocities(self.T[-2:], self.stamps[-2:])
+        mine = np.concatenate([np.arange(last - FRAME, last - FRAME + 6), np.arange(last, last + 6)])
+        J = np.concatenate([before, after], axis=1)
+        return velocity, J @ self.covariance[np.ix_(mine, mine)] @ J.T
 
     def point_covariances(self) -> Array:
         """Covariances (p, 3, 3) of the points."""

@@ -27,6 +27,13 @@ def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
     return np.fromiter(map(set(others.tolist()).__contains__, ids.tolist()), bool, len(ids))
 
 
+def among(count: int, rows: IndexArray | IdArray) -> BoolArray:
+    """Which of so many places (count,) are among `rows`."""
+    out = np.zeros(count, bool)
+    out[rows] = True
+    return out
+
+
 def median(values: Array) -> float:
     """The median of some numbers: ``np.median``, which takes longer to begin than these need."""
     ordered = np.sort(values, axis=None)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray
-from slam.geometry.gauss_kernels import squared_distances
+from slam.geometry.gauss_kernels import near_pairs, squared_distances
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array
 from slam.objects.points import MIN_POINTS
@@ -227,8 +227,8 @@ class _Regions:
 
     def near(self, tracks: MovingTracks, rows: NDArray[np.intp] | slice, places: Array) -> BoolArray:
         """Which tracks lie in each region (C, M), given the covariances (N, 3, 3) of its middle as each sees it."""
-        P = self.covariance[:, :3, :3]
-        return _below(_NEAR, self.state[:, :3], P, tracks.motion.position[rows], places[rows])
+        middles, P = np.ascontiguousarray(self.state[:, :3]), np.ascontiguousarray(self.covariance[:, :3, :3])
+        return np.asarray(near_pairs(_NEAR, middles, P, tracks.motion.position[rows], places[rows]))
 
     def unexplained(self, tracks: MovingTracks, regions: NDArray[np.intp], rows: NDArray[np.intp]) -> Array:
         """χ²(3) of the velocities of tracks (K,), each less that of one of the regions (K,)."""
@@ -303,7 +303,7 @@ def _new_candidates(tracks: MovingTracks, free: BoolArray) -> list[Candidate]:
     if len(rows) < _BEGIN:
         return []
     at, places, speed, speeds = m.position[rows], tracks.places[rows], m.velocity[rows], m.velocity_covariance[rows]
-    near = _below(_NEAR, at, places, at, places) & _below(AGREES, speed, speeds, speed, speeds)
+    near = near_pairs(_NEAR, at, places, at, places) & near_pairs(AGREES, speed, speeds, speed, speeds)
     left, found = np.ones(len(rows), bool), []
     for i in np.argsort(-near.sum(axis=1), kind="stable"):
         group = near[i] & left
@@ -329,14 +329,3 @@ def _begun(tracks: MovingTracks, rows: NDArray[np.intp]) -> Candidate:
 def _share(count: Any) -> Any:
     """Factor on the information of so many velocities: they share errors with the last frame's, and with each other."""
     return _OVERLAP * np.sqrt(count)
-
-
-def _below(limit: float, first: Array, covariances: Array, second: Array, others: Array) -> BoolArray:
-    """Which of some Gaussians (N, 3) are nearer to which others (M, 3) than a limit of χ² (N, M)."""
-    gaps = first[:, None] - second
-    # No variance is larger than the trace: most pairs are too far apart, whatever their covariances are.
-    largest = np.trace(covariances, axis1=1, axis2=2)[:, None] + np.trace(others, axis1=1, axis2=2)
-    near = np.einsum("nmi,nmi->nm", gaps, gaps) < limit * largest
-    one, other = np.nonzero(near)
-    near[one, other] = squared_distances(gaps[one, other], covariances[one] + others[other]) < limit
-    return near

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import Estimate, IdArray, StereoFeatures
-from slam.geometry.arrays import IndexArray, median
+from slam.geometry.arrays import IndexArray, among, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
 from slam.interfaces import Backend, ObjectBackend
@@ -214,11 +214,11 @@ class MovingObjectDetector:
             alike[members] = True
         fit_velocities(tracks, np.flatnonzero(tracks.doubtful), times, c.max_speed)
         tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
-        of_parts = np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)])
+        of_parts = among(len(tracks), np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)]))
         alone = [rows[group.members] for group in scene.groups]
-        alone = [members for members in alone if 2 * np.isin(members, of_parts).sum() <= len(members)]
+        alone = [members for members in alone if 2 * of_parts[members].sum() <= len(members)]
         for whole, members in [*parts, *((None, members) for members in alone)]:
-            members = members[np.isin(tracks.body[members], (-1, whole if whole is not None else -1))]
+            members = members[(tracks.body[members] == -1) | (tracks.body[members] == (-1 if whole is None else whole))]
             if (tracks.streak[members] >= c.confirm).sum() >= c.min_support - 1:
                 new = initializer.moving_group(tracks, members[tracks.streak[members] > 0])
                 if new is not None:
@@ -381,8 +381,7 @@ class MovingObjectDetector:
         tracks = self.tracks
         assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.missed > self.config.patience) & (tracks.body < 0)))
-        taken = np.zeros(len(features), bool)
-        taken[tracks.row[tracks.seen]] = True
+        taken = among(len(features), tracks.row[tracks.seen])
         rows = np.flatnonzero(~taken & np.isfinite(local[:, 0]))
         points = transform(T_world_left, local[rows])
         ids = np.arange(self._next_track, self._next_track + len(rows), dtype=np.int64)

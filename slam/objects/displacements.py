@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry.se3 import Array, inverse, transform
-from slam.objects.track_kernels import displaced
+from slam.geometry.se3 import Array
+from slam.objects.track_kernels import displaced, places_known
 from slam.objects.tracks import Tracks
 
 RECENT = 5  #: frames that are recent, at most
@@ -65,7 +65,5 @@ def known_well(
         rows (K,), and x/z, y/z, log z of each (K, 3).
     """
     rows = rows[tracks.count(rows) >= min_frames]
-    local = transform(inverse(T_world_left), tracks.position[rows])
-    deviation = np.sqrt(np.trace(tracks.covariance[rows], axis1=1, axis2=2))
-    near = local[:, 2] > _FARTHEST * deviation
-    return rows[near], np.column_stack([local[near, :2] / local[near, 2:], np.log(local[near, 2])])
+    known, place = places_known(tracks.position, tracks.covariance, rows, T_world_left, _FARTHEST)
+    return known, place

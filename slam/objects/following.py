@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS
-from slam.data import StereoFeatures
+from slam.data import BoolArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.bodies import Body
 from slam.objects.candidates import Candidate, region_radius
 from slam.objects.config import ObjectsConfig
-from slam.objects.matching import ByLine, match_far, match_near
-from slam.objects.pixel_kernels import pixel_deviations
+from slam.objects.matching import match_far
+from slam.objects.pixel_kernels import continue_tracks
 from slam.objects.track_kernels import members_ahead
 from slam.objects.tracks import LEAST_INFORMATION, Tracks
 
-_RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 _UNEVEN = 0.3  # share of `max_speed` by which a speed may change from frame to frame
+_NONE = np.zeros((3, 3))
 
 
 def follow(
@@ -51,16 +52,20 @@ def follow(
     tracks.row[:] = -1
     alive = np.flatnonzero(tracks.ids >= 0)
     _advance(tracks, bodies, alive, dt)
-    lost = np.isin(tracks.body[alive], [body.id for body in bodies.values() if body.missed > 1])
+    lost = np.zeros(len(alive), bool)
+    for body in bodies.values():
+        if body.missed > 1:
+            lost |= tracks.body[alive] == body.id
     if len(alive) and len(features):
-        among = ByLine.of(features)
-        _expected(tracks, alive[~lost], T_world_left, among, dt, config, rig, sigma)
+        search = _Search.of(tracks, T_world_left, features, dt, config, rig, sigma)
+        taken = np.zeros(len(features), bool)
+        search.expected(alive[~lost], taken)
         held = tracks.row[tracks.seen & (tracks.body >= 0)]
-        _carried_along(tracks, bodies, candidates, T_world_left, among, dt, config, rig, sigma)
-        _far(tracks, T_world_left, features, measured, dt, config, rig, sigma)
+        _carried_along(search, bodies, candidates, taken)
+        _far(tracks, T_world_left, features, measured, taken, dt, config, rig, sigma)
         if lost.any():
             unclaimed = alive[lost]
-            _expected(tracks, unclaimed, T_world_left, among, dt, config, rig, sigma)
+            search.expected(unclaimed, np.zeros(len(features), bool))
             tracks.row[unclaimed[np.isin(tracks.row[unclaimed], held)]] = -1
     seen = tracks.seen
     tracks.missed[:] = np.where(seen, 0, tracks.missed + 1)
@@ -80,85 +85,91 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
         )
 
 
-def _expected(
-    tracks: Tracks, alive: NDArray[np.intp], T_world_left: Array, among: ByLine, dt: float, config: ObjectsConfig,
-    rig: StereoRig, sigma: float,
-) -> None:  # fmt: skip
-    """Look for tracks where their fit or their body's motion says."""
-    local = (tracks.position[alive] - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-    z, J = rig.project_stereo(local)
-    spread = pixel_deviations(J, T_world_left, tracks.covariance, alive, sigma)
-    size = SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
-    least = np.where(tracks.doubtful[alive], 0.5 * config.search_limit, config.search_radius)
-    radius = np.fmin(np.fmax(size, least), config.search_limit)  # the least where the size is NaN
-    rows, columns = match_near(
-        z[:, :2], radius, tracks.descriptors[alive], tracks.laplacian[alive], among, config.d_match, config.ratio
-    )
-    tracks.row[alive[rows]] = columns
-    _check_right(tracks, alive, among.features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+@dataclass(frozen=True)
+class _Search:
+    """The search for tracks in a frame, in windows about expected places.
 
+    Attributes:
+        tracks: all tracks.
+        T_world_left: the camera's pose (4, 4).
+        order: rows of the frame's features (F,) by ascending line of the left image.
+        features: their left and right pixels (F, 2), descriptors (F, D), and signs of the Laplacian (F,).
+        dt: time since the previous frame [s].
+        config: settings.
+        rig: the cameras.
+        sigma: pixel noise [px].
+    """
 
-def _check_right(
-    tracks: Tracks, alive: NDArray[np.intp], features: StereoFeatures, expected: Array, spread: Array, depth: Array,
-    dt: float, config: ObjectsConfig, rig: StereoRig,
-) -> None:  # fmt: skip
-    """Drop matches whose right pixel says that it is another point, or a false stereo match."""
-    seen = np.flatnonzero(tracks.seen[alive])
-    rows = alive[seen]
-    away = np.abs(features.uv_right[tracks.row[rows], 0] - expected[seen])
-    allowance = _UNEVEN * config.max_speed * dt * rig.left.fu / np.maximum(depth[seen], 1e-3)
-    allowance *= np.where(tracks.count(rows) < config.min_frames, 1.0 / _UNEVEN, 1.0)
-    tracks.row[rows[away > _RIGHT_SIGMAS * spread[seen] + allowance]] = -1  # NaN compares false
+    tracks: Tracks
+    T_world_left: Array
+    order: NDArray[np.intp]
+    features: tuple[NDArray, ...]
+    dt: float
+    config: ObjectsConfig
+    rig: StereoRig
+    sigma: float
+
+    @classmethod
+    def of(
+        cls, tracks: Tracks, T_world_left: Array, f: StereoFeatures, dt: float, config: ObjectsConfig, rig: StereoRig,
+        sigma: float,
+    ) -> _Search:  # fmt: skip
+        """Among the features f of a frame."""
+        arrays = tuple(map(np.ascontiguousarray, (f.uv_left, f.uv_right, f.descriptors, f.laplacian)))
+        return cls(tracks, T_world_left, np.argsort(arrays[0][:, 1], kind="stable"), arrays, dt, config, rig, sigma)
+
+    def expected(self, rows: NDArray[np.intp], taken: BoolArray) -> None:
+        """Look for tracks where their fit or their body's motion says; see `_look`."""
+        c, tracks = self.config, self.tracks
+        least = np.where(tracks.doubtful[rows], 0.5 * c.search_limit, c.search_radius)
+        self._look(rows, tracks.position[rows], _NONE, least, taken)
+
+    def about(self, rows: NDArray[np.intp], ahead: Array, covariance: Array, taken: BoolArray) -> None:
+        """Look for unseen tracks (M,) about places (M, 3) that have a covariance (3, 3); see `_look`."""
+        unseen = self.tracks.row[rows] < 0
+        if unseen.any():
+            least = np.full(len(rows), self.config.search_radius)
+            self._look(rows[unseen], ahead[unseen], covariance, least, taken)
+
+    def _look(self, rows: NDArray[np.intp], places: Array, covariance: Array, least: Array, taken: BoolArray) -> None:
+        """Look for tracks (M,) about places (M, 3), in windows of some least size (M,) [px].
+
+        Features that are `taken` (F,) are not found; those that are found are entered there.
+        """
+        c, tracks, rig = self.config, self.tracks, self.rig
+        local = (places - self.T_world_left[:3, 3]) @ self.T_world_left[:3, :3]
+        z, J = rig.project_stereo(local)
+        allowance = _UNEVEN * c.max_speed * self.dt * rig.left.fu / np.maximum(local[:, 2], 1e-3)
+        allowance *= np.where(tracks.count(rows) < c.min_frames, 1.0 / _UNEVEN, 1.0)
+        tracks.row[rows] = continue_tracks(
+            z, J, self.T_world_left, tracks.covariance, covariance, rows, self.sigma, SIGMAS, least, c.search_limit,
+            tracks.descriptors, tracks.laplacian, allowance, self.order, *self.features, c.d_match, c.ratio, taken,
+        )  # fmt: skip
 
 
 def _carried_along(
-    tracks: Tracks, bodies: Mapping[int, Body], candidates: Sequence[Candidate], T_world_left: Array,
-    among: ByLine, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
+    search: _Search, bodies: Mapping[int, Body], candidates: Sequence[Candidate], taken: BoolArray
 ) -> None:  # fmt: skip
     """Look for young tracks on what moves where it takes them."""
-    young = _young(tracks, config.min_frames - 1)
+    c, tracks, dt = search.config, search.tracks, search.dt
+    young = _young(tracks, c.min_frames - 1)
+    if not len(young):
+        return
     places = tracks.position[young]
     for body in bodies.values():
-        size = config.margin * body.across
+        size = c.margin * body.across
         local = transform(inverse(body.T_before), places)
         on = ((local > body.lower - size) & (local < body.upper + size)).all(axis=1)
         R = body.T[:3, :3]
-        ahead = transform(body.T, local[on])
-        spread = R @ body.covariance[3:, 3:] @ R.T
-        _look_at(tracks, young[on], ahead, spread, T_world_left, among, dt, config, rig, sigma)
-    if not len(young) or not candidates:
+        search.about(young[on], transform(body.T, local[on]), R @ body.covariance[3:, 3:] @ R.T, taken)
+    if not candidates:
         return
     middles = np.array([candidate.state[:3] for candidate in candidates])
-    radius = region_radius(np.linalg.norm(middles - T_world_left[:3, 3], axis=1), config.size)
+    radius = region_radius(np.linalg.norm(middles - search.T_world_left[:3, 3], axis=1), c.size)
     inside = np.linalg.norm(places - middles[:, None], axis=2) < radius[:, None]
     for i in np.flatnonzero(inside.any(axis=1)).tolist():
         on, state, P = inside[i], candidates[i].state, candidates[i].covariance
-        ahead = places[on] + dt * state[3:]
-        _look_at(tracks, young[on], ahead, dt**2 * P[3:, 3:], T_world_left, among, dt, config, rig, sigma)
-
-
-def _look_at(
-    tracks: Tracks, rows: NDArray[np.intp], ahead: Array, covariance: Array, T_world_left: Array,
-    among: ByLine, dt: float, config: ObjectsConfig, rig: StereoRig, sigma: float,
-) -> None:  # fmt: skip
-    """Look for unseen tracks (M,) about places (M, 3) that have a covariance (3, 3), in features not taken yet."""
-    unseen = tracks.row[rows] < 0
-    rows, ahead, features = rows[unseen], ahead[unseen], among.features
-    if not len(rows):
-        return
-    taken = np.zeros(len(features), bool)
-    taken[tracks.row[tracks.seen]] = True
-    local = (ahead - T_world_left[:3, 3]) @ T_world_left[:3, :3]
-    z, J = rig.project_stereo(local)
-    spread = pixel_deviations(J, T_world_left, tracks.covariance[rows] + covariance, np.arange(len(rows)), sigma)
-    size = SIGMAS * np.maximum(spread[:, 0], spread[:, 1])
-    radius = np.fmin(np.fmax(size, config.search_radius), config.search_limit)
-    mine, columns = match_near(
-        z[:, :2], radius, tracks.descriptors[rows], tracks.laplacian[rows], among, config.d_match, config.ratio
-    )
-    free = ~taken[columns]
-    tracks.row[rows[mine[free]]] = columns[free]
-    _check_right(tracks, rows, features, z[:, 2], spread[:, 2], local[:, 2], dt, config, rig)
+        search.about(young[on], places[on] + dt * state[3:], dt**2 * P[3:, 3:], taken)
 
 
 def _young(tracks: Tracks, most: int) -> NDArray[np.intp]:
@@ -168,13 +179,11 @@ def _young(tracks: Tracks, most: int) -> NDArray[np.intp]:
 
 
 def _far(
-    tracks: Tracks, T_world_left: Array, features: StereoFeatures, measured: Array, dt: float, config: ObjectsConfig,
-    rig: StereoRig, sigma: float,
+    tracks: Tracks, T_world_left: Array, features: StereoFeatures, measured: Array, taken: BoolArray, dt: float,
+    config: ObjectsConfig, rig: StereoRig, sigma: float,
 ) -> None:  # fmt: skip
-    """Look for tracks without a velocity yet anywhere that `max_speed` allows."""
+    """Look for tracks without a velocity yet anywhere that `max_speed` allows, in features that are not taken (F,)."""
     left = _young(tracks, config.min_frames)
-    taken = np.zeros(len(features), bool)
-    taken[tracks.row[tracks.seen]] = True
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if not len(left) or not len(free):
         return

@@ -149,6 +149,8 @@ def update_members(
     for body in bodies.values():
         _improve(body, tracks, slot)
         gains[body.id] = _expel(body, tracks, config)
+    if not bodies:
+        return gains
     free = np.flatnonzero((tracks.body < 0) & tracks.seen)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
@@ -218,9 +220,12 @@ def tracks_on_bodies(
     A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not confirmed
     yet belong to the second group.
     """
-    certain = np.isin(tracks.body, [body.id for body in bodies.values() if body.confirmed])
-    on, near = tracks.seen & certain, tracks.seen & (tracks.body >= 0) & ~certain
-    free = np.flatnonzero(tracks.seen & (tracks.body < 0))
+    seen, known = tracks.seen, tracks.body >= 0
+    on = np.zeros(len(tracks), bool)
+    for body in bodies.values():
+        if body.confirmed:
+            on |= seen & (tracks.body == body.id)
+    near, free = seen & known & ~on, np.flatnonzero(seen & ~known)
     for body in bodies.values():
         if not body.measured:
             continue

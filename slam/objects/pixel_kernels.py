@@ -6,29 +6,8 @@ import numpy as np
 
 from slam.runtime.compilation import helper, kernel
 
-
-@kernel
-def pixel_deviations(J, T_world_left, P, rows, sigma):
-    """Deviations (M, 3) of the pixels (uL, vL, uR) of points that are not known exactly.
-
-    Args:
-        J: derivatives of the pixels (M, 3, 3) by the points, in camera axes.
-        T_world_left: pose (4, 4) of the camera.
-        P: covariances of all points (N, 3, 3), in world axes.
-        rows: which points these are (M,).
-        sigma: pixel noise.
-    """
-    out = np.empty((len(rows), 3))
-    g = np.empty(3)
-    for m in range(len(rows)):
-        for i in range(3):
-            _into_world(T_world_left, J[m, i], g)
-            square = sigma * sigma
-            for j in range(3):
-                for k in range(3):
-                    square += g[j] * P[rows[m], j, k] * g[k]
-            out[m, i] = np.sqrt(square)
-    return out
+_NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
+_RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
 
 
 @helper
@@ -110,54 +89,95 @@ def information_in_world(points, usable, J, measured, T_world_left, sigma):
 
 
 @kernel
-def best_in_windows(
-    uv, radius, first, descriptors, signs, feature_uv, feature_descriptors, feature_signs, most, d_match, ratio
-):
+def continue_tracks(
+    z, J, T_world_left, P, more, rows, sigma, sigmas, least, limit, descriptors, signs, allowance, order, feature_uv,
+    feature_uv_right, feature_descriptors, feature_signs, d_match, ratio, taken,
+):  # fmt: skip
     """Features that continue tracks: the best inside a track's window, and that track the best of the feature's.
 
+    A window is as wide as the pixel is uncertain. Matches whose right pixel says that it is another point, or a false
+    stereo match, are dropped.
+
     Args:
-        uv: middles of the windows (N, 2); NaN where there is none.
-        radius: their half sizes (N,) [px].
-        first: the first feature in the rows of pixels of every window (N,).
-        descriptors: of the tracks (N, D).
+        z: expected pixels (M, 3) = (uL, vL, uR); NaN where there are none.
+        J: their derivatives (M, 3, 3) by the points, in camera axes.
+        T_world_left: pose (4, 4) of the camera.
+        P: covariances of all tracks (N, 3, 3), in world axes, and
+        more: what is added to each (3, 3).
+        rows: which tracks these are (M,).
+        sigma: pixel noise [px].
+        sigmas: half sizes of the windows in standard deviations, but
+        least: at least so much (M,) [px], and
+        limit: at most so much [px].
+        descriptors: of all tracks (N, D).
         signs: of their Laplacians (N,).
-        feature_uv: pixels of the features (M, 2), by ascending v.
-        feature_descriptors: their descriptors (M, D).
-        feature_signs: of their Laplacians (M,).
-        most: so many features are looked at in a window, the nearest ones.
+        allowance: how far right pixels may be off besides, by an uneven motion (M,) [px].
+        order: rows of the features (F,) by ascending v.
+        feature_uv: their left pixels (F, 2).
+        feature_uv_right: their right pixels (F, 2); NaN where there is none.
+        feature_descriptors: their descriptors (F, D).
+        feature_signs: the signs of their Laplacians (F,).
         d_match: largest descriptor distance.
         ratio: largest ratio of the best to the second best.
+        taken: which features have a track already (F,); those found are entered.
 
     Returns:
-        the features (N,), −1 where there is none.
+        rows of the features (M,), −1 where there is none.
     """
-    best, distance = np.full(len(uv), -1), np.full(len(uv), np.inf)
-    owner = np.full(len(feature_uv), -1)
-    near, gaps = np.empty(most, np.int64), np.empty(most)
-    for n in range(len(uv)):
-        if not (np.isfinite(uv[n, 0]) and np.isfinite(uv[n, 1])):
+    best, distance = np.full(len(rows), -1), np.full(len(rows), np.inf)
+    right = np.empty(len(rows))
+    owner = np.full(len(order), -1)
+    near, gaps = np.empty(_NEIGHBOURS, np.int64), np.empty(_NEIGHBOURS)
+    deviations, g = np.empty(3), np.empty(3)
+    for m in range(len(rows)):
+        n = rows[m]
+        if not (np.isfinite(z[m, 0]) and np.isfinite(z[m, 1])):
             continue
-        count = _nearest(uv[n], radius[n], feature_uv, first[n], near, gaps)
+        _pixel_deviations(J[m], T_world_left, P[n], more, sigma, g, deviations)
+        right[m] = deviations[2]
+        radius = least[m]
+        if not (np.isnan(deviations[0]) or np.isnan(deviations[1])):
+            radius = max(sigmas * max(deviations[0], deviations[1]), radius)
+        count = _nearest(z[m], min(radius, limit), order, feature_uv, near, gaps)
         second = np.inf
         for c in range(count):
-            m = near[c]
-            if feature_signs[m] != signs[n]:
+            k = near[c]
+            if feature_signs[k] != signs[n]:
                 continue
-            gap = _distance(descriptors[n], feature_descriptors[m])
-            if gap < distance[n]:
-                best[n], distance[n], second = m, gap, distance[n]
+            gap = _distance(descriptors[n], feature_descriptors[k])
+            if gap < distance[m]:
+                best[m], distance[m], second = k, gap, distance[m]
             elif gap < second:
                 second = gap
-        if not (distance[n] < d_match and distance[n] < ratio * second):
-            best[n] = -1
+        if not (distance[m] < d_match and distance[m] < ratio * second):
+            best[m] = -1
             continue
-        rival = owner[best[n]]
-        if rival < 0 or distance[n] < distance[rival]:
-            owner[best[n]] = n
-    for n in range(len(uv)):
-        if best[n] >= 0 and owner[best[n]] != n:
-            best[n] = -1
+        rival = owner[best[m]]
+        if rival < 0 or distance[m] < distance[rival]:
+            owner[best[m]] = m
+    for m in range(len(rows)):
+        k = best[m]
+        best[m] = -1
+        if k < 0 or owner[k] != m or taken[k]:
+            continue
+        if not abs(feature_uv_right[k, 0] - z[m, 2]) > _RIGHT_SIGMAS * right[m] + allowance[m]:  # nor where one is NaN
+            best[m] = k
+    for m in range(len(rows)):
+        if best[m] >= 0:
+            taken[best[m]] = True
     return best
+
+
+@helper
+def _pixel_deviations(J, T_world_left, P, more, sigma, g, out):
+    """Deviations (3,) of the pixels (uL, vL, uR) of a point that is not known exactly; `g` (3,) is overwritten."""
+    for i in range(3):
+        _into_world(T_world_left, J[i], g)
+        square = sigma * sigma
+        for j in range(3):
+            for k in range(3):
+                square += g[j] * (P[j, k] + more[j, k]) * g[k]
+        out[i] = np.sqrt(square)
 
 
 @kernel
@@ -196,10 +216,21 @@ def best_of_products(products, allowed, signs, feature_signs, d_match, ratio):
 
 
 @helper
-def _nearest(middle, radius, uv, first, near, gaps):
-    """Rows of the pixels nearest to `middle` into `near`, the nearest first; how many there are, up to its length."""
+def _nearest(middle, radius, order, uv, near, gaps):
+    """Rows of the pixels nearest to `middle` into `near`, the nearest first; how many there are, up to its length.
+
+    `order` (F,) has the rows of the pixels `uv` (F, 2) by ascending v.
+    """
+    first, end = 0, len(uv)
+    while first < end:
+        half = (first + end) // 2
+        if uv[order[half], 1] < middle[1] - radius:
+            first = half + 1
+        else:
+            end = half
     count = 0
-    for m in range(first, len(uv)):
+    for at in range(first, len(uv)):
+        m = order[at]
         if uv[m, 1] > middle[1] + radius:
             break
         gap = (uv[m, 0] - middle[0]) ** 2 + (uv[m, 1] - middle[1]) ** 2

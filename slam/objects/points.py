@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
+from slam.objects.body_kernels import drift_roots
 
 Projection = Callable[[Array], tuple[Array, Array]]
 
@@ -68,11 +69,12 @@ def shape_of(points: Array, covariances: Array) -> Shape:
     """
     if len(points) < MIN_POINTS:
         return Shape(points.mean(axis=0), 100 * covariances.mean(axis=0))
-    offset = points - points.mean(axis=0)
+    mean, noise = points.mean(axis=0), covariances.mean(axis=0)
+    offset = points - mean
     total = offset.T @ offset / max(1, len(points) - 1)
-    values, axes = np.linalg.eigh(total - covariances.mean(axis=0))
-    least = max(values[1] / 4, 1e-4 * float(np.trace(total)), 1e-3 * float(np.trace(covariances.mean(axis=0))))
-    return Shape(points.mean(axis=0), (axes * np.maximum(values, least)) @ axes.T)
+    values, axes = np.linalg.eigh(total - noise)
+    least = max(values[1] / 4, 1e-4 * float(np.trace(total)), 1e-3 * float(np.trace(noise)))
+    return Shape(mean, (axes * np.maximum(values, least)) @ axes.T)
 
 
 def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Shape) -> tuple[Array, Array]:
@@ -117,12 +119,8 @@ def drift(points: Array, first: Array, now: Array, turned: Array, density: float
     Returns:
         the angles with this sight (p,), and symmetric roots (p, 3, 3) of the covariances to be added [m].
     """
-    before, sight = first - points, now - points
-    angle = np.arctan2(np.linalg.norm(np.cross(before, sight), axis=1), (before * sight).sum(axis=1))
-    angle = np.fmax(angle, turned)  # NaN where a point is nowhere
-    distance = np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None, None]
-    across = np.eye(3) - sight[:, :, None] * sight[:, None, :] / distance**2
-    return angle, np.nan_to_num(density * np.sqrt(angle - turned)[:, None, None] * distance * across)
+    angles, roots = drift_roots(points, first, now, turned, density)
+    return angles, roots
 
 
 def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:

@@ -6,14 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, StereoFeatures
+from slam.geometry.arrays import among
 from slam.geometry.pnp import find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, exp, inverse, transform
 from slam.objects.bodies import Body
+from slam.objects.body_kernels import agreed_correction
 from slam.objects.config import ObjectsConfig
 from slam.objects.matching import match_far
 from slam.objects.points import MIN_POINTS
-from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks, times_vectors
+from slam.objects.tracks import AGREES, LEAST_INFORMATION, Tracks
 
 _SIGMAS = 5.0  # a point agrees with the fit up to so many pixel sigmas
 _HYPOTHESES = 60  # cost: poses tried for a body that is found again
@@ -57,11 +59,14 @@ def locate(
     depth = float(np.linalg.norm(T[:3, 3] - T_world_left[:3, 3]))
     if np.linalg.norm(T[:3, 3] - body.T[:3, 3]) > _reach(body, features.stamp, config) + _DEPTHS * depth:
         return None
-    tracks.row[members] = np.where(np.isin(followed, tracks.row[tracks.seen]), -1, followed)
+    taken = among(len(features), tracks.row[tracks.seen])
+    tracks.row[members] = np.where(taken[followed], -1, followed)  # those that were not seen stay at −1
     tracks.misfit[mine] = np.where(agrees, 0, tracks.misfit[mine] + 1)
     good, matched = mine[agrees], rows[agrees]
-    tracks.row[members[np.isin(followed, matched)]] = -1
-    tracks.give_up(np.flatnonzero((tracks.body < 0) & tracks.seen & np.isin(tracks.row, matched)))
+    measured_now = among(len(features), matched)
+    tracks.row[members[measured_now[followed] & (followed >= 0)]] = -1
+    free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+    tracks.give_up(free[measured_now[tracks.row[free]]])
     tracks.row[good], tracks.missed[good] = matched, 0
     tracks.descriptors[good] = features.descriptors[matched]
     return T
@@ -104,40 +109,25 @@ def _predicted(
 ) -> tuple[Array, BoolArray] | None:  # fmt: skip
     """The same by the body's predicted pose and its points: what these do not say of it stays as predicted.
 
-    A Kalman update whose measurements are the points that stereo gives; those beyond the gate are left out, one after
-    the other. At least two points must agree, and the body must be expected to within what it measures across: else
-    any two agree with one of its poses.
+    See `slam.objects.body_kernels.agreed_correction`. At least two points must agree, and the body must be expected
+    to within what it measures across: else any two agree with one of its poses.
     """
     local = measured[rows]
     deep = np.flatnonzero(np.isfinite(local).all(axis=1))
     if len(deep) < _LEAST_PREDICTED or not _is_expected(body):
         return None
-    y, R = tracks.local[mine[deep]], body.T[:3, :3]
-    axes = R.T @ T_world_left[:3, :3]
-    gaps = transform(inverse(body.T) @ T_world_left, local[deep]) - y
-    noise = axes @ rig.triangulation_covariance(local[deep], sigma) @ axes.T
-    noise += np.linalg.inv(tracks.local_information[mine[deep]] + LEAST_INFORMATION * np.eye(3))
-    information, J = np.linalg.inv(noise), -points_by_pose(y)
-    spread = noise + J @ body.covariance @ np.swapaxes(J, 1, 2)
-    # `_squares` takes matrices: all are (3, 3) but that of the body's pose.
-    agrees = _squares(gaps, np.linalg.inv(spread)) < AGREES
-    known, JA = np.linalg.inv(body.covariance), np.swapaxes(J, 1, 2) @ information
-    while agrees.sum() >= _LEAST_PREDICTED:
-        normal = known + (JA[agrees] @ J[agrees]).sum(axis=0)
-        change = np.linalg.solve(normal, (JA[agrees] @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0])
-        off = np.where(agrees, _squares(gaps - J @ change, information), 0.0)
-        worst = int(np.argmax(off))
-        if off[worst] < AGREES:
-            which = np.zeros(len(rows), bool)
-            which[deep[agrees]] = True
-            return inverse(body.T @ exp(change)) @ T_world_left, which
-        agrees[worst] = False
-    return None
-
-
-def _squares(gaps: Array, information: Array) -> Array:
-    """χ² (N,) of gaps (N, 3) with information (N, 3, 3)."""
-    return np.asarray((gaps * times_vectors(information, gaps)).sum(axis=1))
+    local, known = local[deep], mine[deep]
+    T_body_left = inverse(body.T) @ T_world_left
+    _, J = rig.project_stereo(local)
+    change, agrees, enough = agreed_correction(
+        tracks.local[known], tracks.local_information[known], local, J, T_body_left[:3, :3], T_body_left[:3, 3],
+        body.covariance, np.linalg.inv(body.covariance), sigma, LEAST_INFORMATION, AGREES, _LEAST_PREDICTED,
+    )  # fmt: skip
+    if not enough:
+        return None
+    which = np.zeros(len(rows), bool)
+    which[deep[agrees]] = True
+    return inverse(body.T @ exp(change)) @ T_world_left, which
 
 
 def _by_descriptors(
@@ -149,8 +139,7 @@ def _by_descriptors(
     For a body whose position is unknown, because it was out of view for long, weaker matches are accepted, and the fit
     decides. Features of free tracks may be matched, too: such tracks may have started on the body's points.
     """
-    taken = np.zeros(len(features), bool)
-    taken[tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)]] = True
+    taken = among(len(features), tracks.row[tracks.seen & (tracks.body >= 0) & (tracks.body != body.id)])
     free = np.flatnonzero(~taken & np.isfinite(measured[:, 0]))
     if len(mine) < MIN_POINTS or len(free) < MIN_POINTS:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

@@ -194,8 +194,7 @@ class _Windows:
     @classmethod
     def over(cls, place: Array, support: int) -> _Windows:
         """Windows of every size, each half a width from the next, along every axis."""
-        numbers = np.sort(kernels.cells(place, _SIZES))
-        return cls(*kernels.full_windows(numbers, _SIZES, support))
+        return cls(*kernels.full_windows(place, _SIZES, support))
 
     def inside(self, window: int, count: int) -> BoolArray:
         """Which of `count` tracks are inside a window."""

@@ -108,6 +108,35 @@ def measurements(dof, rows):
 
 
 @kernel
+def places_known(position, covariance, rows, T_world_left, farthest):
+    """Tracks whose depth is known well, and where they are seen.
+
+    Args:
+        position: of the tracks, in world coordinates.
+        covariance: of the positions.
+        rows: of the tracks.
+        T_world_left: pose (4, 4) of the camera.
+        farthest: least ratio of the depth to its deviation.
+
+    Returns:
+        rows (K,), and x/z, y/z, log z of each (K, 3).
+    """
+    known, place, away, count = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
+    for m in range(len(rows)):
+        n = rows[m]
+        for i in range(3):
+            away[i] = position[n, i] - T_world_left[i, 3]
+        depth = _column_times(T_world_left, 2, away)
+        if depth > farthest * np.sqrt(_trace(covariance[n])):
+            known[count] = n
+            for i in range(2):
+                place[count, i] = _column_times(T_world_left, i, away) / depth
+            place[count, 2] = np.log(depth)
+            count += 1
+    return known[:count], place[:count]
+
+
+@kernel
 def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
     """Move what `slot` holds from the windows of all tracks to their fading sums, in place."""
     for n in range(len(ids)):

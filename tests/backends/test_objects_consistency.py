@@ -104,6 +104,24 @@ def test_the_cameras_error_since_the_first_sight_is_in_the_covariance():
 # --- parts of the filter ---
 
 
+def test_points_of_a_body_and_their_derivatives():
+    """Positions by the poses of the first cameras, and derivatives there, back, and by the frame."""
+    rng = np.random.default_rng(8)
+    T = se3.exp(rng.normal(0, 0.4, 6))
+    h = np.array([[0.2, -0.1, 3.0], [-0.5, 0.3, 2.0], [0.1, 0.4, 5.0]])
+    points = BodyPoints.at(T, h)
+    Y = points.cartesian()
+    np.testing.assert_allclose(Y, se3.transform(T, h), atol=1e-12)
+    np.testing.assert_allclose(points.derivatives() @ points.by_position(), np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        moved_points = points.plus(np.tile(step, (3, 1))).cartesian()
+        np.testing.assert_allclose((moved_points - Y) / 1e-6, points.derivatives()[:, :, k], rtol=1e-4, atol=1e-4)
+    by_frame = points.by_position() @ np.concatenate([se3.hat(Y), np.tile(-np.eye(3), (3, 1, 1))], axis=2)
+    np.testing.assert_allclose(points.by_frame(), by_frame.reshape(9, 6), atol=1e-12)
+    behind = BodyPoints(points.T_body_anchor, points.coordinates * [1, 1, -1])
+    assert np.isnan(behind.cartesian()).all()
+
+
 def test_derivatives_of_the_measurement():
     rng = np.random.default_rng(0)
     T = se3.exp(np.array([0.2, -0.1, 0.1, 0.1, 0.05, -1.5]))

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.geometry.se3 import exp
-from slam.objects import scene_kernels, track_kernels
+from slam.geometry.gauss_kernels import near_pairs
+from slam.geometry.se3 import exp, points_by_pose
+from slam.objects import body_kernels, scene_kernels, track_kernels
 
 RNG = np.random.default_rng(5)
 TRACKS, SLOTS = 7, 6
@@ -67,3 +68,59 @@ def test_the_common_motion_solves_the_normal_equations_where_no_track_pulls():
     np.testing.assert_allclose(found, motion, atol=1e-9)
     np.testing.assert_allclose(scene_kernels.squares_against(*problem, found), 0.0, atol=1e-6)
     np.testing.assert_allclose(scene_kernels.squares_against(*problem, np.zeros(6)), 1e4 * (d**2).sum(axis=1))
+
+
+def test_windows_hold_all_tracks_of_their_cells():
+    """Against a dictionary of cells, for every size and offset; tracks ascend, and so do the cells."""
+    rng = np.random.default_rng(5)
+    place, sizes, support = rng.uniform(-1, 1, (120, 3)), np.array([[0.4, 0.4, 0.8], [0.8, 0.8, 1.6]]), 4
+    starts, tracks, centres, widths = scene_kernels.full_windows(place, sizes, support)
+    expected = []
+    for size in sizes:
+        for offset in np.ndindex(2, 2, 2):
+            cells: dict[tuple, list[int]] = {}
+            for n, cell in enumerate(np.floor(place / size + 0.5 * np.array(offset)).astype(int).tolist()):
+                cells.setdefault(tuple(cell), []).append(n)
+            full = sorted(cell for cell, inside in cells.items() if len(inside) >= support)
+            expected += [(size * (np.array(cell) + 0.5 - 0.5 * np.array(offset)), size, cells[cell]) for cell in full]
+    assert len(expected) == len(centres) > 20
+    for m, (centre, width, inside) in enumerate(expected):
+        assert tracks[starts[m] : starts[m + 1]].tolist() == inside
+        np.testing.assert_allclose(centres[m], centre, atol=1e-12)
+        np.testing.assert_allclose(widths[m], width)
+
+
+def test_a_body_is_corrected_by_the_points_that_agree():
+    """Points displaced alike and one that is far off: the correction is the Kalman update without that one."""
+    rng = np.random.default_rng(6)
+    y, sigma, count = rng.uniform(-0.3, 0.3, (7, 3)), 0.5, 7
+    change = np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.01])
+    J_body = -points_by_pose(y)
+    T = exp(np.array([0.3, -0.2, 0.1, 0.5, 1.0, -4.0]))  # T_body_left
+    gaps = J_body @ change + rng.normal(0, 1e-3, (count, 3))
+    gaps[4] += 1.0
+    seen = (y + gaps - T[:3, 3]) @ T[:3, :3]
+    J, information = rng.normal(0, 1, (count, 3, 3)) + 40 * np.eye(3), np.tile(1e4 * np.eye(3), (count, 1, 1))
+    P = np.diag([0.01] * 3 + [0.04] * 3)
+    found, agrees, enough = body_kernels.agreed_correction(
+        y, information, seen, J, T[:3, :3], T[:3, 3], P, np.linalg.inv(P), sigma, 1e-6, 11.3, 2
+    )
+    assert enough and agrees.tolist() == [m != 4 for m in range(count)]
+    B = sigma * T[:3, :3] @ np.linalg.inv(J)
+    W = np.linalg.inv(B @ np.swapaxes(B, 1, 2) + 1e-4 * np.eye(3))[agrees]
+    D = J_body[agrees]
+    normal = np.linalg.inv(P) + (np.swapaxes(D, 1, 2) @ W @ D).sum(axis=0)
+    right = (np.swapaxes(D, 1, 2) @ W @ gaps[agrees][:, :, None]).sum(axis=0)[:, 0]
+    np.testing.assert_allclose(found, np.linalg.solve(normal, right), rtol=1e-6)
+
+
+def test_pairs_of_near_gaussians():
+    """Against χ² of all pairs."""
+    rng = np.random.default_rng(7)
+    first, second = rng.normal(0, 1, (20, 3)), rng.normal(0, 1, (30, 3))
+    P, Q = (rng.normal(0, 0.5, (n, 3, 3)) for n in (20, 30))
+    P, Q = P @ np.swapaxes(P, 1, 2), Q @ np.swapaxes(Q, 1, 2)
+    gaps = first[:, None] - second
+    squares = np.einsum("nmi,nmij,nmj->nm", gaps, np.linalg.inv(P[:, None] + Q), gaps)
+    near = near_pairs(7.8, first, P, second, Q)
+    assert (near == (squares < 7.8)).all() and near.any() and not near.all()
