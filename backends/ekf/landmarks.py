@@ -172,7 +172,8 @@ class Landmarks:
     def slots(self, ids: IdArray | Sequence[int]) -> IndexArray:
         """Slots (M,) of landmarks; raises MeasurementError for one that is not in the map."""
         try:
-            return np.array([self._slots[int(i)] for i in ids], np.intp)
+            listed = ids.tolist() if isinstance(ids, np.ndarray) else map(int, ids)
+            return np.array([self._slots[i] for i in listed], np.intp)
         except KeyError as error:
             raise MeasurementError(f"ekf: landmark {error.args[0]} is not in the map") from None
 
