@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -29,7 +28,8 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 #: ones are left out: `LENS` and `POSE` have them.
 _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
-_FIRST, _SECOND = (list(degrees) for degrees in zip(*RESIDUAL))
+_FIRST, _SECOND = np.array(RESIDUAL).T.copy()
+_SCALES = np.sqrt(2 * np.arange(max(_DEGREES) + 1) + 1)
 _BEYOND = 1.1  # polynomials are held constant beyond the image, this many half widths from its centre
 
 
@@ -155,9 +155,12 @@ class RigModel:
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
-        at = [np.clip((v - c) / h, -_BEYOND, _BEYOND) for v, c, h in zip((x, y), self._centre, self._half)]
-        a, b = (legvander(v, n) * np.sqrt(2 * np.arange(n + 1) + 1) for v, n in zip(at, _DEGREES))
-        return np.asarray((a.T[_FIRST] * b.T[_SECOND]).T)
+        from slam.calibration.model_kernels import polynomials
+
+        out = np.empty((len(RESIDUAL), len(x)))
+        at = np.ascontiguousarray(x), np.ascontiguousarray(y)
+        polynomials(*at, self._centre, self._half, _BEYOND, _SCALES, _FIRST, _SECOND, out)
+        return out.T
 
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
