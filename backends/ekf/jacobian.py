@@ -76,7 +76,3 @@ class Jacobian:
         if self.displacement is not None and self.by_displacement is not None:
             out -= self.displacement.share.T @ (self.by_displacement.T @ Y)
         return out
-
-    def sandwich(self, P: Array) -> Array:
-        """``H P Hᵀ`` (3M, 3M) for a symmetric P (6 + 3M, 6 + 3M)."""
-        return self.times(np.ascontiguousarray(self.times(P).T))
