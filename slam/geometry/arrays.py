@@ -27,6 +27,11 @@ def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
     return np.fromiter(map(set(others.tolist()).__contains__, ids.tolist()), bool, len(ids))
 
 
+def ascending(ids: IdArray) -> bool:
+    """Whether ids (N,) ascend, each once."""
+    return bool((ids[1:] > ids[:-1]).all())
+
+
 def median(values: Array) -> float:
     """The median of some numbers: ``np.median``, which takes longer to begin than these need."""
     ordered = np.sort(values, axis=None)
