@@ -212,8 +212,8 @@ class Covariance:
         by_pose, new = J.reshape(-1, POSE), np.arange(self.count, self.count + len(J))
         cross = by_pose @ self._local[:POSE]
         own = cross[:, :POSE] @ by_pose.T
-        for i, block in enumerate(noise):
-            own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
+        each = np.arange(len(J))
+        own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
         rest = self._rest
         self._place = np.concatenate([self._place, np.zeros(len(J), np.intp)])
         self.count += len(J)
