@@ -101,17 +101,7 @@ class RigModel:
 
     def _unturned(self, points: Array) -> Array:
         """`field` without the rotation."""
-        x, y, d = points.T / self.focal
-        right, n = x - d, len(LENS)
-        out = np.zeros((len(points), 3, len(self.names)))
-        _lens(x, y, out[:, 0, :n], out[:, 1, :n])
-        out[:, 2, :n] = out[:, 0, :n]
-        _lens(right, y, out[:, 2, n : 2 * n], None)
-        pose = out[:, 2, 2 * n :]
-        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 4] = right * y, -1 - right**2, y, d * right
-        out[:, 2, n : 2 * n] *= -1
-        out *= self.focal
-        return out
+        return _field(points, self.focal)
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
@@ -119,15 +109,10 @@ class RigModel:
         A pair of pixels of one point on an ideal rig has none; the baseline's direction adds
         ``d · (forward · y - down)``, which the correction takes away.
         """
-        x, y, d = points.T / self.focal
-        right, n = x - d, len(LENS)
-        out = np.zeros((len(points), len(self.names)))
-        _lens(x, y, None, out[:, :n])
-        out[:, :n] *= -1
-        _lens(right, y, None, out[:, n : 2 * n])
-        pose = out[:, 2 * n :]
-        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3], pose[:, 4] = -1 - y**2, right * y, right, d, -d * y
-        out *= self.focal
+        from slam.calibration.model_kernels import vertical
+
+        out = np.empty((len(points), len(self.names)))
+        vertical(np.ascontiguousarray(points), self.focal, out)
         return out
 
     def residual_products(self, factors: Array, points: Array) -> Array:
@@ -165,21 +150,17 @@ class RigModel:
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
     """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera."""
-    along_x, along_y = np.zeros((2, len(x), len(LENS)))
-    _lens(x, y, along_x, along_y)
-    return along_x, along_y
+    out = _field(np.column_stack([x, y, np.zeros(len(x))]), 1.0)
+    return out[:, 0, : len(LENS)], out[:, 1, : len(LENS)]
 
 
-def _lens(x: Array, y: Array, along_x: Array | None, along_y: Array | None) -> None:
-    """`lens_change`, into what holds zeros."""
-    r2 = x * x + y * y
-    r4, both = r2**2, 2 * x * y
-    if along_x is not None:
-        along_x[:, 0], along_x[:, 2], along_x[:, 4], along_x[:, 5] = 1, x, x * r2, x * r4
-        along_x[:, 6], along_x[:, 7] = both, r2 + 2 * x * x
-    if along_y is not None:
-        along_y[:, 1], along_y[:, 2], along_y[:, 3], along_y[:, 4], along_y[:, 5] = 1, y, y, y * r2, y * r4
-        along_y[:, 6], along_y[:, 7] = r2 + 2 * y * y, both
+def _field(points: Array, focal: float) -> Array:
+    """Change (N, 3, n) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, without the rig's rotation."""
+    from slam.calibration.model_kernels import field
+
+    out = np.empty((len(points), 3, 2 * len(LENS) + len(POSE)))
+    field(np.ascontiguousarray(points), focal, out)
+    return out
 
 
 def _turn(points: Array, focal: float) -> Array:
