@@ -9,14 +9,10 @@ from slam.runtime.compilation import kernel
 
 @kernel
 def polynomials(x, y, centre, half, beyond, scales, first, second, out):
-    """Products of Legendre polynomials at points (N,), into `out` (K, N).
+    """Products of Legendre polynomials of degrees `first` in x and `second` in y (K,), into `out` (K, N).
 
-    Args:
-        x, y: of the points [focal lengths].
-        centre, half: of the image (2,) each [focal lengths].
-        beyond: half widths from the centre at which the polynomials are held.
-        scales: factor of the polynomial of each degree.
-        first, second: degrees (K,) in x and in y.
+    Points x, y (N,) and the image's centre and half size (2,) are in focal lengths. The polynomial of each degree is
+    multiplied by its scale, and held constant so many half sizes `beyond` the centre.
     """
     P = np.ones((2, len(scales)))
     for n in range(len(x)):
@@ -47,7 +43,8 @@ def field(points, focal, out):
                 out[p, 1, 1], out[p, 1, 2], out[p, 1, 3] = focal, y * focal, y * focal
                 out[p, 1, 4], out[p, 1, 5] = y * r2 * focal, y * r4 * focal
                 out[p, 1, 6], out[p, 1, 7] = (r2 + 2 * y * y) * focal, both * focal
-                out[p, 0, 0], out[p, 0, 2], out[p, 0, 4], out[p, 0, 5] = focal, x * focal, x * r2 * focal, x * r4 * focal
+                out[p, 0, 0], out[p, 0, 2] = focal, x * focal
+                out[p, 0, 4], out[p, 0, 5] = x * r2 * focal, x * r4 * focal
                 out[p, 0, 6], out[p, 0, 7] = both * focal, (r2 + 2 * x * x) * focal
             out[p, 2, first], out[p, 2, first + 2] = sign, u * sign
             out[p, 2, first + 4], out[p, 2, first + 5] = u * r2 * sign, u * r4 * sign

@@ -324,7 +324,7 @@ class _Pairs:
     def mutual_best(
         self, d_match: float, ratio: float, size: tuple[int, int], allowed: BoolArray | None = None
     ) -> BoolArray:
-        """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than a landmark's second.
+        """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than the second.
 
         Only pairs that are `allowed` (P,) count; `size` are the numbers of landmarks and of features.
         """

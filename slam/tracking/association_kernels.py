@@ -9,12 +9,10 @@ from slam.runtime.compilation import kernel
 
 @kernel
 def pairs_in_boxes(centres, reach, x, y, rows, places):
-    """Pairs of boxes (M) and of points (N) inside them, by ascending box; returns how many there are.
+    """Pairs of boxes and of points inside them, by ascending box; returns how many there are.
 
-    Args:
-        centres, reach: of the boxes (M, 2).
-        x, y: of the points (N,), ascending in x.
-        rows, places: the pairs, written as far as there is room.
+    Boxes have centres and half sizes `reach` (M, 2); the points x, y (N,) ascend in x. Pairs are written into `rows` of
+    boxes and `places` of points as far as there is room.
     """
     count = 0
     for row in range(len(centres)):
@@ -39,12 +37,8 @@ def pairs_in_boxes(centres, reach, x, y, rows, places):
 def mutual_best(rows, columns, distance, allowed, size, d_match, ratio):
     """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than the row's second.
 
-    Args:
-        rows, columns: of the pairs (P,).
-        distance: theirs (P,).
-        allowed: which pairs count (P,).
-        size: numbers of rows and of columns.
-        d_match, ratio: limits.
+    Pairs are of rows and columns, of which there are `size`, and have a distance; those that are not allowed do not
+    count.
     """
     nearest, second = np.full(size[0], np.float32(np.inf)), np.full(size[0], np.float32(np.inf))
     of_column, good = np.full(size[1], np.float32(np.inf)), np.zeros(len(rows), np.bool_)
