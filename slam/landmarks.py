@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.arrays import isin
+from slam.geometry.arrays import ascending, isin
 from slam.geometry.se3 import Array, transform
 from slam.showing import count
 
@@ -142,7 +142,7 @@ class LandmarkTable:
         """These and others, ids ascending; none may be in both."""
         both = (np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(LandmarkTable))
         whole = LandmarkTable(*both)
-        return whole.select(np.argsort(whole.ids, kind="stable"))
+        return whole if ascending(whole.ids) else whole.select(np.argsort(whole.ids, kind="stable"))
 
     def moved(self, T: Array) -> LandmarkTable:
         """The same in another world frame; `T` (4, 4) transforms coordinates to it."""
@@ -150,4 +150,6 @@ class LandmarkTable:
 
     def select(self, keep: BoolArray | NDArray[np.intp]) -> LandmarkTable:
         """Some of the rows, in order."""
+        if keep.dtype == bool and keep.all():
+            return self
         return LandmarkTable(*(getattr(self, f.name)[keep] for f in fields(LandmarkTable)))

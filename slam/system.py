@@ -303,7 +303,7 @@ class StereoSlam:
         anchors = self._aligner.anchored(self.frontend, seen.aligned, seen.matches, change.added, T)
         if self.landmarks is not None and not len(seen.landmarks):  # left behind: a new map was started
             change = replace(change, erased=np.concatenate([self.landmarks.ids, change.erased]))
-        new = np.setdiff1d(change.added.ids, change.erased)
+        new = change.added.ids[~isin(change.added.ids, change.erased)]
         self._rig_error.uncertainty.change(new, self._positions(new), change.erased)
         return change, anchors
 

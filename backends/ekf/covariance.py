@@ -177,7 +177,7 @@ class Covariance:
 
     def move_camera(self, dt: float, noise: Array) -> None:
         """``P ← A P Aᵀ + noise`` with the printed A of paper B: [r, φ] move by dt times [v, ω]; noise (12, 12)."""
-        P, Phi = self._own()
+        P, Phi = self._camera_rows()
         P[:POSE] += dt * P[POSE:CAMERA]
         P[:, :POSE] += dt * P[:, POSE:CAMERA]
         P[:CAMERA, :CAMERA] = _symmetric(P[:CAMERA, :CAMERA] + noise)
@@ -185,7 +185,7 @@ class Covariance:
 
     def transform_camera(self, J: Array) -> None:
         """``P ← J P Jᵀ`` for a change of the camera's state (12, 12)."""
-        P, Phi = self._own()
+        P, Phi = self._camera_rows()
         rows = J @ P[:CAMERA]
         rows[:, :CAMERA] = _symmetric(rows[:, :CAMERA] @ J.T)
         P[:CAMERA], P[:, :CAMERA] = rows, rows.T
@@ -212,8 +212,8 @@ class Covariance:
         by_pose, new = J.reshape(-1, POSE), np.arange(self.count, self.count + len(J))
         cross = by_pose @ self._local[:POSE]
         own = cross[:, :POSE] @ by_pose.T
-        for i, block in enumerate(noise):
-            own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
+        each = np.arange(len(J))
+        own.reshape(len(J), 3, len(J), 3)[each, :, each] += noise
         rest = self._rest
         self._place = np.concatenate([self._place, np.zeros(len(J), np.intp)])
         self.count += len(J)
@@ -239,7 +239,7 @@ class Covariance:
         stay = ~gone[self._slots]
         if not stay.all():
             rows = np.concatenate([np.ones(CAMERA, bool), np.repeat(stay, 3)])
-            self._local, self._Phi = _kept(self._local, rows), self._Phi[rows]
+            self._local, self._Phi, self._mine = _kept(self._local, rows), self._Phi[rows], True
             self._slots = self._slots[stay]
         for hole, mover in zip(holes.tolist(), movers.tolist()):
             if self._place[mover] < 0:  # what is stored of local ones does not count
@@ -290,8 +290,7 @@ class Covariance:
         larger = np.empty((old + len(own), old + len(own)))
         larger[:old, :old], larger[:old, old:] = self._local, cross.T
         larger[old:, :old], larger[old:, old:] = cross, _symmetric(own)
-        self._local = larger
-        self._Phi = np.concatenate([self._Phi, Phi])
+        self._local, self._Phi, self._mine = larger, np.concatenate([self._Phi, Phi]), True
         self._place = self._place.copy()
         self._place[slots] = len(self._slots) + np.arange(len(slots))
         self._slots = np.concatenate([self._slots, slots])
@@ -341,6 +340,13 @@ class Covariance:
         P[row + 3 : self.size, to : to + 3] = P[row + 3 : self.size, row : row + 3]
         P[to : to + 3, to : to + 3] = P[row : row + 3, row : row + 3]
         self._X[to : to + 3] = self._X[row : row + 3]
+
+    def _camera_rows(self) -> tuple[Array, Array]:
+        """P_LL and Φ, of which the camera's rows and columns are to be changed in place."""
+        if not self._mine:
+            for array in (self._local, self._local.T, self._Phi):
+                self._note(array, slice(CAMERA))
+        return self._local, self._Phi
 
     def _own(self) -> tuple[Array, Array]:
         """P_LL and Φ, to be changed in place: copies, once after each `saved`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -257,7 +258,7 @@ class EkfBackend:
             prior, state.covariance.marginal(slots), z, self.models.pixel_sigma, model,
             self.config.iterations, self.models.gate_probability,
             None if guess is None else state.change_to(guess),
-            state.gauge_jacobian(slots) if state.consistent else None,
+            partial(state.gauge_jacobian, slots) if state.consistent else None,
         )  # fmt: skip
 
     def _inflated_noises(self) -> list[Array]:

@@ -43,7 +43,7 @@ class Jacobian:
     @classmethod
     def of(cls, line: Linearisation, rows: BoolArray, displacement: Displacement | None = None) -> Jacobian:
         """From derivatives; zero where a row is not measured (mask (M, 3))."""
-        by_pose, own = line.by_pose, line.own
+        by_pose, own = line.by_pose, np.ascontiguousarray(line.own)
         if not rows.all():
             by_pose, own = np.where(rows[:, :, None], by_pose, 0.0), np.where(rows[:, :, None], own, 0.0)
         plain = cls(by_pose, own)
@@ -59,10 +59,10 @@ class Jacobian:
 
     def times(self, X: Array) -> Array:
         """``H X`` (3M, N) for X (6 + 3M, N)."""
-        m, n = len(self.own), X.shape[1]
-        out = np.empty((3 * m, n))
-        np.matmul(self.own, X[6:].reshape(m, 3, n), out=out.reshape(m, 3, n))
-        out += self.by_pose.reshape(3 * m, 6) @ X[:6]
+        from backends.ekf.jacobian_kernels import times
+
+        out = np.empty((3 * len(self.own), X.shape[1]))
+        times(self.by_pose, self.own, np.ascontiguousarray(X), out)
         if self.displacement is not None and self.by_displacement is not None:
             out -= self.by_displacement @ (self.displacement.share @ X)
         return np.asarray(out)
@@ -76,7 +76,3 @@ class Jacobian:
         if self.displacement is not None and self.by_displacement is not None:
             out -= self.displacement.share.T @ (self.by_displacement.T @ Y)
         return out
-
-    def sandwich(self, P: Array) -> Array:
-        """``H P Hᵀ`` (3M, 3M) for a symmetric P (6 + 3M, 6 + 3M)."""
-        return self.times(np.ascontiguousarray(self.times(P).T))

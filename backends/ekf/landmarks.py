@@ -172,7 +172,8 @@ class Landmarks:
     def slots(self, ids: IdArray | Sequence[int]) -> IndexArray:
         """Slots (M,) of landmarks; raises MeasurementError for one that is not in the map."""
         try:
-            return np.array([self._slots[int(i)] for i in ids], np.intp)
+            listed = ids.tolist() if isinstance(ids, np.ndarray) else map(int, ids)
+            return np.array([self._slots[i] for i in listed], np.intp)
         except KeyError as error:
             raise MeasurementError(f"ekf: landmark {error.args[0]} is not in the map") from None
 
@@ -196,9 +197,7 @@ class Landmarks:
 
     def remove(self, ids: IdArray, holes: IndexArray, movers: IndexArray) -> None:
         """Forget landmarks; `holes` are filled from `movers`, as the covariance has done (`Covariance.drop`)."""
-        left, gone = len(self) - len(ids), set(ids.tolist())
-        moved = dict(zip(self.ids[movers].tolist(), holes.tolist()))
-        self._slots = {i: moved.get(i, slot) for i, slot in self._slots.items() if i not in gone}
+        left = len(self) - len(ids)
 
         def rest(array: NDArray[Any]) -> NDArray[Any]:
             out = array[:left].copy()
@@ -207,6 +206,7 @@ class Landmarks:
 
         self.ids, self.anchors, self.state = rest(self.ids), rest(self.anchors), rest(self.state)
         self.points, self.gauge_jacobian = rest(self.points), rest(self.gauge_jacobian)
+        self._slots = dict(zip(self.ids.tolist(), range(left)))
 
     def move(self, change: Array) -> None:
         """Add to the coordinates (N, 3)."""

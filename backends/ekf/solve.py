@@ -10,6 +10,7 @@ A component that is not measured (or gated) keeps its row with a zero Jacobian a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,8 @@ _LINEAR = 1.0
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
 
+_SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
+
 _LATER = np.maximum(np.arange(3)[:, None], np.arange(3))  # row of an entry in the lower triangle of a symmetric block
 _EARLIER = np.minimum(np.arange(3)[:, None], np.arange(3))
 
@@ -56,6 +59,7 @@ class Problem:
         iterations: most linearisations.
         gate_probability: quantile of χ² beyond which a landmark's measurement is rejected.
         guess: a change of [r, φ] (6,) worth trying where the prior is far off, or None.
+        gauge_jacobian: gives the Jacobian (6 + 3M, 6) of g by a displacement of the world, if that is unobservable.
     """
 
     prior: Array
@@ -66,7 +70,7 @@ class Problem:
     iterations: int
     gate_probability: float
     guess: Array | None = None
-    gauge_jacobian: Array | None = None
+    gauge_jacobian: Callable[[], Array] | None = None
 
     @cached_property
     def displacement(self) -> Displacement | None:
@@ -76,7 +80,7 @@ class Problem:
         """
         if self.gauge_jacobian is None:
             return None
-        U = self.gauge_jacobian
+        U = self.gauge_jacobian()
         lower, info = dpotrf(self.covariance[6:, 6:].T, lower=1, clean=0)
         if info != 0:
             return None
@@ -108,6 +112,7 @@ class Solution:
         measured: which rows (3M,) are measured.
         nis: ``νᵀ S⁻¹ ν`` with the innovation taken back to the prior through the last linearisation.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
+        variances: of [r, φ] (6,) after the update.
     """
 
     used: BoolArray
@@ -117,6 +122,7 @@ class Solution:
     measured: BoolArray
     nis: float
     distances: Array
+    variances: Array
 
     @cached_property
     def B(self) -> Array:
@@ -149,12 +155,17 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _System:
-    """The linear update at an iterate: Jacobian H, innovation ν taken back to the prior, its covariance S."""
+    """The linear update at an iterate: Jacobian H, innovation ν taken back to the prior, its covariance S.
+
+    `cross` is the innovation's covariance (3M, 6) with [r, φ], whose prior variances (6,) are `prior`.
+    """
 
     rows: BoolArray
     H: Jacobian
     nu: Array
     S: Array
+    cross: Array
+    prior: Array
 
     @cached_property
     def L(self) -> Array:
@@ -164,6 +175,12 @@ class _System:
             raise UnsolvableError("the innovation covariance is not positive definite")
         return np.asarray(L)
 
+    @cached_property
+    def variances(self) -> Array:
+        """Of [r, φ] (6,) after the update; rounding may leave one that is not positive."""
+        W = dtrtrs(self.L, self.cross, lower=1)[0]
+        return np.asarray(self.prior - (W * W).sum(axis=0))
+
     def only(self, rows: BoolArray, sigma: float) -> _System:
         """With fewer rows (mask (M, 3))."""
         if (rows == self.rows).all():
@@ -171,7 +188,8 @@ class _System:
         kept = rows.reshape(-1)
         S = np.where(kept[:, None] & kept, self.S, 0.0)
         S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
-        return _System(rows, self.H.only(rows), np.where(kept, self.nu, 0.0), S)
+        nu, cross = np.where(kept, self.nu, 0.0), np.where(kept[:, None], self.cross, 0.0)
+        return _System(rows, self.H.only(rows), nu, S, cross, self.prior)
 
 
 @dataclass(frozen=True)
@@ -229,7 +247,8 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
         excess = solution.distances / gated.limits
         worst = excess.max()
         if worst <= 1:
-            _require_positive(problem, solution)
+            if not (solution.variances > 0).all():
+                raise UnsolvableError("the pose's variances would not stay positive")
             return solution
         used = used & (excess <= max(1.0, 0.5 * worst))
     return None
@@ -267,16 +286,22 @@ def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System)
         if iteration == problem.iterations or following is now:
             break
         now, system = following, _system(problem, rows, following)
-    inverse = np.asarray(dtrtri(system.L, lower=1)[0])  # L⁻¹
+    inverse = _inverse(system.L)
     distances = _conditional_distances(inverse, y)
-    return Solution(used, s, system.H, inverse, rows.reshape(-1), float(system.nu @ y), distances)
+    nis = float(system.nu @ y)
+    return Solution(used, s, system.H, inverse, rows.reshape(-1), nis, distances, system.variances)
 
 
-def _require_positive(problem: Problem, solution: Solution) -> None:
-    """Raise where rounding leaves a variance of the pose that is not positive."""
-    W = solution.whitened(problem.covariance[:, :6])
-    if not (problem.covariance.diagonal()[:6] > (W * W).sum(axis=0)).all():
-        raise UnsolvableError("the pose's variances would not stay positive")
+def _inverse(L: Array) -> Array:
+    """``L⁻¹`` of a lower triangular L (N, N), by halves: LAPACK's own takes twice as long for many rows."""
+    half = len(L) // 2
+    if half < _SMALL:
+        return np.asarray(dtrtri(L, lower=1)[0])
+    first, last = _inverse(L[:half, :half]), _inverse(L[half:, half:])
+    out = np.zeros(L.shape, order="F")
+    out[:half, :half], out[half:, half:] = first, last
+    out[half:, :half] = dtrmm(1.0, last, dtrmm(-1.0, first, L[half:, :half], side=1, lower=1), lower=1)
+    return out
 
 
 def _solved(system: _System) -> Array:
@@ -290,10 +315,8 @@ def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterat
     errors = np.where(system.rows, following.z - now.z - expected, 0.0)
     if np.abs(errors).max() >= _LINEAR * problem.sigma:
         return False
-    moved = problem.covariance[:6] @ system.H.transposed_times(dpotrs(system.L, errors.reshape(-1, 1), lower=1)[0])
-    W = dtrtrs(system.L, system.H.times(problem.covariance[:, :6]), lower=1)[0]
-    variances = problem.covariance.diagonal()[:6] - (W * W).sum(axis=0)
-    return bool((moved[:, 0] ** 2 <= _POSE_SHARE**2 * variances).all())
+    moved = system.cross.T @ dpotrs(system.L, errors.reshape(-1), lower=1)[0]
+    return bool((moved**2 <= _POSE_SHARE**2 * system.variances).all())
 
 
 def _cost(problem: Problem, rows: BoolArray, z: Array, prior_cost: float) -> float:
@@ -336,9 +359,10 @@ def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisatio
     nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
     if now.change.any():
         nu += H.times(now.change[:, None])[:, 0]
-    S = H.sandwich(problem.covariance)
+    HP = H.times(problem.covariance)
+    S = H.times(HP.T)
     S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    return _System(rows, H, nu, S)
+    return _System(rows, H, nu, S, HP[:, :6], problem.covariance.diagonal()[:6])
 
 
 def _conditional_distances(inverse: Array, y: Array) -> Array:
@@ -357,12 +381,12 @@ def _conditional_distances(inverse: Array, y: Array) -> Array:
 
 def _squared_distances(nu: Array, covariances: Array) -> Array:
     """``ν_jᵀ S_j⁻¹ ν_j`` (M,) for the parts ν_j of ν (3M,) and positive definite S_j (M, 3, 3)."""
-    nu = nu.reshape(-1, 3)
-    try:
-        whitened = np.linalg.solve(covariances, nu[:, :, None])[:, :, 0]
-    except np.linalg.LinAlgError:
-        raise UnsolvableError("the innovation covariance is not positive definite") from None
-    return np.asarray((whitened * nu).sum(axis=1))
+    from slam.geometry.gauss_kernels import squared_distances
+
+    distances = np.asarray(squared_distances(nu.reshape(-1, 3), covariances))
+    if np.isnan(distances).any():
+        raise UnsolvableError("the innovation covariance is not positive definite")
+    return distances
 
 
 def _diagonal_blocks(lower: Array) -> Array:

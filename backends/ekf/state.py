@@ -149,9 +149,9 @@ class FilterState:
     def place(self, ids: IdArray, h: Array, covariances: Array) -> None:
         """Add landmarks at h (M, 3) in the camera's coordinates with covariances (M, 3, 3) (paper A, Eq. 10)."""
         R, E = attitude(self.R_world_angles, self.camera[3:6]), body_rate_matrix(self.camera[3:6])
-        J = np.tile(np.eye(3, POSE), (len(h), 1, 1))
+        J = np.repeat(np.eye(3, POSE)[None], len(h), axis=0)
         J[:, :, 3:] = -R @ se3.hat(h) @ E  # turning by δθ = E δφ about the camera's axes moves h by δθ × h
-        anchors = np.tile(self.pose()[:3], (len(h), 1, 1))
+        anchors = np.repeat(self.pose()[None, :3], len(h), axis=0)
         self.append(ids, anchors, self.camera[:3] + h @ R.T, J, R @ covariances @ R.T)
 
     def append(self, ids: IdArray, anchors: Array, points: Array, J: Array, covariances: Array) -> None:

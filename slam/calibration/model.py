@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
@@ -29,7 +28,8 @@ _UNITS = {"cx": "focal lengths", "cy": "focal lengths", "pitch": "rad", "yaw": "
 #: ones are left out: `LENS` and `POSE` have them.
 _DEGREES = 5, 3
 RESIDUAL = tuple((i, j) for i in range(_DEGREES[0] + 1) for j in range(_DEGREES[1] + 1) if i + j > 1)
-_FIRST, _SECOND = (list(degrees) for degrees in zip(*RESIDUAL))
+_FIRST, _SECOND = np.array(RESIDUAL).T.copy()
+_SCALES = np.sqrt(2 * np.arange(max(_DEGREES) + 1) + 1)
 _BEYOND = 1.1  # polynomials are held constant beyond the image, this many half widths from its centre
 
 
@@ -101,17 +101,7 @@ class RigModel:
 
     def _unturned(self, points: Array) -> Array:
         """`field` without the rotation."""
-        x, y, d = points.T / self.focal
-        right, n = x - d, len(LENS)
-        out = np.zeros((len(points), 3, len(self.names)))
-        _lens(x, y, out[:, 0, :n], out[:, 1, :n])
-        out[:, 2, :n] = out[:, 0, :n]
-        _lens(right, y, out[:, 2, n : 2 * n], None)
-        pose = out[:, 2, 2 * n :]
-        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 4] = right * y, -1 - right**2, y, d * right
-        out[:, 2, n : 2 * n] *= -1
-        out *= self.focal
-        return out
+        return _field(points, self.focal)
 
     def vertical(self, points: Array) -> Array:
         """Change (N, n) [px] of the vertical disparity, right row less left row, by the parameters.
@@ -119,15 +109,10 @@ class RigModel:
         A pair of pixels of one point on an ideal rig has none; the baseline's direction adds
         ``d · (forward · y - down)``, which the correction takes away.
         """
-        x, y, d = points.T / self.focal
-        right, n = x - d, len(LENS)
-        out = np.zeros((len(points), len(self.names)))
-        _lens(x, y, None, out[:, :n])
-        out[:, :n] *= -1
-        _lens(right, y, None, out[:, n : 2 * n])
-        pose = out[:, 2 * n :]
-        pose[:, 0], pose[:, 1], pose[:, 2], pose[:, 3], pose[:, 4] = -1 - y**2, right * y, right, d, -d * y
-        out *= self.focal
+        from slam.calibration.model_kernels import vertical
+
+        out = np.empty((len(points), len(self.names)))
+        vertical(np.ascontiguousarray(points), self.focal, out)
         return out
 
     def residual_products(self, factors: Array, points: Array) -> Array:
@@ -155,28 +140,27 @@ class RigModel:
 
     def _polynomials(self, x: Array, y: Array) -> Array:
         """Products of Legendre polynomials (N, k), with a mean square of one over the image."""
-        at = [np.clip((v - c) / h, -_BEYOND, _BEYOND) for v, c, h in zip((x, y), self._centre, self._half)]
-        a, b = (legvander(v, n) * np.sqrt(2 * np.arange(n + 1) + 1) for v, n in zip(at, _DEGREES))
-        return np.asarray((a.T[_FIRST] * b.T[_SECOND]).T)
+        from slam.calibration.model_kernels import polynomials
+
+        out = np.empty((len(RESIDUAL), len(x)))
+        at = np.ascontiguousarray(x), np.ascontiguousarray(y)
+        polynomials(*at, self._centre, self._half, _BEYOND, _SCALES, _FIRST, _SECOND, out)
+        return out.T
 
 
 def lens_change(x: Array, y: Array) -> tuple[Array, Array]:
     """Change of x and of y (N, 8 each) [focal lengths] by the parameters of one camera."""
-    along_x, along_y = np.zeros((2, len(x), len(LENS)))
-    _lens(x, y, along_x, along_y)
-    return along_x, along_y
+    out = _field(np.column_stack([x, y, np.zeros(len(x))]), 1.0)
+    return out[:, 0, : len(LENS)], out[:, 1, : len(LENS)]
 
 
-def _lens(x: Array, y: Array, along_x: Array | None, along_y: Array | None) -> None:
-    """`lens_change`, into what holds zeros."""
-    r2 = x * x + y * y
-    r4, both = r2**2, 2 * x * y
-    if along_x is not None:
-        along_x[:, 0], along_x[:, 2], along_x[:, 4], along_x[:, 5] = 1, x, x * r2, x * r4
-        along_x[:, 6], along_x[:, 7] = both, r2 + 2 * x * x
-    if along_y is not None:
-        along_y[:, 1], along_y[:, 2], along_y[:, 3], along_y[:, 4], along_y[:, 5] = 1, y, y, y * r2, y * r4
-        along_y[:, 6], along_y[:, 7] = r2 + 2 * y * y, both
+def _field(points: Array, focal: float) -> Array:
+    """Change (N, 3, n) [px] of points ``(x, y, d)`` (N, 3) [px] by the parameters, without the rig's rotation."""
+    from slam.calibration.model_kernels import field
+
+    out = np.empty((len(points), 3, 2 * len(LENS) + len(POSE)))
+    field(np.ascontiguousarray(points), focal, out)
+    return out
 
 
 def _turn(points: Array, focal: float) -> Array:

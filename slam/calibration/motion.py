@@ -97,26 +97,24 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         focal: focal length [px].
         noise: covariance of a point (3, 3) [px²]; only its form matters.
     """
+    from slam.calibration.motion_kernels import move_points, normal_equations
+
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
     points, at = first, Linear.empty(len(first))
+    normal, right = np.empty((6, 6)), np.empty(6)
     for _ in range(_ITERATIONS):
         _linearise(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
             return None
         weights = student_weights(distance, 3, _LEAST_NOISE)
-        root = np.sqrt(weights)[:, None]
-        A, b = (root[..., None] * at.motion).reshape(-1, 6), (root * at.residual).ravel()
-        normal = A.T @ A
-        normal += 1e-12 * np.trace(normal) * np.eye(6)
-        step = np.linalg.solve(normal, A.T @ b)
+        normal_equations(at.motion, at.residual, weights, normal, right)
+        step = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(6), right)
         if not np.isfinite(step).all():
             return None
-        change = at.J_motion.reshape(-1, 6) @ step
         R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        left = np.einsum("nij,ni->nj", at.white, at.residual - (at.motion.reshape(-1, 6) @ step).reshape(-1, 3))
-        points = first + np.einsum("nij,ni->nj", at.J_point, left) @ noise
-        last = float(np.abs(change).max())
+        points = np.empty_like(first)
+        last = move_points(first, at.J_point, at.J_motion, at.motion, at.white, at.residual, noise, step, points)
         if last < _CONVERGED:
             break
     return Fit(R, t, points, at, weights) if last < _NEARLY else None

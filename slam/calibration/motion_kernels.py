@@ -1,4 +1,4 @@
-"""Compiled loop of `slam.calibration.motion`."""
+"""Compiled loops of `slam.calibration.motion`."""
 
 from __future__ import annotations
 
@@ -65,3 +65,55 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
                 motion[n, i, k] = 0.0
                 for j in range(i + 1):
                     motion[n, i, k] += white[n, i, j] * J_motion[n, j, k]
+
+
+@kernel
+def normal_equations(motion, residual, weights, normal, right):
+    """``Jᵀ W J`` into `normal` (6, 6) and ``Jᵀ W r`` into `right` (6,).
+
+    J (N, 3, 6) and r (N, 3) are whitened; W are the points' weights (N,).
+    """
+    for j in range(6):
+        right[j] = 0.0
+        for k in range(6):
+            normal[j, k] = 0.0
+    for n in range(len(motion)):
+        for i in range(3):
+            for j in range(6):
+                a = weights[n] * motion[n, i, j]
+                right[j] += a * residual[n, i]
+                for k in range(j + 1):
+                    normal[j, k] += a * motion[n, i, k]
+    for j in range(6):
+        for k in range(j):
+            normal[k, j] = normal[j, k]
+
+
+@kernel
+def move_points(first, J_point, J_motion, motion, white, residual, noise, step, points):
+    """The first view's points after a step (6,) of the motion, into `points` (N, 3); returns how far they move [px].
+
+    That is the largest change of a coordinate of a point in the second view. For the other arguments see
+    `slam.calibration.motion.Linear`.
+    """
+    left, back = np.zeros(3), np.zeros(3)
+    last = 0.0
+    for n in range(len(first)):
+        for j in range(3):
+            left[j] = back[j] = 0.0
+        for i in range(3):
+            change, r = 0.0, residual[n, i]
+            for k in range(6):
+                change += J_motion[n, i, k] * step[k]
+                r -= motion[n, i, k] * step[k]
+            last = max(last, abs(change))
+            for j in range(i + 1):
+                left[j] += white[n, i, j] * r
+        for i in range(3):
+            for j in range(3):
+                back[j] += J_point[n, i, j] * left[i]
+        for j in range(3):
+            points[n, j] = first[n, j]
+            for k in range(3):
+                points[n, j] += back[k] * noise[k, j]
+    return last

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from slam.geometry.arrays import Array, IdArray, isin
 from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
@@ -115,11 +115,13 @@ class SensitivityState:
         size, count, H = len(self.by_rig), 3 * len(rows), H @ self.T_world[:3, :3].T
         HC = (H @ self.covariance[columns]).reshape(count, size)
         innovation = (HC[:, columns][:, :, None] @ np.swapaxes(H, 1, 2)).reshape(count, count)
-        innovation += np.kron(np.eye(len(rows)), noise)
-        innovation[np.diag_indices(count)] += _ROUNDING * innovation.trace()
+        _add_blocks(innovation, noise)
+        innovation.reshape(-1)[:: count + 1] += _ROUNDING * innovation.trace()
         residual = (field - H @ self.by_rig[columns]).reshape(count, -1)
-        root = cholesky(innovation, lower=True, check_finite=False)
-        whitened = solve_triangular(root, np.hstack([HC, residual]), lower=True, check_finite=False)
+        root, info = dpotrf(innovation, lower=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
+        whitened = dtrtrs(root, np.hstack([HC, residual]), lower=1)[0]
         gain, residual = whitened[:, :size], whitened[:, size:]
         by_rig, covariance = self.by_rig + gain.T @ residual, self.covariance - gain.T @ gain
         return replace(seen, by_rig=by_rig, covariance=covariance)
@@ -171,8 +173,7 @@ class SensitivityState:
         lever = (by_pose @ part).reshape(size, 6)
         chance = (by_pose @ left).reshape(size, 6)
         own = lever @ now @ lever.T + chance @ chance.T
-        for i, P in enumerate(frozen.relative):
-            own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += P
+        _add_blocks(own, frozen.relative)
         return self._with(frozen.ids, local, by_rig.reshape(size, -1), across, own)
 
     def frozen(self) -> InactiveLandmarks:
@@ -204,14 +205,24 @@ class SensitivityState:
 
     def _with(self, ids: IdArray, local: Array, by_rig: Array, across: Array, own: Array) -> SensitivityState:
         """The state with more landmarks, given their covariances with the state and with each other."""
+        n = len(self.covariance)
+        covariance = np.empty((n + len(own), n + len(own)))
+        covariance[:n, :n], covariance[:n, n:] = self.covariance, across.T
+        covariance[n:, :n], covariance[n:, n:] = across, own
         return replace(
             self,
             ids=np.concatenate([self.ids, ids]),
             local=np.concatenate([self.local, local]),
             unseen=np.concatenate([self.unseen, np.zeros(len(ids), np.int64)]),
             by_rig=np.concatenate([self.by_rig, by_rig]),
-            covariance=np.block([[self.covariance, across.T], [across, own]]),
+            covariance=covariance,
         )
+
+
+def _add_blocks(M: Array, blocks: Array) -> None:
+    """Add one or K blocks (3, 3) to those on the diagonal of M (3K, 3K), which is contiguous."""
+    each = np.arange(len(M) // 3)
+    M.reshape(len(each), 3, len(each), 3)[each, :, each] += blocks
 
 
 def _positive(D: Array) -> Array:

@@ -105,8 +105,9 @@ def _nearest(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[N
     likeness[every, best] = -1.0
     clear = 1 - nearest < _RATIO**2 * (1 - likeness.max(axis=1))  # of unit vectors, |a - b|² = 2 (1 - a·b)
     rows = np.flatnonzero((nearest == most[best]) & clear)
-    once = np.unique(best[rows], return_index=True)[1]  # of equally near ones, the first
-    rows = rows[np.sort(once)]
+    first = np.empty(len(second), np.intp)
+    first[best[rows[::-1]]] = rows[::-1]
+    rows = rows[first[best[rows]] == rows]  # of equally near ones, the first
     return rows, best[rows]
 
 

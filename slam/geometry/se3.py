@@ -20,6 +20,7 @@ from slam.geometry.arrays import Array as Array
 #: numerics: Variance [rad², m²] that a covariance has at least, or that is added to it, to keep it invertible.
 LEAST_VARIANCE = 1e-12
 
+_MINUS_ONE = -np.eye(3)
 _SMALL = 1e-5  # numerics: below this angle [rad] series are exact to double precision
 _SMALL_CUBIC = 1e-2  # numerics: the same where a difference of third order is taken
 
@@ -184,7 +185,9 @@ def adjoint(T: Array) -> Array:
 
 def points_by_pose(local: Array) -> Array:
     """Derivatives (N, 3, 6) of fixed points, at `local` (N, 3) in a frame, by the frame's pose: ``[hat(p), −1]``."""
-    return np.concatenate([hat(local), np.broadcast_to(-np.eye(3), (len(local), 3, 3))], axis=2)
+    out = np.empty((len(local), 3, 6))
+    out[:, :, :3], out[:, :, 3:] = hat(local), _MINUS_ONE
+    return out
 
 
 def rotation_angle(R: Array) -> Array:

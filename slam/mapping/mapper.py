@@ -139,7 +139,7 @@ class Mapper:
         landmarks = change.landmarks.select(~stale)
         backend.place(ids, returned.local[free], returned.covariances[free])
         rows = returned.rows[free]
-        landmarks = landmarks.with_new(step.index, ids, step.features, rows, self._camera(backend))
+        landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
         return replace(change, landmarks=landmarks, returned=LandmarkMatches(ids, rows))
 
     def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
@@ -217,7 +217,7 @@ class Mapper:
         added = LandmarkMatches(self._new_ids(len(rows)), rows)
         if len(added):
             backend.add(added.observations(features))
-            landmarks = landmarks.with_new(step.index, added.ids, features, rows, self._camera(backend))
+            landmarks = landmarks.with_new(step.index, added.ids, features, rows, step.estimate.T_world_left[:3, 3])
         if self._monocular is not None:
             return self._add_monocular(self._monocular, backend, landmarks, step, added, free)
         return landmarks, added
@@ -246,7 +246,7 @@ class Mapper:
             return landmarks, added
         ids = self._new_ids(len(best))
         backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
-        landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], self._camera(backend))
+        landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
         both = LandmarkMatches(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
         return landmarks, both
 
@@ -255,8 +255,3 @@ class Mapper:
         ids = np.arange(self.next_id, self.next_id + count, dtype=np.int64)
         self.next_id += count
         return ids
-
-    @staticmethod
-    def _camera(backend: Backend) -> np.ndarray:
-        """The camera's position (3,)."""
-        return backend.estimate(landmarks=False).T_world_left[:3, 3]

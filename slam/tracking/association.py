@@ -19,7 +19,7 @@ from slam.models import FORBID_UNKNOWN, require_not_negative
 
 Descriptors = NDArray[np.float32]
 
-_NONE = np.float32(np.inf)
+_ROOM = 8  # cost: pairs a box for which there is room at once
 _LARGE = 0.03  # cost: if windows fill more than this share of the image, all descriptors are compared first
 
 _POSES = (0, 100_000)  # guard: bounds of the number of poses tried in a frame
@@ -189,7 +189,7 @@ def match_everywhere(
         return Matches(np.zeros(0, np.intp), np.zeros(0, np.intp))
     rows, columns = _alike(descriptors, laplacian, features, config.wide_d_match / config.wide_ratio)
     pairs = _Pairs(rows, columns, _distances(descriptors, features.descriptors, rows, columns))
-    best = pairs.mutual_best(config.wide_d_match, config.wide_ratio, len(features))
+    best = pairs.mutual_best(config.wide_d_match, config.wide_ratio, (len(descriptors), len(features)))
     return Matches(pairs.rows[best], pairs.columns[best])
 
 
@@ -218,7 +218,7 @@ def match_in_boxes(
     same = laplacian[which] == features.laplacian[member]
     which, member = which[same], member[same]
     pairs = _Pairs(which, member, _distances(descriptors, features.descriptors, which, member))
-    best = pairs.mutual_best(d_match, ratio, len(features))
+    best = pairs.mutual_best(d_match, ratio, (len(descriptors), len(features)))
     return Matches(pairs.rows[best], pairs.columns[best])
 
 
@@ -276,19 +276,17 @@ def pairs_in_boxes(centres: Array, reach: Array, uv: Array) -> tuple[NDArray[np.
 
     Pixels are sorted by column, so that few pairs have to be tested.
     """
+    from slam.tracking import association_kernels
+
     order = np.argsort(uv[:, 0], kind="stable")
     x, y = uv[:, 0].take(order), uv[:, 1].take(order)
-    edge = centres[:, 0] - reach[:, 0], centres[:, 0] + reach[:, 0]
-    rows, place = _expand(np.searchsorted(x, edge[0]), np.searchsorted(x, edge[1], side="right"))
-    near = np.flatnonzero(np.abs(y.take(place) - centres[:, 1].take(rows)) <= reach[:, 1].take(rows))
-    return rows.take(near), order.take(place.take(near))
-
-
-def _expand(first: NDArray[np.intp], last: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """All integers of the ranges [first, last) (M,), one range after the other: the range's row, and the integer."""
-    count = np.maximum(last - first, 0)
-    which = np.repeat(np.arange(len(count)), count)
-    return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
+    boxes = np.ascontiguousarray(centres), np.ascontiguousarray(reach)
+    rows, places = np.empty((2, _ROOM * len(centres)), np.intp)
+    count = association_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
+    if count > len(rows):
+        rows, places = np.empty((2, count), np.intp)
+        association_kernels.pairs_in_boxes(*boxes, x, y, rows, places)
+    return rows[:count], order.take(places[:count])
 
 
 def _alike(
@@ -323,25 +321,18 @@ class _Pairs:
     columns: NDArray[np.intp]
     distance: NDArray[np.float32]
 
-    def select(self, keep: BoolArray) -> _Pairs:
-        """Some of the pairs."""
-        return _Pairs(self.rows[keep], self.columns[keep], self.distance[keep])
+    def mutual_best(
+        self, d_match: float, ratio: float, size: tuple[int, int], allowed: BoolArray | None = None
+    ) -> BoolArray:
+        """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than the second.
 
-    def mutual_best(self, d_match: float, ratio: float, features: int) -> NDArray[np.intp]:
-        """Pairs that are each other's nearest, nearer than `d_match`, and clearly nearer than the landmark's second."""
-        if not len(self.rows):
-            return np.zeros(0, np.intp)
-        starts = np.flatnonzero(np.diff(self.rows, prepend=-1))
-        count = np.diff(starts, append=len(self.rows))
-        nearest = np.repeat(np.minimum.reduceat(self.distance, starts), count)
-        is_nearest = self.distance == nearest
-        others = np.where(is_nearest, _NONE, self.distance)
-        second = np.where(np.add.reduceat(is_nearest, starts, dtype=int) > 1, 0, np.minimum.reduceat(others, starts))
-        of_feature = np.full(features, _NONE)
-        np.minimum.at(of_feature, self.columns, self.distance)
-        good = is_nearest & (self.distance < d_match) & (self.distance <= of_feature[self.columns])
-        good &= self.distance < ratio * np.repeat(second, count)
-        return np.flatnonzero(good)
+        Only pairs that are `allowed` (P,) count; `size` are the numbers of landmarks and of features.
+        """
+        from slam.tracking.association_kernels import mutual_best
+
+        allowed = np.ones(len(self.rows), bool) if allowed is None else allowed
+        limits = np.float32(d_match), np.float32(ratio)
+        return np.asarray(mutual_best(self.rows, self.columns, self.distance, allowed, size, *limits))
 
 
 def _by_levels(pairs: _Pairs, level: NDArray[np.intp], size: tuple[int, int], config: AssociationConfig) -> Matches:
@@ -349,10 +340,10 @@ def _by_levels(pairs: _Pairs, level: NDArray[np.intp], size: tuple[int, int], co
     free_landmarks, free_features = np.ones(size[0], bool), np.ones(size[1], bool)
     landmarks, taken = [], []
     for number, d_match in enumerate(config.d_match):
-        allowed = pairs.select((level <= number) & free_landmarks[pairs.rows] & free_features[pairs.columns])
-        best = allowed.mutual_best(d_match, config.ratio, size[1])
-        landmarks.append(allowed.rows[best])
-        taken.append(allowed.columns[best])
+        allowed = (level <= number) & free_landmarks[pairs.rows] & free_features[pairs.columns]
+        best = pairs.mutual_best(d_match, config.ratio, size, allowed)
+        landmarks.append(pairs.rows[best])
+        taken.append(pairs.columns[best])
         free_landmarks[landmarks[-1]] = False
         free_features[taken[-1]] = False
     return Matches(np.concatenate(landmarks), np.concatenate(taken))

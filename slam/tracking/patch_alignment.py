@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Patches, StereoFeatures
-from slam.geometry.arrays import Array, isin
+from slam.geometry.arrays import Array, ascending, isin
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.interfaces import AligningFrontend, Frontend
 from slam.landmarks import LandmarkTable
@@ -50,6 +50,8 @@ class PatchAnchors:
 
     def select(self, keep: BoolArray | NDArray[np.intp]) -> PatchAnchors:
         """Some of the rows, in order."""
+        if keep.dtype == bool and keep.all():
+            return self
         return PatchAnchors(self.ids[keep], self.patches.select(keep), self.poses[keep])
 
     def with_new(self, ids: IdArray, patches: Patches, T_world_left: Array) -> PatchAnchors:
@@ -57,7 +59,8 @@ class PatchAnchors:
         old = self.select(~isin(self.ids, ids))
         ids = np.concatenate([old.ids, ids])
         poses = np.concatenate([old.poses, np.tile(T_world_left, (len(patches), 1, 1))])
-        return PatchAnchors(ids, old.patches.joined(patches), poses).select(np.argsort(ids, kind="stable"))
+        both = PatchAnchors(ids, old.patches.joined(patches), poses)
+        return both if ascending(ids) else both.select(np.argsort(ids, kind="stable"))
 
     def known(self, landmarks: LandmarkTable) -> PatchAnchors:
         """Those of landmarks that are in the map and were measured recently."""
