@@ -145,7 +145,7 @@ class SurfFrontend:
         keypoints, threshold = self._detect(image, integral)
         if self.config.localise:
             keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-            keypoints = self._surf.localise_in(integral, keypoints, FULL_SCALE[image.dtype])
+            keypoints = self._surf.localise_in(image, keypoints)
         return *self._surf.describe_in(integral, self._spread(keypoints, self.config.features)), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:

@@ -15,7 +15,7 @@ from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussia
 from frontends.surf.detector import COLUMNS, detect_octave
 from frontends.surf.filters import Filters, layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
-from frontends.surf.integral import integral_image
+from frontends.surf.integral import float_integral_image, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
@@ -95,8 +95,7 @@ class Surf:
         Raises:
             SequenceError: the image is unusable.
         """
-        image = grey(image)
-        return self.localise_in(integral_image(image), keypoints, FULL_SCALE[image.dtype])
+        return self.localise_in(grey(image), keypoints)
 
     def describe(self, image: NDArray, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
         """Orient (unless upright) and describe features; those that cannot be oriented are left out.
@@ -185,8 +184,11 @@ class Surf:
             rows = rows[_mostly_inside(rows, mask)]
         return _as_keypoints(rows[np.argsort(-rows[:, 3], kind="stable")])
 
-    def localise_in(self, integral: NDArray[np.int32], keypoints: Keypoints, full_scale: float) -> Keypoints:
-        """`localise` on an integral image of pixels 0..full_scale; of several that share a maximum one stays."""
+    def localise_in(self, image: NDArray, keypoints: Keypoints) -> Keypoints:
+        """`localise` in an image as `grey` gives it; of several features that share a maximum one stays."""
+        if not len(keypoints):
+            return keypoints
+        integral = float_integral_image(image)
         x, y = np.ascontiguousarray(keypoints.uv.T)
         size = np.ascontiguousarray(keypoints.size)
         place = np.concatenate(
@@ -194,7 +196,7 @@ class Surf:
         )
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         place = place[rows]
-        response = place[:, 3] * (255.0 / full_scale) ** 2
+        response = place[:, 3] * (255.0 / FULL_SCALE[image.dtype]) ** 2
         order = np.argsort(-response, kind="stable")
         place, rows, response = place[order], rows[order], response[order]
         x, y, size = np.ascontiguousarray(place[:, :3].T)
