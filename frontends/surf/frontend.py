@@ -176,11 +176,10 @@ class SurfFrontend:
         """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
         c = self.config
         assert images.right is not None
-        wide = refine(images.left, images.right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._wide)
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-        reach = (_FINE_REACH, _FINE_REACH)
-        narrow = refine(images.left, images.right, uv, size, wide, c.min_correlation, reach, self._narrow)
-        return np.where(np.isfinite(narrow), narrow, wide)
+        reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
+        windows = self._wide, self._narrow
+        return refine(images.left, images.right, uv, size, start, c.min_correlation, reaches, windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""
