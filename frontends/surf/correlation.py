@@ -123,15 +123,16 @@ def refine(
     start: NDArray[np.float64],
     min_correlation: float,
     reaches: tuple[tuple[float, float], ...],
-    windows: tuple[NDArray[np.float32], ...],
+    windows: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     """Right pixels (N, 2) to sub-pixel accuracy by image correlation.
 
     The right patch moves in both directions until its difference from the left patch is least; brightness offset
     and contrast are removed from both. This fails where a patch leaves the image, has no texture, moves further than
-    `reach` from the start, does not converge, or correlates below `min_correlation`. It is done with the first
-    windows, from there with the second ones; where these fail the result of the first ones stands. NaN where they
-    fail.
+    its reach from the start, does not converge, or correlates below `min_correlation`. A second pass, with other
+    windows, starts where the first one ended; where it fails the first one's result stands.
+
+    NaN where the first pass fails.
 
     Args:
         left: grey image (H, W) float32.
@@ -140,13 +141,13 @@ def refine(
         size: of the features (N,) [px]; large ones are compared in large patches.
         start: first guess of the right pixels (N, 2), NaN where there is none.
         min_correlation: least normalised correlation.
-        reaches: largest shift along the row and across [px], with each windows.
-        windows: see `patch_windows`.
+        reaches: largest shift along the row and across [px], in each pass.
+        windows: of each pass (P, 2, 552), see `patch_windows`.
     """
     out = np.full((len(uv), 2), np.nan)
     _refine(
         left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, np.array(reaches),
-        np.stack(windows), *_work_space(), out,
+        windows, *_work_space(), out,
     )  # fmt: skip
     return out
 

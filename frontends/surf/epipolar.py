@@ -147,19 +147,19 @@ def _search(pixels, weights, stride, rows, band, y, first, last, patch, own, sco
 
     Rivals are looked for only if `rivals`.
     """
-    count = last - first + 1
+    begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
     found, row, score, rival = -1, -1, np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(pixels, weights, stride, v, first, count, patch, own, scores)
-        best = _largest(scores, 0, count)
+        best = _largest(scores, begin, count)
         if best > score:
             place = first + _place_of(scores, best)
             if abs(place - found) > _NEIGHBOURS:
                 rival = max(rival, score)
             found, row, score = place, v, best
         if rivals:
-            rival = max(rival, _largest(scores, 0, min(found - first - _NEIGHBOURS, count)))
-            rival = max(rival, _largest(scores, max(found - first + _NEIGHBOURS + 1, 0), count))
+            rival = max(rival, _largest(scores, begin, min(found - first - _NEIGHBOURS, count)))
+            rival = max(rival, _largest(scores, max(found - first + _NEIGHBOURS + 1, begin), count))
     return found, row, score, rival
 
 

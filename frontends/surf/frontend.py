@@ -60,7 +60,7 @@ class SurfFrontend:
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
         self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
-        self._wide, self._narrow = patch_windows(0.4), patch_windows(0.3)
+        self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
 
     @property
@@ -103,7 +103,7 @@ class SurfFrontend:
         """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
         least, size = self.config.min_correlation, patches.size
         left = align_patches(
-            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._wide
+            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._windows[0]
         )
         if images.right is None:
             return left, np.full_like(left, np.nan)
@@ -188,8 +188,7 @@ class SurfFrontend:
         assert images.right is not None
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
         reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
-        windows = self._wide, self._narrow
-        return refine(images.left, images.right, uv, size, start, c.min_correlation, reaches, windows)
+        return refine(images.left, images.right, uv, size, start, c.min_correlation, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""

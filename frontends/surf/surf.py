@@ -231,7 +231,9 @@ class Surf:
         def orient_and_describe(a: int, b: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
             upright = np.full(b - a, UPRIGHT_ANGLE)
             angle = upright if self.upright else orientations(integral, x[a:b], y[a:b], size[a:b])
-            return angle, describe(integral, x[a:b], y[a:b], size[a:b], np.nan_to_num(angle), box, self._weights)
+            return angle, describe(
+                integral, x[a:b], y[a:b], size[a:b], np.where(np.isfinite(angle), angle, 0.0), box, self._weights
+            )
 
         return orient_and_describe
 
