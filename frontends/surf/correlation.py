@@ -8,21 +8,22 @@ from numpy.typing import NDArray
 from slam.runtime.compilation import helper, kernel, vector_helper
 
 _HALVES = (7, 11)  # half widths of the two patch sizes [px]
+_LARGEST = (2 * _HALVES[1] + 1) * (2 * _HALVES[1] + 2)  # pixels of the larger patch, with one more in each row
 _ITERATIONS = 12  # numerics: of the alignment at most
 _CONVERGED = 0.01  # numerics: px
 _MARGIN = 3 * (_HALVES[1] + 1) // 2  # half width of a patch that is kept [px]: it may be seen 1.5 times as large
 
 
 def patch_windows(spread: float) -> NDArray[np.float32]:
-    """Gaussian weights (2, 23, 24) of the pixels of the two patch sizes; rows padded with zeros to vector registers.
+    """Gaussian weights (2, 552) of the pixels of the two patch sizes, by rows, each padded with a zero.
 
     `spread` is the Gaussian's sigma in units of the patch's half width.
     """
-    out = np.zeros((2, 2 * _HALVES[1] + 1, 24), np.float32)
+    out = np.zeros((2, _LARGEST), np.float32)
     for k, half in enumerate(_HALVES):
         line = np.exp(-(np.arange(-half, half + 1) ** 2) / (2 * (spread * half) ** 2))
-        n = 2 * half + 1
-        out[k, :n, :n] = np.outer(line, line) / line.sum() ** 2
+        weights = np.pad(np.outer(line, line) / line.sum() ** 2, ((0, 0), (0, 1)))
+        out[k, : weights.size] = weights.reshape(-1)
     return out
 
 
@@ -35,72 +36,83 @@ def _window_of(size):
 
 
 @vector_helper
-def _sample(pixels, shape, x, y, half, rows, lanes, blend, out):
-    """Bilinear samples (rows, lanes) with the first one at (x - half, y - half); False where they leave the image."""
+def _sample(pixels, shape, x, y, half, rows, lanes, out):
+    """Bilinear samples (rows, lanes), flat, the first one at (x - half, y - half); False where outside of the image."""
     if not (y >= half and x >= half and y < shape[0] and x < shape[1]):  # NaN, and more than an integer holds
         return False
     top, left = int(np.floor(y)) - half, int(np.floor(x)) - half
     if top < 0 or left < 0 or top + rows + 1 > shape[0] or left + lanes + 1 > shape[1]:
         return False
     a, b = np.float32(y - np.floor(y)), np.float32(x - np.floor(x))
-    stride = shape[1]
+    stride, one = np.uint64(shape[1]), np.uint64(1)
     for r in range(rows):
-        start = np.uint64((top + r) * stride + left)
-        below = np.uint64(start + np.uint64(stride))
-        for c in range(lanes + 1):
-            u = np.float32(pixels[start + np.uint64(c)])
-            blend[c] = u + a * (np.float32(pixels[below + np.uint64(c)]) - u)
+        start, to = np.uint64((top + r) * shape[1] + left), np.uint64(r * lanes)
         for c in range(lanes):
-            out[r, c] = blend[c] + b * (blend[c + 1] - blend[c])
+            k = start + np.uint64(c)
+            first = pixels[k] + a * (pixels[k + stride] - pixels[k])
+            second = pixels[k + one] + a * (pixels[k + stride + one] - pixels[k + one])
+            out[to + np.uint64(c)] = first + b * (second - first)
     return True
 
 
 @vector_helper
-def _template(sampled, window, k, rows, lanes, weighted, gx, gy):
-    """Weighted patch and gradients from samples one pixel wider on each side, and their weighted sums.
+def _gradients(sampled, rows, lanes, patch, gx, gy):
+    """The patch, and its gradients, of samples that are one pixel wider on each side."""
+    stride, half = lanes + 2, np.float32(0.5)
+    for r in range(rows):
+        at, to = np.uint64((r + 1) * stride + 1), np.uint64(r * lanes)
+        for c in range(lanes):
+            k, j = at + np.uint64(c), to + np.uint64(c)
+            patch[j] = sampled[k]
+            gx[j] = half * (sampled[k + np.uint64(1)] - sampled[k - np.uint64(1)])
+            gy[j] = half * (sampled[k + np.uint64(stride)] - sampled[k - np.uint64(stride)])
+
+
+@vector_helper
+def _template(patch, dx, dy, window, k, n, weighted, gx, gy):
+    """Weighted patch and gradients of n pixels, and their weighted sums.
 
     Returns the patch's mean and standard deviation; the gradients' sums x, y; the normal matrix xx, xy, yy of the
     gradients less their means; and the sums of gradients times patch, x, y.
     """
     zero = np.float32(0.0)
     s, ss, sx, sy, xx, xy, yy, px, py = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    half = np.float32(0.5)
-    for r in range(rows):
-        for c in range(lanes):
-            w = window[k, r, c]
-            v = sampled[r + 1, c + 1]
-            dx = half * (sampled[r + 1, c + 2] - sampled[r + 1, c])
-            dy = half * (sampled[r + 2, c + 1] - sampled[r, c + 1])
-            wv, wx, wy = w * v, w * dx, w * dy
-            weighted[r, c], gx[r, c], gy[r, c] = wv, wx, wy
-            s += wv
-            ss += wv * v
-            sx += wx
-            sy += wy
-            xx += wx * dx
-            xy += wx * dy
-            yy += wy * dy
-            px += wx * v
-            py += wy * v
+    for j in range(n):
+        w, v, x, y = window[k, j], patch[j], dx[j], dy[j]
+        wv, wx, wy = w * v, w * x, w * y
+        weighted[j], gx[j], gy[j] = wv, wx, wy
+        s += wv
+        ss += wv * v
+        sx += wx
+        sy += wy
+        xx += wx * x
+        xy += wx * y
+        yy += wy * y
+        px += wx * v
+        py += wy * v
     deviation = np.sqrt(max(ss - s * s, zero))
     return s, deviation, sx, sy, xx - sx * sx, xy - sx * sy, yy - sy * sy, px, py
 
 
 @vector_helper
-def _compare(patch, window, k, rows, lanes, weighted, gx, gy):
+def _compare(patch, window, k, n, weighted, gx, gy):
     """Weighted sums over a patch: itself, its square, times the template, times the gradients x and y."""
     zero = np.float32(0.0)
     s, ss, both, px, py = zero, zero, zero, zero, zero
-    for r in range(rows):
-        for c in range(lanes):
-            v = patch[r, c]
-            wv = window[k, r, c] * v
-            s += wv
-            ss += wv * v
-            both += weighted[r, c] * v
-            px += gx[r, c] * v
-            py += gy[r, c] * v
+    for j in range(n):
+        v = patch[j]
+        wv = window[k, j] * v
+        s += wv
+        ss += wv * v
+        both += weighted[j] * v
+        px += gx[j] * v
+        py += gy[j] * v
     return s, np.sqrt(max(ss - s * s, zero)), both, px, py
+
+
+def _work_space() -> tuple[NDArray[np.float32], ...]:
+    """For samples; the patch and its gradients; the weighted patch and gradients."""
+    return np.empty(25 * 26, np.float32), *(np.empty(_LARGEST, np.float32) for _ in range(7))
 
 
 def refine(
@@ -110,14 +122,17 @@ def refine(
     size: NDArray[np.float64],
     start: NDArray[np.float64],
     min_correlation: float,
-    reach: tuple[float, float],
+    reaches: tuple[tuple[float, float], ...],
     windows: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     """Right pixels (N, 2) to sub-pixel accuracy by image correlation.
 
     The right patch moves in both directions until its difference from the left patch is least; brightness offset
-    and contrast are removed from both. NaN where a patch leaves the image, has no texture, moves further than
-    `reach` from the start, does not converge, or correlates below `min_correlation`.
+    and contrast are removed from both. This fails where a patch leaves the image, has no texture, moves further than
+    its reach from the start, does not converge, or correlates below `min_correlation`. A second pass, with other
+    windows, starts where the first one ended; where it fails the first one's result stands.
+
+    NaN where the first pass fails.
 
     Args:
         left: grey image (H, W) float32.
@@ -126,62 +141,68 @@ def refine(
         size: of the features (N,) [px]; large ones are compared in large patches.
         start: first guess of the right pixels (N, 2), NaN where there is none.
         min_correlation: least normalised correlation.
-        reach: largest shift along the row and across [px].
-        windows: see `patch_windows`.
+        reaches: largest shift along the row and across [px], in each pass.
+        windows: of each pass (P, 2, 552), see `patch_windows`.
     """
     out = np.full((len(uv), 2), np.nan)
     _refine(
-        left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, reach[0], reach[1], windows,
-        np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32),
-        np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros(32, np.float32), out,
+        left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, np.array(reaches),
+        windows, *_work_space(), out,
     )  # fmt: skip
     return out
 
 
 @kernel
 def _refine(
-    left, right, shape, uv, size, start, min_correlation, reach_x, reach_y, windows, sampled, patch, weighted, gx, gy,
-    blend, out,
+    left, right, shape, uv, size, start, min_correlation, reaches, windows, sampled, patch, dx, dy, other, weighted,
+    gx, gy, out,
 ):  # fmt: skip
     """The same into `out`, on flat images and with work space."""
     for i in range(len(uv)):
-        if np.isnan(start[i, 0]):
+        x0, y0 = start[i, 0], start[i, 1]
+        if np.isnan(x0):
             continue
         k, half = _window_of(size[i])
         rows, lanes = 2 * half + 1, 2 * half + 2
-        if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, blend, sampled):
+        if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, sampled):
             continue
-        mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
-        out[i, 0], out[i, 1] = _best_place(
-            right, shape, start[i, 0], start[i, 1], reach_x, reach_y, min_correlation, windows, k, half, rows, lanes,
-            mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
-        )  # fmt: skip
+        _gradients(sampled, rows, lanes, patch, dx, dy)
+        for w in range(len(windows)):
+            x0, y0 = _best_place(
+                right, shape, x0, y0, reaches[w, 0], reaches[w, 1], min_correlation, windows[w], k, half, patch, dx,
+                dy, other, weighted, gx, gy,
+            )  # fmt: skip
+            if np.isnan(x0):
+                break
+            out[i, 0], out[i, 1] = x0, y0
 
 
 @helper
 def _best_place(
-    image, shape, x0, y0, reach_x, reach_y, min_correlation, windows, k, half, rows, lanes,
-    mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
-):  # fmt: skip
-    """Where an image looks like the template whose sums these are, by steps from (x0, y0); NaN where nowhere."""
+    image, shape, x0, y0, reach_x, reach_y, min_correlation, window, k, half, patch, dx, dy, other, weighted, gx, gy
+):
+    """Where an image looks like a patch with these gradients, by steps from (x0, y0); NaN where nowhere."""
+    rows, lanes = 2 * half + 1, 2 * half + 2
+    n = rows * lanes
+    mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(patch, dx, dy, window, k, n, weighted, gx, gy)
     det = xx * yy - xy * xy
     if deviation < 1e-3 or det <= 1e-4 * (xx + yy) ** 2:
         return np.nan, np.nan
     x, y = x0, y0
     for _ in range(_ITERATIONS):
-        if not _sample(image, shape, x, y, half, rows, lanes, blend, patch):
+        if not _sample(image, shape, x, y, half, rows, lanes, other):
             break
-        mean2, deviation2, both, px, py = _compare(patch, windows, k, rows, lanes, weighted, gx, gy)
+        mean2, deviation2, both, px, py = _compare(other, window, k, n, weighted, gx, gy)
         if deviation2 < 1e-3:
             break
         gain = deviation / deviation2
         ex = (tx - mean * sx) - gain * (px - mean2 * sx)
         ey = (ty - mean * sy) - gain * (py - mean2 * sy)
-        dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
-        x, y = x + dx, y + dy
+        step_x, step_y = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
+        x, y = x + step_x, y + step_y
         if not (abs(x - x0) <= reach_x and abs(y - y0) <= reach_y):
             break
-        if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
+        if step_x * step_x + step_y * step_y < _CONVERGED * _CONVERGED:
             if (both - mean * mean2) / (deviation * deviation2) >= min_correlation:
                 return x, y
             break
@@ -231,16 +252,15 @@ def align_patches(
     out = np.full((len(start), 2), np.nan)
     _align_patches(
         image.reshape(-1), image.shape, patches, centres, warps, size, start, min_correlation, reach, windows,
-        np.zeros((25, 26), np.float32), np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32),
-        np.zeros((23, 24), np.float32), np.zeros((23, 24), np.float32), np.zeros(32, np.float32), out,
+        *_work_space(), out,
     )  # fmt: skip
     return out
 
 
 @kernel
 def _align_patches(
-    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, sampled, patch, weighted, gx,
-    gy, blend, out,
+    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, sampled, patch, dx, dy, other,
+    weighted, gx, gy, out,
 ):  # fmt: skip
     """The same into `out`, on a flat image and with work space."""
     for i in range(len(start)):
@@ -250,10 +270,10 @@ def _align_patches(
         rows, lanes = 2 * half + 1, 2 * half + 2
         if not _sample_warped(patches[i], centres[i], warps[i], half + 1, rows + 2, lanes + 2, sampled):
             continue
-        mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(sampled, windows, k, rows, lanes, weighted, gx, gy)
+        _gradients(sampled, rows, lanes, patch, dx, dy)
         out[i, 0], out[i, 1] = _best_place(
-            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, rows, lanes,
-            mean, deviation, sx, sy, xx, xy, yy, tx, ty, patch, weighted, gx, gy, blend,
+            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, patch, dx, dy,
+            other, weighted, gx, gy,
         )  # fmt: skip
 
 
@@ -273,7 +293,8 @@ def _sample_warped(patch, centre, warp, half, rows, lanes, out):
             a, b = np.float32(y - top), np.float32(x - left)
             first = patch[top, left] + a * (patch[top + 1, left] - patch[top, left])
             second = patch[top, left + 1] + a * (patch[top + 1, left + 1] - patch[top, left + 1])
-            out[r, c] = first + b * (second - first)
-            if np.isnan(out[r, c]):
+            value = first + b * (second - first)
+            if np.isnan(value):
                 return False
+            out[r * lanes + c] = value
     return True

@@ -12,6 +12,7 @@ from slam.runtime.compilation import helper, kernel, vector_helper
 _HALF = 4  # fixed: half width of the compared patches [half-resolution px]; the kernel's inner loop is written for it
 _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
+_LANES = 16  # cost: columns are searched in whole vector registers
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
@@ -23,10 +24,14 @@ class HalfImage:
         pixels: grey values (H/2, W/2) float32 on the scale of 8-bit images.
         weight: one over the root of the sum of squared deviations of the patch about each pixel; 0 where it is flat
             or leaves the image.
+        flat_pixels: these by rows in one line, and as many zeros behind them as `_correlate` reads.
+        flat_weight: likewise.
     """
 
     pixels: NDArray[np.float32]
     weight: NDArray[np.float32]
+    flat_pixels: NDArray[np.float32]
+    flat_weight: NDArray[np.float32]
 
 
 def half_image(image: NDArray, full_scale: float) -> HalfImage:
@@ -35,10 +40,11 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
 
     height, width = image.shape
     small = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
-    pixels = small.astype(np.float32) * np.float32(255.0 / full_scale)
-    weight = np.zeros_like(pixels)
+    flat_pixels, flat_weight = np.zeros((2, small.size + _LANES), np.float32)
+    pixels, weight = flat_pixels[: small.size].reshape(small.shape), flat_weight[: small.size].reshape(small.shape)
+    np.multiply(small, np.float32(255.0 / full_scale), out=pixels)
     _weigh(pixels, weight, np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32))
-    return HalfImage(pixels, weight)
+    return HalfImage(pixels, weight, flat_pixels, flat_weight)
 
 
 @kernel
@@ -91,7 +97,11 @@ def _zero_mean_patch(image, x, y, patch):
 
 @vector_helper
 def _correlate(pixels, weights, stride, y, first, count, patch, own, scores):
-    """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`."""
+    """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`.
+
+    It goes on to the end of a vector register: `_LANES - 1` more scores and, in the images, pixels at most.
+    """
+    count = (count + _LANES - 1) & -_LANES
     for j in range(count):
         scores[j] = np.float32(0.0)
     for r in range(_SIDE):
@@ -110,39 +120,46 @@ def _correlate(pixels, weights, stride, y, first, count, patch, own, scores):
         scores[j] *= own * weights[at + np.uint64(j)]
 
 
-@helper
-def _best(scores, count):
-    """Column of the best score."""
-    best = 0
-    for j in range(1, count):
-        if scores[j] > scores[best]:
-            best = j
-    return best
+@vector_helper
+def _largest(scores, first, last):
+    """Largest score from `first` to before `last`; -1 where there is none."""
+    a = b = c = d = np.float32(-1.0)
+    for j in range(first, last - 3, 4):  # four chains: each step of one waits for the step before
+        a, b = max(a, scores[j]), max(b, scores[j + 1])
+        c, d = max(c, scores[j + 2]), max(d, scores[j + 3])
+    for j in range(max(first, last - 3), last):
+        a = max(a, scores[j])
+    return max(max(a, b), max(c, d))
 
 
 @helper
-def _rival(scores, count, best):
-    """Best score away from the best place."""
-    rival = np.float32(-1.0)
-    for j in range(count):
-        if scores[j] > rival and abs(j - best) > _NEIGHBOURS:
-            rival = scores[j]
-    return rival
+def _place_of(scores, value):
+    """Column of the first score with a value that there is."""
+    j = 0
+    while scores[j] != value:
+        j += 1
+    return j
 
 
 @helper
-def _search(pixels, weights, stride, rows, band, y, first, last, patch, own, scores):
-    """Best place of a patch in columns first..last of the rows within `band` of y: x, y, score and rival's score."""
-    count = last - first + 1
+def _search(pixels, weights, stride, rows, band, y, first, last, patch, own, scores, rivals):
+    """Best place of a patch in columns first..last of the rows within `band` of y: x, y, score and rival's score.
+
+    Rivals are looked for only if `rivals`.
+    """
+    begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
     found, row, score, rival = -1, -1, np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(pixels, weights, stride, v, first, count, patch, own, scores)
-        best = _best(scores, count)
-        if scores[best] > score:
-            if abs(first + best - found) > _NEIGHBOURS:
+        best = _largest(scores, begin, count)
+        if best > score:
+            place = first + _place_of(scores, best)
+            if abs(place - found) > _NEIGHBOURS:
                 rival = max(rival, score)
-            found, row, score = first + best, v, scores[best]
-        rival = max(rival, _rival(scores, count, found - first))
+            found, row, score = place, v, best
+        if rivals:
+            rival = max(rival, _largest(scores, begin, min(found - first - _NEIGHBOURS, count)))
+            rival = max(rival, _largest(scores, max(found - first + _NEIGHBOURS + 1, begin), count))
     return found, row, score, rival
 
 
@@ -172,10 +189,10 @@ def search_rows(
         uniqueness: largest ratio ``(1 - best) / (1 - rival)``.
     """
     out = np.full((len(uv), 2), np.nan)
-    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1], np.float32)
+    patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1] + _LANES, np.float32)
     _search_rows(
-        left.pixels, left.weight, left.pixels.reshape(-1), left.weight.reshape(-1), right.pixels, right.weight,
-        right.pixels.reshape(-1), right.weight.reshape(-1), uv, 0.5 * low, 0.5 * high, band, min_correlation,
+        left.pixels, left.weight, left.flat_pixels, left.flat_weight, right.pixels, right.weight, right.flat_pixels,
+        right.flat_weight, uv, 0.5 * low, 0.5 * high, band, min_correlation,
         uniqueness, patch, scores, out,
     )  # fmt: skip
     return out
@@ -206,7 +223,7 @@ def _search_rows(
                 break
             _zero_mean_patch(image, found, row, patch)
             place, line, score, rival = _search(
-                pixels, weights, width, height, band, row, first, last, patch, own, scores
+                pixels, weights, width, height, band, row, first, last, patch, own, scores, not back
             )
             if back:
                 if abs(place - x) <= 1:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align_patches, cut_patches, patch_windows, refine
-from frontends.surf.epipolar import half_image, search_rows
+from frontends.surf.epipolar import HalfImage, half_image, search_rows
 from frontends.surf.images import FULL_SCALE, grey
 from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import Keypoints
@@ -27,6 +28,14 @@ _REACH = 3.0  # largest sub-pixel correction along the row [px]
 _FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
 _COARSE = 0.9  # the search along the row may correlate less than the final patches, by this factor
 _OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighbouring rows
+
+
+class _View(NamedTuple):
+    """A rectified image: as it came, as float32, and at half resolution if it is one of two."""
+
+    grey: NDArray
+    pixels: NDArray[np.float32]
+    half: HalfImage | None
 
 
 class SurfFrontend:
@@ -51,7 +60,7 @@ class SurfFrontend:
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
         self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
-        self._wide, self._narrow = patch_windows(0.4), patch_windows(0.3)
+        self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
 
     @property
@@ -69,14 +78,20 @@ class SurfFrontend:
         if not isinstance(frame, StereoFrame):
             raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
-        images = self._surf.workers.run([partial(self._image, frame, image, k) for k, image in enumerate(given)])
-        left = images[0]
-        keypoints, descriptors, threshold = self._describe(left)
-        uv_right = np.full((len(keypoints), 2), np.nan)
-        pair = ImagePair(left.astype(np.float32), None if len(images) == 1 else images[1].astype(np.float32))
-        if len(images) > 1:
-            uv_right = self._match(left, images[1], pair, keypoints)
-        return self._features(frame.stamp, keypoints, uv_right, descriptors, threshold, pair)
+        views = self._surf.workers.run([partial(self._view, frame, image, k) for k, image in enumerate(given)])
+        integral = integral_image(views[0].grey)
+        keypoints, threshold = self._keypoints(views[0].grey, integral)
+        describe = self._surf.describer(integral, keypoints)
+        images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
+
+        def finish(first: int, last: int) -> tuple[NDArray, ...]:
+            """Angles, descriptors and right pixels of some of the features."""
+            uv, size = keypoints.uv[first:last], keypoints.size[first:last]
+            right = np.full(uv.shape, np.nan) if images.right is None else self._match(views, images, uv, size)
+            return *describe(first, last), right
+
+        angles, descriptors, uv_right = map(np.concatenate, zip(*self._surf.workers.over(len(keypoints), finish)))
+        return self._features(frame.stamp, replace(keypoints, angle=angles), uv_right, descriptors, threshold, images)
 
     def patches(self, images: ImagePair, uv_left: NDArray, size: NDArray) -> Patches:
         """The left image around pixels, see `slam.interfaces.AligningFrontend`."""
@@ -88,15 +103,15 @@ class SurfFrontend:
         """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
         least, size = self.config.min_correlation, patches.size
         left = align_patches(
-            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._wide
+            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._windows[0]
         )
         if images.right is None:
             return left, np.full_like(left, np.nan)
         start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])
         return left, self._refine(images, left, size, start)
 
-    def _image(self, frame: StereoFrame, image: NDArray, side: int) -> NDArray:
-        """Grey, rectified image of the left (0) or right (1) camera."""
+    def _view(self, frame: StereoFrame, image: NDArray, side: int) -> _View:
+        """What is needed of the rectified image of the left (0) or right (1) camera."""
         what = f"frame {frame.index}, {('left', 'right')[side]} image"
         image = grey(image, what)
         if image.shape != (self.rig.height, self.rig.width):
@@ -104,7 +119,9 @@ class SurfFrontend:
                 f"{what}: {image.shape[1]}x{image.shape[0]} pixels, "
                 f"but the calibration is for {self.rig.width}x{self.rig.height}"
             )
-        return self._rectify(image, side)
+        image = self._rectify(image, side)
+        half = None if frame.right is None else half_image(image, FULL_SCALE[image.dtype])
+        return _View(image, image.astype(np.float32), half)
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
@@ -139,36 +156,29 @@ class SurfFrontend:
                 break
         return keypoints, threshold
 
-    def _describe(self, image: NDArray) -> tuple[Keypoints, NDArray[np.float32], float]:
-        """Spread and described features of the left image, and the D_threshold that found them."""
-        integral = integral_image(image)
+    def _keypoints(self, image: NDArray, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+        """Features of the left image, spread over it, and the D_threshold that found them."""
         keypoints, threshold = self._detect(image, integral)
         if self.config.localise:
             keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-            keypoints = self._surf.localise_in(integral, keypoints, FULL_SCALE[image.dtype])
-        return *self._surf.describe_in(integral, self._spread(keypoints, self.config.features)), threshold
+            keypoints = self._surf.localise_in(image, keypoints)
+        return self._spread(keypoints, self.config.features), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
         """At most `limit` features, spread over the image."""
         return keypoints.select(spread(keypoints.uv, limit, self.config.grid, self.rig.width, self.rig.height))
 
-    def _match(self, left: NDArray, right: NDArray, pair: ImagePair, keypoints: Keypoints) -> NDArray[np.float64]:
-        """Right pixels (N, 2) of the left features in the rectified images, NaN where unmatched."""
+    def _match(self, views: list[_View], images: ImagePair, uv: NDArray, size: NDArray) -> NDArray[np.float64]:
+        """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
         c = self.config
         low, high = self._disparities()
-        scale = FULL_SCALE[left.dtype], FULL_SCALE[right.dtype]
-        a, b = self._surf.workers.run([partial(half_image, left, scale[0]), partial(half_image, right, scale[1])])
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
-
-        def locate(first: int, last: int) -> NDArray[np.float64]:
-            """Right pixels of some of the features."""
-            uv, size = keypoints.uv[first:last], keypoints.size[first:last]
-            start = search_rows(a, b, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
-            return self._refine(pair, uv, size, start)
-
-        found = np.concatenate(self._surf.workers.over(len(keypoints), locate))
-        disparity = keypoints.uv[:, 0] - found[:, 0]
-        off_line = np.abs(found[:, 1] - keypoints.uv[:, 1]) > c.epipolar
+        left, right = views[0].half, views[1].half
+        assert left is not None and right is not None
+        start = search_rows(left, right, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
+        found = self._refine(images, uv, size, start)
+        disparity = uv[:, 0] - found[:, 0]
+        off_line = np.abs(found[:, 1] - uv[:, 1]) > c.epipolar
         found[~((disparity >= low) & (disparity <= high)) | off_line] = np.nan
         return found
 
@@ -176,11 +186,9 @@ class SurfFrontend:
         """Right pixels (N, 2) of left ones by correlation, NaN where they do not correlate."""
         c = self.config
         assert images.right is not None
-        wide = refine(images.left, images.right, uv, size, start, c.min_correlation, (_REACH, c.epipolar), self._wide)
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
-        reach = (_FINE_REACH, _FINE_REACH)
-        narrow = refine(images.left, images.right, uv, size, wide, c.min_correlation, reach, self._narrow)
-        return np.where(np.isfinite(narrow), narrow, wide)
+        reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
+        return refine(images.left, images.right, uv, size, start, c.min_correlation, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""
@@ -198,7 +206,10 @@ class SurfFrontend:
         threshold: float,
         images: ImagePair,
     ) -> StereoFeatures:
-        """The features in pixels of the rig's own images."""
+        """Those features that have an angle, in pixels of the rig's own images."""
+        good = np.isfinite(keypoints.angle)
+        if not good.all():
+            keypoints, uv_right, descriptors = keypoints.select(good), uv_right[good], descriptors[good]
         uv_left: NDArray = keypoints.uv
         if not self.rig.is_rectified:
             uv_left = self.rig.rectified.unrectify_left(uv_left)

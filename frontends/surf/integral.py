@@ -21,6 +21,13 @@ def integral_image(image: NDArray) -> NDArray[np.int32]:
     return _integral_image(image)
 
 
+def float_integral_image(image: NDArray) -> NDArray[np.float64]:
+    """The same of a grey image that is not empty, in float64, which may be interpolated: no sum wraps around."""
+    import cv2
+
+    return cv2.integral(image, sdepth=cv2.CV_64F)
+
+
 @kernel
 def _integral_image(image):
     """The same for pixel types that OpenCV does not sum up in 32 bits."""

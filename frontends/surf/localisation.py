@@ -10,86 +10,103 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.runtime.compilation import helper, kernel, vector_helper
+from slam.runtime.compilation import disjoint_vector_helper, helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
 _SIZE_STEP = 0.3  # of those in size
 _ITERATIONS = 10  # numerics: of the search for the continuous maximum at most
 _FOLLOWERS = 10  # cost: features that repeated ones may lie apart, when sorted by x
 _CONVERGED = 0.05  # numerics: in units of the steps
+_LANES = 8  # cost: columns are read in whole vector registers
+_WIDEST = 2.6  # cost: bound of the columns that the filters of a feature read, in units of its size
 
-
-#: Places of the finite differences (x, y, size): the seven of the gradient, then those of the mixed derivatives.
-_PLACES = np.array(
-    [
-        (0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1),
-        (1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0),
-        (1, 0, 1), (1, 0, -1), (-1, 0, 1), (-1, 0, -1),
-        (0, 1, 1), (0, 1, -1), (0, -1, 1), (0, -1, -1),
-    ],
-    np.float64,
-)  # fmt: skip
-
-
-#: The corners' numbers, from an array because Numba compiles a helper again for each literal number it is called with.
-_N = np.arange(10)
+#: Horizontal part of the filters: which of the three vertical parts is read at the ten columns of corners, and weights.
+_PART = np.array([0, 2, 1, 0, 2, 2, 0, 1, 2, 0])
+_WEIGHT = np.array([-1.0, -1.0, -1.0, 3.0, 1.0, 1.0, -3.0, 1.0, -1.0, 1.0])
 
 
 @vector_helper
-def _corner(pixels, stride, y, fy, x, fx):
-    """Integral image between pixel corners: a whole part, modulo 2**32, and the rest, exact."""
-    k = np.uint64(y * stride + x)
-    a = pixels[k]
-    right = np.float64(np.int32(pixels[k + np.uint64(1)] - a))
-    c = pixels[k + np.uint64(stride)]
-    below = np.float64(np.int32(c - a))
-    right_below = np.float64(np.int32(pixels[k + np.uint64(stride + 1)] - c))
-    return a, fx * right + fy * (below + fx * (right_below - right))
+def _line(pixels, at, stride, part):
+    """Sum of the image above and left of a pixel corner, between two rows."""
+    return pixels[at] + part * (pixels[at + stride] - pixels[at])
+
+
+@disjoint_vector_helper
+def _vertical_parts(p, s, a, f, n, out, lanes):
+    """Vertical part of the filters for Dxx, Dyy and Dxy, from the lines at the ten rows of corners, on n columns."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8], a[9]
+    f0, f1, f2, f3, f4, f5, f6, f7, f8, f9 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]
+    for j in range(n):
+        k = np.uint64(j)
+        lobe = _line(p, a6 + k, s, f6) - _line(p, a3 + k, s, f3)
+        upper = _line(p, a4 + k, s, f4) - _line(p, a1 + k, s, f1)
+        lower = _line(p, a8 + k, s, f8) - _line(p, a5 + k, s, f5)
+        out[k] = _line(p, a7 + k, s, f7) - _line(p, a2 + k, s, f2)
+        out[lanes + k] = _line(p, a9 + k, s, f9) - _line(p, a0 + k, s, f0) - 3.0 * lobe
+        out[lanes + lanes + k] = upper - lower
 
 
 @vector_helper
-def _box(pixels, stride, whole, part, top, bottom, left, right):
-    """Sum of a box between the numbered corner positions."""
-    y0, y1, x0, x1 = whole[1, top], whole[1, bottom], whole[0, left], whole[0, right]
-    fy0, fy1, fx0, fx1 = part[1, top], part[1, bottom], part[0, left], part[0, right]
-    a, p = _corner(pixels, stride, y0, fy0, x0, fx0)
-    b, q = _corner(pixels, stride, y0, fy0, x1, fx1)
-    c, r = _corner(pixels, stride, y1, fy1, x0, fx0)
-    d, s = _corner(pixels, stride, y1, fy1, x1, fx1)
-    return np.float64(np.int32(np.int32(d - c) - np.int32(b - a))) + ((s - r) - (q - p))
-
-
-@vector_helper
-def _response(pixels, stride, x, y, size, whole, part):
-    """Determinant of the Hessian at any position and size; the filter must lie inside the image."""
-    n, w, f = _N, whole, part
+def _response(parts, lanes, x, size):
+    """Determinant of the Hessian of the filter with its centre at a column of the vertical parts."""
+    dxx, dyy, dxy = 0.0, 0.0, 0.0
     for k in range(10):
-        u, v = x + 0.5 + size * (k / 9.0 - 0.5), y + 0.5 + size * (k / 9.0 - 0.5)
-        w[0, k], w[1, k] = np.int64(u), np.int64(v)
-        f[0, k], f[1, k] = u - w[0, k], v - w[1, k]
-    dxx = _box(pixels, stride, w, f, n[2], n[7], n[0], n[9]) - 3.0 * _box(pixels, stride, w, f, n[2], n[7], n[3], n[6])
-    dyy = _box(pixels, stride, w, f, n[0], n[9], n[2], n[7]) - 3.0 * _box(pixels, stride, w, f, n[3], n[6], n[2], n[7])
-    dxy = _box(pixels, stride, w, f, n[1], n[4], n[1], n[4]) + _box(pixels, stride, w, f, n[5], n[8], n[5], n[8])
-    dxy -= _box(pixels, stride, w, f, n[1], n[4], n[5], n[8]) + _box(pixels, stride, w, f, n[5], n[8], n[1], n[4])
+        u = x + size * (k / 9.0 - 0.5)
+        column = np.int64(u)
+        at = np.uint64(_PART[k] * lanes + column)
+        value = _WEIGHT[k] * (parts[at] + (u - column) * (parts[at + np.uint64(1)] - parts[at]))
+        if _PART[k] == 0:
+            dxx += value
+        elif _PART[k] == 1:
+            dyy += value
+        else:
+            dxy += value
     area = size * size
     dxx, dyy, dxy = dxx * 5.4 / area, dyy * 5.4 / area, dxy * 9.0 / area
     return dxx * dyy - 0.81 * dxy * dxy
 
 
 @helper
-def _responses(pixels, stride, x, y, size, first, last, whole, part, values):
-    """Responses at a range of the places of the finite differences."""
-    for k in range(first, last):
-        u, v = x + _PLACES[k, 0] * _STEP * size, y + _PLACES[k, 1] * _STEP * size
-        values[k] = _response(pixels, stride, u, v, size + _PLACES[k, 2] * _SIZE_STEP * size, whole, part)
+def _responses(pixels, stride, x, y, size, step, wide, corners, fractions, parts, lanes, out, layer, row):
+    """Responses of a filter at (x, y) and, if `wide`, `step` to its left and right; it must lie inside the image.
+
+    The vertical part of the filters is common to the three.
+    """
+    half = 0.5 * size + (step if wide else 0.0)
+    first = np.int64(x + 0.5 - half)
+    n = (np.int64(x + 0.5 + half) + 1 + _LANES - first) & -_LANES
+    for k in range(10):
+        v = y + 0.5 + size * (k / 9.0 - 0.5)
+        whole = np.int64(v)
+        corners[k], fractions[k] = np.uint64(whole * stride + first), v - whole
+    _vertical_parts(pixels, np.uint64(stride), corners, fractions, n, parts, np.uint64(lanes))
+    for j in range(0 if wide else 1, 3 if wide else 2):
+        out[layer, row, j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
 
 
 @helper
-def _inverse_curvature(v, inverse):
+def _sample(pixels, stride, x, y, size, bend, corners, fractions, parts, lanes, cube):
+    """Responses about (x, y, size), as cube[size, y, x]: those of the gradient and, if `bend`, of the curvature."""
+    step = _STEP * size
+    for layer in range(3):
+        for row in range(3):
+            sides = (layer == 1) + (row == 1)
+            if bend or sides:
+                wide = sides == 2 or (bend and sides == 1)
+                v, scale = y + (row - 1) * step, size + (layer - 1) * _SIZE_STEP * size
+                _responses(
+                    pixels, stride, x, v, scale, step, wide, corners, fractions, parts, lanes, cube, layer, row
+                )  # fmt: skip
+
+
+@helper
+def _inverse_curvature(c, inverse):
     """Inverse of the Hessian (3, 3) of the responses, in units of the finite differences; False unless a maximum."""
-    xx, yy, ss = v[1] + v[2] - 2.0 * v[0], v[3] + v[4] - 2.0 * v[0], v[5] + v[6] - 2.0 * v[0]
-    xy, xs = 0.25 * (v[7] - v[8] - v[9] + v[10]), 0.25 * (v[11] - v[12] - v[13] + v[14])
-    ys = 0.25 * (v[15] - v[16] - v[17] + v[18])
+    v = 2.0 * c[1, 1, 1]
+    xx, yy, ss = c[1, 1, 0] + c[1, 1, 2] - v, c[1, 0, 1] + c[1, 2, 1] - v, c[0, 1, 1] + c[2, 1, 1] - v
+    xy = 0.25 * (c[1, 2, 2] - c[1, 0, 2] - c[1, 2, 0] + c[1, 0, 0])
+    xs = 0.25 * (c[2, 1, 2] - c[0, 1, 2] - c[2, 1, 0] + c[0, 1, 0])
+    ys = 0.25 * (c[2, 2, 1] - c[0, 2, 1] - c[2, 0, 1] + c[0, 0, 1])
     cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
     det = xx * cxx + xy * cxy + xs * cxs
     if not (xx < 0.0 and xx * yy - xy * xy > 0.0 and det < 0.0):
@@ -102,7 +119,7 @@ def _inverse_curvature(v, inverse):
 
 
 def localise(
-    integral: NDArray[np.int32],
+    integral: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     size: NDArray[np.float64],
@@ -111,7 +128,7 @@ def localise(
     """Maximum of the response next to each feature, in continuous position and size.
 
     Args:
-        integral: see `integral_image`.
+        integral: see `float_integral_image`.
         x: columns of the features (N,) [px].
         y: their rows (N,) [px].
         size: their sizes (N,) [px].
@@ -122,17 +139,19 @@ def localise(
         maximum in reach, or where the filter would leave the image.
     """
     out = np.full((len(x), 4), np.nan)
+    lanes = int(_WIDEST * size.max(initial=0.0)) + 2 * _LANES
     _localise(
-        integral.reshape(-1), integral.shape, x, y, size, reach, np.empty((2, 10), np.int64), np.empty((2, 10)),
-        np.empty(len(_PLACES)), np.empty((3, 3)), np.empty(3), out,
+        integral.reshape(-1), integral.shape, x, y, size, reach, np.empty(10, np.uint64), np.empty(10),
+        np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3), out,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _localise(pixels, shape, x, y, size, reach, whole, part, values, inverse, step, out):
+def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube, inverse, step, out):
     """The same into `out`, on the flat integral image and with work space."""
     rows, stride = shape
+    lanes = parts.size // 3
     for i in range(x.size):
         u, v, s = x[i], y[i], size[i]
         for k in range(_ITERATIONS):
@@ -141,14 +160,14 @@ def _localise(pixels, shape, x, y, size, reach, whole, part, values, inverse, st
                 break
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
-            _responses(pixels, stride, u, v, s, 0, len(_PLACES) if bend else 7, whole, part, values)
-            if bend and not _inverse_curvature(values, inverse):
+            _sample(pixels, stride, u, v, s, bend, corners, fractions, parts, lanes, cube)
+            if bend and not _inverse_curvature(cube, inverse):
                 break
+            gx, gy = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
+            gs = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])
             largest = 0.0
             for a in range(3):
-                step[a] = 0.0
-                for b in range(3):
-                    step[a] -= inverse[a, b] * 0.5 * (values[2 * b + 2] - values[2 * b + 1])
+                step[a] = -(inverse[a, 0] * gx + inverse[a, 1] * gy + inverse[a, 2] * gs)
                 largest = max(largest, abs(step[a]))
             shrink = 1.0 if largest <= 1.0 else 1.0 / largest
             u += shrink * step[0] * _STEP * s
@@ -157,7 +176,7 @@ def _localise(pixels, shape, x, y, size, reach, whole, part, values, inverse, st
             if (u - x[i]) ** 2 + (v - y[i]) ** 2 > (reach * size[i]) ** 2 or not 0.6 < s / size[i] < 1.7:
                 break
             if largest < _CONVERGED:
-                out[i, 0], out[i, 1], out[i, 2], out[i, 3] = u, v, s, values[0]
+                out[i, 0], out[i, 1], out[i, 2], out[i, 3] = u, v, s, cube[1, 1, 1]
                 break
 
 
@@ -168,10 +187,12 @@ def first_of_each(x: NDArray, y: NDArray, size: NDArray) -> NDArray[np.bool_]:
     """
     keep = np.ones(len(x), bool)
     order = np.argsort(x, kind="stable")
-    for lag in range(1, min(_FOLLOWERS, len(x) - 1) + 1):
-        i, j = order[:-lag], order[lag:]
-        near = 0.05 * np.maximum(size[i], size[j])
-        same = np.hypot(x[i] - x[j], y[i] - y[j]) < near
-        same &= np.abs(size[i] - size[j]) < 2.0 * near
-        keep[np.maximum(i, j)[same]] = False
+    padded = np.full((3, len(x) + _FOLLOWERS), np.inf)
+    padded[:, : len(x)] = x[order], y[order], size[order]
+    first = padded[:, : len(x)]
+    later = np.stack([padded[:, lag : lag + len(x)] for lag in range(1, _FOLLOWERS + 1)], axis=1)  # (3, lags, N)
+    near = 0.05 * np.maximum(first[2], later[2])
+    dx, dy, ds = later - first[:, None]
+    lag, i = np.nonzero((dx * dx + dy * dy < near * near) & (np.abs(ds) < 2.0 * near))
+    keep[np.maximum(order[i], order[i + 1 + lag])] = False
     return keep

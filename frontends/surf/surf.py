@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +12,9 @@ from numpy.typing import NDArray
 
 from frontends.surf.descriptor import TURNED_BOX, UPRIGHT_BOX, describe, gaussian_weights
 from frontends.surf.detector import COLUMNS, detect_octave
-from frontends.surf.filters import Filters, layer_sizes, make_filters
+from frontends.surf.filters import layer_sizes, make_filters
 from frontends.surf.images import FULL_SCALE, binary_mask, grey
-from frontends.surf.integral import integral_image
+from frontends.surf.integral import float_integral_image, integral_image
 from frontends.surf.keypoints import UPRIGHT_ANGLE, Keypoints
 from frontends.surf.localisation import first_of_each, localise
 from frontends.surf.orientation import orientations
@@ -25,7 +24,7 @@ from slam.errors import ConfigurationError
 if TYPE_CHECKING:
     import cv2
 
-_SMALLEST_STRIPE = 48  # cost: grid rows that are worth a task of their own
+_SMALLEST_STRIPE = 48  # cost: rows [px] that are worth a task of their own
 _REACH = 0.15  # furthest that localisation moves a feature, in units of its size
 
 
@@ -95,8 +94,7 @@ class Surf:
         Raises:
             SequenceError: the image is unusable.
         """
-        image = grey(image)
-        return self.localise_in(integral_image(image), keypoints, FULL_SCALE[image.dtype])
+        return self.localise_in(grey(image), keypoints)
 
     def describe(self, image: NDArray, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
         """Orient (unless upright) and describe features; those that cannot be oriented are left out.
@@ -179,14 +177,24 @@ class Surf:
         height, width = integral.shape[0] - 1, integral.shape[1] - 1
         usable = [o for o in range(self.octaves) if min(width, height) >= layer_sizes(o, self.layers)[2]]
         bank = [make_filters(o, self.layers, 255.0 / full_scale, width + 1) for o in usable]
-        tasks = [task for o, f in zip(usable, bank) for task in self._scans(integral, f, o, limit)]
-        rows = np.concatenate([np.zeros((0, COLUMNS)), *self.workers.run(tasks)])
+        count = max(1, min(self.workers.threads, height // _SMALLEST_STRIPE))
+
+        def search(stripe: int) -> list[NDArray[np.float64]]:
+            """Candidates in a stripe of the image, by octave."""
+            edges = [[(height >> o) * k // count for k in (stripe, stripe + 1)] for o in usable]
+            return [detect_octave(integral, f, o, limit, a, b) for o, f, (a, b) in zip(usable, bank, edges)]
+
+        found = self.workers.run([partial(search, stripe) for stripe in range(count)])
+        rows = np.concatenate([np.zeros((0, COLUMNS)), *(part for octave in zip(*found) for part in octave)])
         if mask is not None:
             rows = rows[_mostly_inside(rows, mask)]
         return _as_keypoints(rows[np.argsort(-rows[:, 3], kind="stable")])
 
-    def localise_in(self, integral: NDArray[np.int32], keypoints: Keypoints, full_scale: float) -> Keypoints:
-        """`localise` on an integral image of pixels 0..full_scale; of several that share a maximum one stays."""
+    def localise_in(self, image: NDArray, keypoints: Keypoints) -> Keypoints:
+        """`localise` in an image as `grey` gives it; of several features that share a maximum one stays."""
+        if not len(keypoints):
+            return keypoints
+        integral = float_integral_image(image)
         x, y = np.ascontiguousarray(keypoints.uv.T)
         size = np.ascontiguousarray(keypoints.size)
         place = np.concatenate(
@@ -194,7 +202,7 @@ class Surf:
         )
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         place = place[rows]
-        response = place[:, 3] * (255.0 / full_scale) ** 2
+        response = place[:, 3] * (255.0 / FULL_SCALE[image.dtype]) ** 2
         order = np.argsort(-response, kind="stable")
         place, rows, response = place[order], rows[order], response[order]
         x, y, size = np.ascontiguousarray(place[:, :3].T)
@@ -207,32 +215,27 @@ class Surf:
 
     def describe_in(self, integral: NDArray[np.int32], keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
         """`describe` on an integral image."""
+        shares = self.workers.over(len(keypoints), self.describer(integral, keypoints))
+        angles, descriptors = (np.concatenate(parts) for parts in zip(*shares))
+        good = np.isfinite(angles)
+        return replace(keypoints, angle=angles).select(good), descriptors[good]
+
+    def describer(
+        self, integral: NDArray[np.int32], keypoints: Keypoints
+    ) -> Callable[[int, int], tuple[NDArray[np.float64], NDArray[np.float32]]]:
+        """What returns the angles [rad], NaN where there is none, and the descriptors of features number a to b."""
         x, y = np.ascontiguousarray(keypoints.uv.T)
         size = np.ascontiguousarray(keypoints.size)
         box = UPRIGHT_BOX if self.upright else TURNED_BOX
 
         def orient_and_describe(a: int, b: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-            """Angles and descriptors of some of the features."""
             upright = np.full(b - a, UPRIGHT_ANGLE)
             angle = upright if self.upright else orientations(integral, x[a:b], y[a:b], size[a:b])
-            return angle, describe(integral, x[a:b], y[a:b], size[a:b], np.nan_to_num(angle), box, self._weights)
+            return angle, describe(
+                integral, x[a:b], y[a:b], size[a:b], np.where(np.isfinite(angle), angle, 0.0), box, self._weights
+            )
 
-        angles, descriptors = (np.concatenate(parts) for parts in zip(*self.workers.over(len(x), orient_and_describe)))
-        oriented = Keypoints(
-            keypoints.uv, keypoints.size, angles, keypoints.response, keypoints.laplacian, keypoints.octave
-        )
-        good = np.isfinite(angles)
-        return (oriented, descriptors) if good.all() else (oriented.select(good), descriptors[good])
-
-    def _scans(
-        self, integral: NDArray[np.int32], filters: Filters, octave: int, limit: float
-    ) -> list[Callable[[], NDArray[np.float64]]]:
-        """Searches of an octave, in stripes of rows: one, or some for each thread."""
-        rows = (integral.shape[0] - 1) >> octave
-        threads = self.workers.threads
-        count = 1 if threads == 1 else max(1, min(threads, rows // _SMALLEST_STRIPE))
-        edges = [rows * k // count for k in range(count + 1)]
-        return [partial(detect_octave, integral, filters, octave, limit, a, b) for a, b in pairwise(edges)]
+        return orient_and_describe
 
 
 def _as_keypoints(rows: NDArray[np.float64]) -> Keypoints:

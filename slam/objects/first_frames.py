@@ -23,7 +23,7 @@ from slam.objects.regions import classify_scene, tail
 
 #: Gives the positions (K, 3) of landmarks in the world [m] by their ids (K,).
 Places = Callable[[IdArray], Array]
-_LEAST_SCALE = 1e-3  # numerics: of χ²; measurements without noise would agree with nothing
+_LEAST_NOISE = 0.1  # px: from frame to frame pixels are no better than that, and errors of the rig show below it
 _RIDGE = 1e-6  # numerics: share of the trace
 
 
@@ -87,7 +87,7 @@ def moving_landmarks(
     lag = (frame - first.frame[known]).astype(float)
     moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), lag)
     place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
-    scene = classify_scene(moved, place, config.suspect, config.min_support, _LEAST_SCALE)
+    scene = classify_scene(moved, place, config.suspect, config.min_support, (_LEAST_NOISE / sigma) ** 2)
     for group in scene.groups:
         moves[known[group.members]] = True
     moves[known[scene.alone > config.doubtful * tail(scene.alone)]] = True

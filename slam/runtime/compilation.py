@@ -21,6 +21,7 @@ from slam.runtime.compile_clock import compile_clock
 try:
     from numba import njit
     from numba.core import event
+    from numba.core.compiler import Compiler
 except ValueError as error:
     if not any(name.startswith("NUMBA_") for name in os.environ):
         raise
@@ -31,9 +32,20 @@ _ROOMS = ("slam.", "frontends.", "backends.")
 _NUMPY: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is no exception
 _INNER: dict[str, Any] = {**_NUMPY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
 
+
+class _Disjoint(Compiler):
+    """Compiles for arrays of which none that is written to shares memory with another."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.state.flags.noalias = True
+
+
 helper = njit(**_INNER)
 #: Sums may be reordered, so that loops run on vector registers; always the same way, whatever the number of threads.
 vector_helper = njit(fastmath=True, **_INNER)
+#: The same for loops over so many arrays that looking for shared memory would keep them from vector registers.
+disjoint_vector_helper = njit(fastmath=True, pipeline_class=_Disjoint, **_INNER)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
