@@ -23,7 +23,7 @@ from slam.objects.regions import classify_scene, tail
 
 #: Gives the positions (K, 3) of landmarks in the world [m] by their ids (K,).
 Places = Callable[[IdArray], Array]
-_LEAST_NOISE = 0.1  # px: from frame to frame pixels are no better than that, and errors of the rig show below it
+_LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it no better; errors of the rig are below
 _RIDGE = 1e-6  # numerics: share of the trace
 
 
