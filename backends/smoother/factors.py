@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -96,7 +97,7 @@ class FactorMaker:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
-    def smart(self, points: list, keys: list[int]) -> gtsam.NonlinearFactor:
+    def smart(self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int]) -> gtsam.NonlinearFactor:
         """A landmark eliminated from its measurements."""
         factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._parameters, *self._sensor)
         factor.add(points, keys, self._K)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,11 @@ from slam.geometry.se3 import Array
 RECENT = 12
 
 
-@dataclass
+@dataclass(frozen=True)
 class Track:
     """A landmark's measurements since its last factor was finished, and the factor that holds them.
+
+    It is never changed, only replaced: tracks as they were are kept by a copy of the dictionary that holds them.
 
     Attributes:
         limit: so many measurements finish it.
@@ -31,9 +33,9 @@ class Track:
     """
 
     limit: int
-    rows: list[int] = field(default_factory=list)
-    points: list[Any] = field(default_factory=list)
-    keys: list[int] = field(default_factory=list)
+    rows: tuple[int, ...] = ()
+    points: tuple[Any, ...] = ()
+    keys: tuple[int, ...] = ()
     stereo: int = 0
     factor: int = -1
 
@@ -45,21 +47,23 @@ class Track:
         """Whether a smart factor can be made: gtsam's throws where it is given left pixels only."""
         return len(self.rows) >= 2 and self.stereo > 0
 
-    def append(self, row: int, point: Any, key: int, stereo: bool) -> None:
-        """Add a measurement."""
-        self.rows.append(row)
-        self.points.append(point)
-        self.keys.append(key)
-        self.stereo += stereo
+    def longer(self, row: int, point: Any, key: int, stereo: bool) -> Track:
+        """With one more measurement."""
+        rows, points, keys = (*self.rows, row), (*self.points, point), (*self.keys, key)
+        return Track(self.limit, rows, points, keys, self.stereo + stereo, self.factor)
 
-    def drop_last(self, stereo: bool) -> None:
-        """Take back the newest measurement."""
-        self.rows.pop(), self.points.pop(), self.keys.pop()
-        self.stereo -= stereo
+    def without_last(self, stereo: bool) -> Track:
+        """Without the newest measurement."""
+        rows, points, keys = self.rows[:-1], self.points[:-1], self.keys[:-1]
+        return Track(self.limit, rows, points, keys, self.stereo - stereo, self.factor)
 
-    def restart(self) -> None:
-        """Forget the measurements: their factor is finished and stays as it is."""
-        self.rows, self.points, self.keys, self.stereo, self.factor = [], [], [], 0, -1
+    def in_factor(self, slot: int) -> Track:
+        """The same in the smart factor of a slot."""
+        return Track(self.limit, self.rows, self.points, self.keys, self.stereo, slot)
+
+    def restarted(self) -> Track:
+        """Without measurements: their factor is finished and stays as it is."""
+        return Track(self.limit)
 
 
 @dataclass(frozen=True)
@@ -163,6 +167,11 @@ class Landmarks:
         self.recent[slots, place] = rows
         self.seen[slots] += 1
         self.last[slots] = frame
+
+    def put_in_factors(self, factors: Mapping[int, int]) -> None:
+        """Note the smart factors that hold some landmarks' tracks, both by slot."""
+        for slot, factor in factors.items():
+            self.tracks[slot] = self.tracks[slot].in_factor(factor)
 
     def remove(self, slots: IndexArray) -> None:
         """Take landmarks out of the map."""

@@ -95,25 +95,32 @@ def predict_points(predicted: PredictedPose, points: Array, own: Array, by_windo
         own: their covariances (M, 3, 3) where all poses are known.
         by_window: their Jacobians (M, 3, 6 W) by the poses of the window.
     """
-    R, t = predicted.T[:3, :3], predicted.T[:3, 3]
-    local = (points - t) @ R
+    R = predicted.T[:3, :3]
+    local, own = seen_from(predicted.T, points, own)
     by_camera = points_by_pose(local)
-    return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, R.T @ own @ R)
+    return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, own)
 
 
-def residual_noise(stereo: RectifiedStereo, sigma: float, points: PredictedPoints, z: Array) -> Array:
+def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:
+    """Points (M, 3) and their covariances (M, 3, 3) in the coordinates of a camera at T (4, 4)."""
+    R = T[:3, :3]
+    return (points - T[:3, 3]) @ R, R.T @ own @ R
+
+
+def residual_noise(stereo: RectifiedStereo, sigma: float, local: Array, own: Array, z: Array) -> Array:
     """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
 
-    Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position, whichever
-    gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
+    The landmarks are at `local` (M, 3) in the camera's coordinates, with covariances `own` (M, 3, 3) where all poses
+    are known. Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position,
+    whichever gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
     """
-    _, J = stereo.project(points.local)
-    own = J @ points.own @ np.swapaxes(J, 1, 2)
+    _, J = stereo.project(local)
+    estimated = J @ own @ np.swapaxes(J, 1, 2)
     _, J = stereo.project(stereo.triangulate(z))
-    measured = J @ points.own @ np.swapaxes(J, 1, 2)
-    size, other = (np.trace(C, axis1=1, axis2=2) for C in (own, measured))
+    measured = J @ own @ np.swapaxes(J, 1, 2)
+    size, other = (np.trace(C, axis1=1, axis2=2) for C in (estimated, measured))
     smaller = (other > 0) & (other < size)
-    return np.where(smaller[:, None, None], measured, own) + sigma**2 * np.eye(3)
+    return np.where(smaller[:, None, None], measured, estimated) + sigma**2 * np.eye(3)
 
 
 def normalised_innovation(

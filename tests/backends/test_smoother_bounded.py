@@ -12,7 +12,7 @@ from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker
 from backends.smoother.marginal import MarginalPrior
-from backends.smoother.prediction import PredictedPoints, residual_noise
+from backends.smoother.prediction import residual_noise
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Observations
@@ -149,9 +149,8 @@ def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
 def test_a_landmark_close_by_does_not_explain_any_pixel():
     stereo = RectifiedStereo.of(KITTI)
     local, own = np.array([[-0.5, -1.0, 1.4]]), np.diag([0.05, 0.05, 1.5])[None] ** 2
-    none = np.zeros((1, 3, 0))
     z = np.array([[585.0, 131.6, 570.8]])  # of a point 27 m away
-    noise = residual_noise(stereo, 0.7, PredictedPoints(local, none, np.zeros((1, 3, 6)), own), z)
+    noise = residual_noise(stereo, 0.7, local, own, z)
     h, _ = stereo.project(local)
     r = (z - h)[0]
     assert r @ np.linalg.solve(noise[0], r) > 1000
