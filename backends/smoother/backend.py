@@ -126,7 +126,7 @@ class SmootherBackend:
         solved = self._belief.points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         try:
-            nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
+            nis, dof = normalised_innovation(self._stereo, self._make.sigma, solved, z[used], step)
         except np.linalg.LinAlgError:  # covariances that differ by more than their digits
             nis, dof = float("nan"), 0
         with self._whole():
@@ -283,7 +283,7 @@ class SmootherBackend:
         points = self._belief.points(predicted, slots)
         uv, J = rig.left.project_with_jacobian(points.local)
         right = rig.right.project((points.local + rig.b) @ rig.R.T)
-        S = J @ points.covariance(predicted) @ np.swapaxes(J, 1, 2) + self.models.pixel_sigma**2 * np.eye(2)
+        S = points.covariance(J) + self.models.pixel_sigma**2 * np.eye(2)
         return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
 
     def _solve_pose(
@@ -312,6 +312,6 @@ class SmootherBackend:
             raise MeasurementError(f"smoother: {what} before the first predict")
 
     def _require_new(self, ids: IdArray) -> None:
-        for i in ids.tolist():
-            if i in self.measurement_log.landmarks:
-                raise MeasurementError(f"smoother: landmark {i} is in the map already")
+        known = ids[self.measurement_log.landmarks.among(ids)]
+        if len(known):
+            raise MeasurementError(f"smoother: landmark {known[0]} is in the map already")
