@@ -14,7 +14,7 @@ from backends.smoother.stereo import RectifiedStereo
 _POSE = "x"
 _BALLAST = "z"
 _LETTERS = "ABCDEFGHIJKLMNOP"
-_INDEX_BITS = 56  # of a key, below those of its letter; asking gtsam for each key would take longer
+_INDEX_BITS = 56  # numerics: of a key, below those of its letter; asking gtsam for each key would take longer
 _FIRST_POSE = int(gtsam.symbol(_POSE, 0))
 _FINEST = 1e-3  # cost: threshold of the first letter [m]; each next one's is twice as large
 
