@@ -170,6 +170,24 @@ def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():
     factor.linearize(values)
 
 
+@pytest.mark.parametrize(("depth", "refined"), [(10.0, False), (30.0, False), (300.0, True)])
+def test_only_far_points_are_refined_and_near_ones_are_the_same_without(depth, refined):
+    stereo, rng = RectifiedStereo.of(KITTI), np.random.default_rng(0)
+    make = FactorMaker(stereo, EstimatorModels(pixel_sigma=0.7))
+    values, keys, points = gtsam.Values(), [pose_key(i) for i in range(5)], []
+    for i, key in enumerate(keys):
+        values.insert(key, gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * i, 0.0, 0.5 * i])))
+        z, _ = stereo.project(np.array([[1.0 - 0.1 * i, 0.5, depth - 0.5 * i]]))
+        points.append(make.point((z[0] + 0.7 * rng.standard_normal(3)).tolist()))
+    assert make._is_far(points) == refined
+    assert make._is_far([*points[:-1], make.point([600.0, 180.0, np.nan])])
+    if not refined:
+        as_it_is = make.smart(points, keys).linearize(values).information()
+        make._linear = make._refined
+        with_more = make.smart(points, keys).linearize(values).information()
+        np.testing.assert_allclose(as_it_is, with_more, atol=0.03 * np.abs(with_more).max())
+
+
 def test_a_map_may_be_looked_at_before_the_camera_is_in_it():
     backend = SmootherBackend(RIG, MODELS)
     ids, covariances = np.arange(3), np.tile(1e-4 * np.eye(3), (3, 1, 1))
