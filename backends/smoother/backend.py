@@ -18,7 +18,7 @@ from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.objects import ObjectSmoother
 from backends.smoother.pose_set import PredictedPose
-from backends.smoother.prediction import PredictedPoints, normalised_innovation, residual_noise
+from backends.smoother.prediction import normalised_innovation, residual_noise, seen_from
 from backends.smoother.recovery import Agreement, agreement, world_covariance
 from backends.smoother.rollback import snapshot
 from backends.smoother.stereo import RectifiedStereo
@@ -113,9 +113,8 @@ class SmootherBackend:
         if predicted is None or not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         z, P = self._stereo.measure(observations), predicted.covariance
-        points = self._belief.points(predicted, slots)
         try:
-            found = self._solve_pose(predicted, points, slots, observations, guess)
+            found = self._solve_pose(predicted, slots, z, observations, guess)
         except np.linalg.LinAlgError as error:
             return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: the pose cannot be solved for: {error}")
         self._contradicted = found.contradicted
@@ -127,7 +126,7 @@ class SmootherBackend:
         solved = self._belief.points(replace(predicted, T=T), slots[used])
         step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
         try:
-            nis, dof = normalised_innovation(self._stereo, self._make.sigma, predicted, solved, z[used], step)
+            nis, dof = normalised_innovation(self._stereo, self._make.sigma, solved, z[used], step)
         except np.linalg.LinAlgError:  # covariances that differ by more than their digits
             nis, dof = float("nan"), 0
         with self._whole():
@@ -284,16 +283,16 @@ class SmootherBackend:
         points = self._belief.points(predicted, slots)
         uv, J = rig.left.project_with_jacobian(points.local)
         right = rig.right.project((points.local + rig.b) @ rig.R.T)
-        S = J @ points.covariance(predicted) @ np.swapaxes(J, 1, 2) + self.models.pixel_sigma**2 * np.eye(2)
+        S = points.covariance(J) + self.models.pixel_sigma**2 * np.eye(2)
         return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
 
     def _solve_pose(
-        self, predicted: PredictedPose, points: PredictedPoints, slots: IndexArray, observations: Observations,
-        guess: Array | None,
-    ) -> Agreement:  # fmt: skip
+        self, predicted: PredictedPose, slots: IndexArray, z: Array, observations: Observations, guess: Array | None
+    ) -> Agreement:
         """Initial value of the newest pose, and which measurements agree with it."""
-        marks, z = self.measurement_log.landmarks, self._stereo.measure(observations)
-        noise = residual_noise(self._stereo, self._make.sigma, points, z)
+        marks = self.measurement_log.landmarks
+        local, own = seen_from(predicted.T, marks.position[slots], marks.covariance[slots])
+        noise = residual_noise(self._stereo, self._make.sigma, local, own, z)
         known = marks.prior[slots].any()  # what is known in the world does not move with the poses
         P = predicted.covariance if known else predicted.covariance_to(self._belief.last_measured())
         information = np.linalg.inv(P)
@@ -313,6 +312,6 @@ class SmootherBackend:
             raise MeasurementError(f"smoother: {what} before the first predict")
 
     def _require_new(self, ids: IdArray) -> None:
-        for i in ids.tolist():
-            if i in self.measurement_log.landmarks:
-                raise MeasurementError(f"smoother: landmark {i} is in the map already")
+        known = ids[self.measurement_log.landmarks.among(ids)]
+        if len(known):
+            raise MeasurementError(f"smoother: landmark {known[0]} is in the map already")

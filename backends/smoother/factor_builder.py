@@ -54,14 +54,14 @@ class FactorBuilder:
         recent = (marks.variable >= 0) & (marks.last > frame - _LATE)
         landmarks.update(set(marks.variable[recent].tolist()).difference(gone))
 
-    def grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> list[tuple[Track, int]]:
-        """Put measurements into factors; returns tracks with the places of their new smart factors in the change."""
+    def grow(self, change: Change, slots: IndexArray, rows: IndexArray, z: Array) -> dict[int, int]:
+        """Put measurements into factors; returns the places of new smart factors in the change, by landmark's slot."""
         make, marks, frame = self._make, self.log.landmarks, self.log.path.count - 1
         key, explicit = pose_key(frame), self.log.history.explicit
         self._enter_known(change, slots)
         variables, again = marks.variable[slots], (frame - marks.last[slots] > _GAP).tolist()
         room = self._config.explicit - int((variables >= 0).sum())
-        grown = []
+        grown = {}
         columns = (slots.tolist(), variables.tolist(), rows.tolist(), z.tolist(), np.isfinite(z[:, 2]).tolist(), again)
         for slot, variable, row, zi, stereo, long_unseen in zip(*columns):
             point = make.point(zi)
@@ -69,10 +69,8 @@ class FactorBuilder:
                 explicit[variable].append(row)
                 change.factors.add(make.explicit(point, key, variable))
                 continue
-            track = marks.tracks[slot]
-            if long_unseen and room <= 0:
-                self.log.finish(track)
-            track.append(row, point, key, stereo)
+            track = self.log.finish(slot) if long_unseen and room <= 0 else marks.tracks[slot]
+            marks.tracks[slot] = track = track.longer(row, point, key, stereo)
             if not track.informative:
                 continue
             if track.factor >= 0:
@@ -82,7 +80,7 @@ class FactorBuilder:
                 room -= 1
                 self._make_variable(change, slot, track)
                 continue
-            grown.append((track, change.factors.size()))
+            grown[slot] = change.factors.size()
             change.factors.add(make.smart(track.points, track.keys))
         return grown
 
@@ -95,10 +93,10 @@ class FactorBuilder:
     def _make_variable(self, change: Change, slot: int, track: Track) -> None:
         """Turn a landmark's smart factor into a variable with a factor for each measurement."""
         key = self._new_variable(change, slot)
-        self.log.history.explicit[key] = track.rows
+        self.log.history.explicit[key] = list(track.rows)
         for point, pose in zip(track.points, track.keys):
             change.factors.add(self._make.explicit(point, pose, key))
-        track.restart()
+        self.log.landmarks.tracks[slot] = track.restarted()
 
     def _known(self, slot: int) -> Known | None:
         """A landmark's prior; None once the pose that it is relative to has left the solver."""
@@ -138,4 +136,4 @@ class FactorBuilder:
         for slot in slots[marks.variable[slots] < 0].tolist():
             track = marks.tracks[slot]
             if len(track.rows) >= track.limit:
-                self.log.finish(track)
+                self.log.finish(slot)

@@ -132,8 +132,7 @@ class FactorGraph:
         try:
             try:
                 new = self._enter_pose(change)
-                for track, number in grown:
-                    track.factor = new[number]
+                marks.put_in_factors({slot: new[number] for slot, number in grown.items()})
             except SolverError:
                 self._rebuild()
         except SolverError as error:
@@ -199,7 +198,7 @@ class FactorGraph:
         path.note_measured()
         key = pose_key(frame)
         for slot, row, zi in zip(slots.tolist(), rows.tolist(), z.tolist()):
-            marks.tracks[slot].append(row, self._make.point(zi), key, stereo=True)
+            marks.tracks[slot] = marks.tracks[slot].longer(row, self._make.point(zi), key, stereo=True)
         linearise(self._make, self.log, slots)
         self.placements += 1
 
@@ -226,7 +225,7 @@ class FactorGraph:
         """Remove landmarks from the map; what their measurements said about the poses is kept."""
         marks = self.log.landmarks
         for slot in slots.tolist():
-            self.log.finish(marks.tracks[slot])
+            self.log.finish(slot)
         marks.remove(slots)
 
     def revise(self, correct: Callable[[Array], Array]) -> None:
@@ -331,10 +330,10 @@ class FactorGraph:
         marks = self.log.landmarks
         self.log.path.poses[first - len(left) : first] = left
         marks.variable[np.isin(marks.variable, rest.gone)] = -1
-        for track in rest.finished:
-            track.restart()
-        for track in marks.tracks.values():
-            track.factor = new[rest.slots[track.factor]] if track.factor >= 0 else -1
+        for slot in rest.finished:
+            marks.tracks[slot] = marks.tracks[slot].restarted()
+        held_by = {slot: track.factor for slot, track in marks.tracks.items() if track.factor >= 0}
+        marks.put_in_factors({slot: new[rest.slots[factor]] for slot, factor in held_by.items()})
         self.log.advance(first, rest.gone, rest.prior, held)
         self._seconds += self.solver.seconds
         self.solver = solver
@@ -416,10 +415,8 @@ class FactorGraph:
             held = _with_covariance(held, solver)
         self._broken = True  # until all of the following has been done
         self.log.history.reference = held
-        for track in self.log.landmarks.tracks.values():
-            track.factor = -1
-        for track, number in places:
-            track.factor = new[number]
+        marks = self.log.landmarks
+        marks.put_in_factors({slot: new[places[slot]] if slot in places else -1 for slot in marks.tracks})
         self._seconds += self.solver.seconds
         self.solver, self._rebuilt = solver, self.log.path.count
         self.solutions += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,9 @@ from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import pose_key
 from slam.geometry.se3 import Array, hat, nearest_rotation
 from slam.models import EstimatorModels
+
+#: cost: Share of its depth to which a point's depth must be known for its linear triangulation to be good enough.
+_WELL_KNOWN = 0.1
 
 
 def to_pose3(T: Array) -> gtsam.Pose3:
@@ -34,6 +38,15 @@ def _as_it_is(local: Array) -> tuple[Array, Array]:
     return local, np.eye(3)
 
 
+def _smart_parameters(refined: bool) -> gtsam.SmartProjectionParams:
+    """How smart factors triangulate and linearise."""
+    parameters = gtsam.SmartProjectionParams()
+    # The other mode gives the same information, but throws where a landmark lies behind a camera.
+    parameters.setLinearizationMode(gtsam.LinearizationMode.JACOBIAN_SVD)
+    parameters.setEnableEPI(refined)
+    return parameters
+
+
 class FactorMaker:
     """Makes factors for one rig and one set of models.
 
@@ -48,11 +61,7 @@ class FactorMaker:
         self.sigma = models.pixel_sigma * stereo.scale
         self._K = gtsam.Cal3_S2Stereo(stereo.f, stereo.f, 0.0, stereo.u0, stereo.v0, stereo.baseline)
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
-        self._parameters = gtsam.SmartProjectionParams()
-        # The other mode gives the same information, but throws where a landmark lies behind a camera.
-        self._parameters.setLinearizationMode(gtsam.LinearizationMode.JACOBIAN_SVD)
-        # A far point's linear triangulation alone can be so far off that a step goes astray by metres.
-        self._parameters.setEnableEPI(True)
+        self._refined, self._linear = _smart_parameters(True), _smart_parameters(False)
         rectified = stereo.rectified_rig.original.is_rectified
         self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)
 
@@ -96,11 +105,22 @@ class FactorMaker:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
-    def smart(self, points: list, keys: list[int]) -> gtsam.NonlinearFactor:
-        """A landmark eliminated from its measurements."""
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._parameters, *self._sensor)
+    def smart(self, points: Sequence[gtsam.StereoPoint2], keys: Sequence[int]) -> gtsam.NonlinearFactor:
+        """A landmark eliminated from its measurements.
+
+        The linear triangulation of a far point alone can be so far off that a step goes astray by metres; so it is
+        refined, which takes as long as all the rest.
+        """
+        parameters = self._refined if self._is_far(points) else self._linear
+        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, parameters, *self._sensor)
         factor.add(points, keys, self._K)
         return factor
+
+    def _is_far(self, points: Sequence[gtsam.StereoPoint2]) -> bool:
+        """Whether a point's measurements tell its depth to less than a tenth; n disparities d to ``σ √2 / (d √n)``."""
+        first, last = (point.uL() - point.uR() for point in (points[0], points[-1]))
+        known = first > 0 and len(points) * first * last > 2 * (self.sigma / _WELL_KNOWN) ** 2  # not if one is NaN
+        return not known
 
     def known(self, key: int, known: Known) -> gtsam.NonlinearFactor:
         """The prior on a landmark variable, in the world or in a camera's coordinates.

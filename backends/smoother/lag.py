@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import gtsam
 
-from backends.smoother.landmarks import Track
 from backends.smoother.marginal import MarginalPrior, marginal_prior
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.reference_pose import ReferencePose
@@ -28,7 +27,7 @@ class Marginalised:
     Attributes:
         first: frame of the oldest pose.
         gone: landmark variables that were marginalised.
-        finished: tracks whose factor has become part of the prior.
+        finished: landmarks, by slot, whose track's factor has become part of the prior.
         prior: what the marginalised part says of the rest.
         held: the oldest pose, if it is held; else None.
         change: all factors and values for a new solver.
@@ -37,7 +36,7 @@ class Marginalised:
 
     first: int
     gone: list[int]
-    finished: list[Track]
+    finished: list[int]
     prior: MarginalPrior
     held: ReferencePose | None
     change: Change
@@ -86,7 +85,7 @@ def without_old(log: MeasurementLog, solver: Solver, first: int, most: int) -> M
         if key not in leaving:
             put(kept.values, key, values)
     oldest = pose_key(first)
-    finished = [track for track in log.landmarks.tracks.values() if track.keys and track.keys[0] < oldest]
+    finished = [slot for slot, track in log.landmarks.tracks.items() if track.keys and track.keys[0] < oldest]
     return Marginalised(first, gone, finished, prior, held, kept, slots)
 
 

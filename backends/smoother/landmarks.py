@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from backends.smoother.path import grown
-from slam.data import IdArray, IndexArray
+from slam.data import BoolArray, IdArray, IndexArray
 from slam.errors import MeasurementError
+from slam.geometry.arrays import isin
 from slam.geometry.se3 import Array
 
 #: So many of its last measurements give a landmark's position and covariance.
 RECENT = 12
 
 
-@dataclass
+@dataclass(frozen=True)
 class Track:
     """A landmark's measurements since its last factor was finished, and the factor that holds them.
+
+    It is never changed, only replaced: tracks as they were are kept by a copy of the dictionary that holds them.
 
     Attributes:
         limit: so many measurements finish it.
@@ -31,9 +34,9 @@ class Track:
     """
 
     limit: int
-    rows: list[int] = field(default_factory=list)
-    points: list[Any] = field(default_factory=list)
-    keys: list[int] = field(default_factory=list)
+    rows: tuple[int, ...] = ()
+    points: tuple[Any, ...] = ()
+    keys: tuple[int, ...] = ()
     stereo: int = 0
     factor: int = -1
 
@@ -45,21 +48,23 @@ class Track:
         """Whether a smart factor can be made: gtsam's throws where it is given left pixels only."""
         return len(self.rows) >= 2 and self.stereo > 0
 
-    def append(self, row: int, point: Any, key: int, stereo: bool) -> None:
-        """Add a measurement."""
-        self.rows.append(row)
-        self.points.append(point)
-        self.keys.append(key)
-        self.stereo += stereo
+    def longer(self, row: int, point: Any, key: int, stereo: bool) -> Track:
+        """With one more measurement."""
+        rows, points, keys = (*self.rows, row), (*self.points, point), (*self.keys, key)
+        return Track(self.limit, rows, points, keys, self.stereo + stereo, self.factor)
 
-    def drop_last(self, stereo: bool) -> None:
-        """Take back the newest measurement."""
-        self.rows.pop(), self.points.pop(), self.keys.pop()
-        self.stereo -= stereo
+    def without_last(self, stereo: bool) -> Track:
+        """Without the newest measurement."""
+        rows, points, keys = self.rows[:-1], self.points[:-1], self.keys[:-1]
+        return Track(self.limit, rows, points, keys, self.stereo - stereo, self.factor)
 
-    def restart(self) -> None:
-        """Forget the measurements: their factor is finished and stays as it is."""
-        self.rows, self.points, self.keys, self.stereo, self.factor = [], [], [], 0, -1
+    def in_factor(self, slot: int) -> Track:
+        """The same in the smart factor of a slot."""
+        return Track(self.limit, self.rows, self.points, self.keys, self.stereo, slot)
+
+    def restarted(self) -> Track:
+        """Without measurements: their factor is finished and stays as it is."""
+        return Track(self.limit)
 
 
 @dataclass(frozen=True)
@@ -115,26 +120,29 @@ class Landmarks:
         self.last = np.zeros(256, np.int64)
         self.variable = np.full(256, -1, np.int64)
         self.tracks: dict[int, Track] = {}
-        self._slot: dict[int, int] = {}
+        self._by_id = np.zeros(0, np.intp)  # slots of all landmarks, by ascending id
         self._added = 0
         self._free: list[int] = list(range(255, -1, -1))
 
     def __len__(self) -> int:
-        return len(self._slot)
+        return len(self._by_id)
 
-    def __contains__(self, landmark: int) -> bool:
-        return landmark in self._slot
+    def among(self, ids: IdArray) -> BoolArray:
+        """Which of the ids (M,) are in the map."""
+        return isin(ids, self.ids[self._by_id])
 
-    def slots(self, ids: Iterable[int] | IdArray) -> IndexArray:
+    def slots(self, ids: IdArray) -> IndexArray:
         """Slots (M,) of landmarks; raises MeasurementError where one is not in the map."""
-        try:
-            return np.array([self._slot[i] for i in np.asarray(ids, np.int64).tolist()], np.intp)
-        except KeyError as error:
-            raise MeasurementError(f"smoother: landmark {error.args[0]} is not in the map") from None
+        ids = np.asarray(ids, np.int64)
+        known = self.ids[self._by_id]
+        place = np.searchsorted(known, ids)
+        if not ((place < len(known)).all() and (known[place] == ids).all()):
+            raise MeasurementError(f"smoother: landmark {ids[~self.among(ids)][0]} is not in the map")
+        return self._by_id[place]
 
     def all_slots(self) -> IndexArray:
         """Slots of all landmarks, by ascending id."""
-        return np.array([self._slot[i] for i in sorted(self._slot)], np.intp)
+        return self._by_id.copy()
 
     def used(self) -> IndexArray:
         """Slots of all landmarks, ascending."""
@@ -150,9 +158,9 @@ class Landmarks:
         self._added += len(slots)
         self.recent[slots], self.seen[slots], self.variable[slots] = -1, 0, -1
         self.information[slots], self.older[slots], self.prior[slots] = 0, 0, 0
-        for i, slot, limit in zip(ids.tolist(), slots.tolist(), limits):
-            self._slot[i] = slot
+        for slot, limit in zip(slots.tolist(), limits):
             self.tracks[slot] = Track(limit)
+        self._sort()
         return slots
 
     def measured(self, slots: IndexArray, rows: IndexArray, frame: int) -> None:
@@ -164,12 +172,23 @@ class Landmarks:
         self.seen[slots] += 1
         self.last[slots] = frame
 
+    def put_in_factors(self, factors: Mapping[int, int]) -> None:
+        """Note the smart factors that hold some landmarks' tracks, both by slot."""
+        for slot, factor in factors.items():
+            self.tracks[slot] = self.tracks[slot].in_factor(factor)
+
     def remove(self, slots: IndexArray) -> None:
         """Take landmarks out of the map."""
         for slot in slots.tolist():
-            del self._slot[int(self.ids[slot])], self.tracks[slot]
+            del self.tracks[slot]
             self._free.append(slot)
         self.ids[slots] = self.variable[slots] = -1
+        self._sort()
+
+    def _sort(self) -> None:
+        """Order the slots by id."""
+        slots = self.used()
+        self._by_id = slots[np.argsort(self.ids[slots])]
 
     def _grow(self, needed: int) -> None:
         """Room for at least `needed` more landmarks."""

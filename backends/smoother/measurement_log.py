@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,11 +111,13 @@ class MeasurementLog:
         """Frames of the poses whose joint covariance is worked out, at most so many: see `Path.newest`."""
         return self.path.newest(most, self.history.first)
 
-    def finish(self, track: Track) -> None:
-        """End a track; what it holds stays in its factor."""
+    def finish(self, slot: int) -> Track:
+        """End a landmark's track, and begin the next one; what it holds stays in its factor."""
+        track = self.landmarks.tracks[slot]
         if track.informative:
             self.history.finished.append(np.array(track.rows))
-        track.restart()
+        self.landmarks.tracks[slot] = track = track.restarted()
+        return track
 
     def take_back(self, slots: IndexArray, rows: IndexArray) -> None:
         """Take the newest measurements `rows` of landmarks `slots` out again."""
@@ -124,7 +127,8 @@ class MeasurementLog:
             if variable >= 0:
                 self._take_back_explicit(slot, variable, row)
             elif track.rows and track.rows[-1] == row:
-                track.drop_last(bool(np.isfinite(self.measurements.z[row, 2])))
+                stereo = bool(np.isfinite(self.measurements.z[row, 2]))
+                self.landmarks.tracks[slot] = track.without_last(stereo)
 
     def _take_back_explicit(self, slot: int, variable: int, row: int) -> None:
         """Take back a measurement of a landmark's own variable; without depth from the others the variable goes too.
@@ -148,8 +152,10 @@ class MeasurementLog:
         if not (np.isfinite(z) | np.isnan(self.measurements.z)).all():
             raise MeasurementError("smoother: a mended measurement is not finite")
         self.measurements.z[:] = z
-        for track in self.landmarks.tracks.values():
-            track.points = [point(z) for z in self.measurements.z[track.rows].tolist()] if track.rows else []
+        for slot, track in self.landmarks.tracks.items():
+            if track.rows:
+                points = tuple(point(z) for z in self.measurements.z[list(track.rows)].tolist())
+                self.landmarks.tracks[slot] = replace(track, points=points)
         for slot in np.flatnonzero(self.landmarks.variable >= 0).tolist():
             self.history.places[int(self.landmarks.variable[slot])] = self.landmarks.position[slot].copy()
 
@@ -215,8 +221,9 @@ class MeasurementLog:
         marks.recent[:] = number[np.where(marks.ids[:, None] >= 0, marks.recent, -1)]
         history.finished = [number[rows] for rows in history.finished]
         history.explicit = {key: number[rows].tolist() if rows else [] for key, rows in history.explicit.items()}
-        for track in marks.tracks.values():
-            track.rows = number[track.rows].tolist() if track.rows else []
+        for slot, track in marks.tracks.items():
+            if track.rows:
+                marks.tracks[slot] = replace(track, rows=tuple(number[list(track.rows)].tolist()))
         self.measurements.keep(used[:-1])
 
     def forget_measurements(self) -> None:
@@ -226,8 +233,7 @@ class MeasurementLog:
         history.restarted = self.path.count
         if history.prior is not None:
             history.prior = history.prior.of_reference()
-        for track in self.landmarks.tracks.values():
-            track.restart()
+        self.landmarks.tracks = {slot: track.restarted() for slot, track in self.landmarks.tracks.items()}
         self.landmarks.variable[:] = -1
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from backends.smoother import uncertainty
 from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
@@ -59,11 +57,11 @@ def linearise(make: FactorMaker, log: MeasurementLog, slots: IndexArray) -> tupl
     """
     marks = log.landmarks
     position = marks.position[slots]
-    E, residuals = uncertainty.linearise(
+    information, gradient, _ = uncertainty.linearise(
         make.stereo, make.sigma, log.path.poses, log.measurements, position, marks.recent[slots]
     )
+    marks.information[slots] = information
     step, marks.covariance[slots], gain = uncertainty.position_step(
-        E, residuals, marks.older[slots], np.zeros_like(position), marks.prior[slots], marks.mean[slots] - position
+        information.sum(axis=1) + marks.older[slots], gradient, marks.prior[slots], marks.mean[slots] - position
     )
-    marks.information[slots] = np.swapaxes(E, 2, 3) @ E
     return step, gain

@@ -9,9 +9,9 @@ import numpy as np
 from backends.smoother import motion
 from backends.smoother.path import Path
 from backends.smoother.pose_set import PoseSet, PredictedPose
-from backends.smoother.stereo import RectifiedStereo, by_pose
+from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.uncertainty import quadratic
-from slam.data import BoolArray, IndexArray
+from slam.data import IndexArray
 from slam.geometry.se3 import Array, points_by_pose
 from slam.models import EstimatorModels
 from slam.tracking.gating import whiteners
@@ -65,59 +65,68 @@ class PredictedPoints:
     """Landmarks in the predicted camera's coordinates.
 
     Attributes:
+        predicted: the camera's pose.
         local: positions (M, 3).
-        by_window: their Jacobians (M, 3, 6 W) by the poses of the window.
-        by_camera: their Jacobians (M, 3, 6) by what the motion adds to the pose.
         own: covariances (M, 3, 3) of the landmarks where all poses are known.
+        by_camera: Jacobians (M, 3, 6) of `local` by what the motion adds to the pose.
+        carried: Jacobians (M, 3, 6 W) of the landmarks in world coordinates by the poses of the window.
     """
 
+    predicted: PredictedPose
     local: Array
-    by_window: Array
-    by_camera: Array
     own: Array
+    by_camera: Array
+    carried: Array
 
-    def select(self, rows: BoolArray) -> PredictedPoints:
-        """Some of the landmarks."""
-        return PredictedPoints(self.local[rows], self.by_window[rows], self.by_camera[rows], self.own[rows])
+    def by_window(self, J: Array) -> Array:
+        """Jacobians (M, k, 6 W) by the poses of the window of what depends on `local` by J (M, k, 3)."""
+        moved = (J @ self.by_camera).reshape(-1, 6) @ self.predicted.by_window
+        by_landmark = (J @ self.predicted.T[:3, :3].T) @ self.carried
+        return np.asarray(by_landmark + moved.reshape(by_landmark.shape))
 
-    def covariance(self, predicted: PredictedPose) -> Array:
-        """Covariances (M, 3, 3) of the positions."""
-        from_window = quadratic(self.by_window, predicted.window.covariance)
-        return from_window + quadratic(self.by_camera, predicted.noise) + self.own
+    def covariance(self, J: Array) -> Array:
+        """Covariances (M, k, k) of what depends on `local` by J (M, k, 3)."""
+        from_window = quadratic(self.by_window(J), self.predicted.window.covariance)
+        return from_window + quadratic(J @ self.by_camera, self.predicted.noise) + J @ self.own @ np.swapaxes(J, 1, 2)
 
 
-def predict_points(predicted: PredictedPose, points: Array, own: Array, by_window: Array) -> PredictedPoints:
+def predict_points(predicted: PredictedPose, points: Array, own: Array, carried: Array) -> PredictedPoints:
     """Landmarks as seen from the predicted pose.
 
     Args:
         predicted: the pose.
         points: landmark positions (M, 3) in world coordinates.
         own: their covariances (M, 3, 3) where all poses are known.
-        by_window: their Jacobians (M, 3, 6 W) by the poses of the window.
+        carried: their Jacobians (M, 3, 6 W) by the poses of the window.
     """
-    R, t = predicted.T[:3, :3], predicted.T[:3, 3]
-    local = (points - t) @ R
-    by_camera = points_by_pose(local)
-    return PredictedPoints(local, R.T @ by_window + by_camera @ predicted.by_window, by_camera, R.T @ own @ R)
+    local, own = seen_from(predicted.T, points, own)
+    return PredictedPoints(predicted, local, own, points_by_pose(local), carried)
 
 
-def residual_noise(stereo: RectifiedStereo, sigma: float, points: PredictedPoints, z: Array) -> Array:
+def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:
+    """Points (M, 3) and their covariances (M, 3, 3) in the coordinates of a camera at T (4, 4)."""
+    R = T[:3, :3]
+    return (points - T[:3, 3]) @ R, R.T @ own @ R
+
+
+def residual_noise(stereo: RectifiedStereo, sigma: float, local: Array, own: Array, z: Array) -> Array:
     """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
 
-    Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position, whichever
-    gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
+    The landmarks are at `local` (M, 3) in the camera's coordinates, with covariances `own` (M, 3, 3) where all poses
+    are known. Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position,
+    whichever gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
     """
-    _, J = stereo.project(points.local)
-    own = J @ points.own @ np.swapaxes(J, 1, 2)
+    _, J = stereo.project(local)
+    estimated = J @ own @ np.swapaxes(J, 1, 2)
     _, J = stereo.project(stereo.triangulate(z))
-    measured = J @ points.own @ np.swapaxes(J, 1, 2)
-    size, other = (np.trace(C, axis1=1, axis2=2) for C in (own, measured))
+    measured = J @ own @ np.swapaxes(J, 1, 2)
+    size, other = (np.trace(C, axis1=1, axis2=2) for C in (estimated, measured))
     smaller = (other > 0) & (other < size)
-    return np.where(smaller[:, None, None], measured, own) + sigma**2 * np.eye(3)
+    return np.where(smaller[:, None, None], measured, estimated) + sigma**2 * np.eye(3)
 
 
 def normalised_innovation(
-    stereo: RectifiedStereo, sigma: float, predicted: PredictedPose, points: PredictedPoints, z: Array, step: Array
+    stereo: RectifiedStereo, sigma: float, points: PredictedPoints, z: Array, step: Array
 ) -> tuple[float, int]:
     """``νᵀ S⁻¹ ν`` of measurements (M, 3) taken together, and its degrees of freedom.
 
@@ -127,21 +136,19 @@ def normalised_innovation(
     S is the innovations' joint covariance: from the poses of the window and the motion, common to all, and from each
     landmark's own. It is inverted by Woodbury's identity, as the poses are fewer.
     """
-    h, J = stereo.project(points.local)
+    predicted, (h, J) = points.predicted, stereo.project(points.local)
     r = z - h
     missing = ~np.isfinite(r)
     own = J @ points.own @ np.swapaxes(J, 1, 2) + sigma**2 * np.eye(3)
     W = whiteners(own)
     W[missing[:, 2], 2] = 0
-    r = r + by_pose(J, points.local) @ step
+    r = r + (J @ (points.by_camera @ step)[:, :, None])[:, :, 0]
     r[missing] = 0
     r = (W @ r[:, :, None]).reshape(-1)
-    G = W @ np.concatenate([J @ points.by_window, by_pose(J, points.local)], axis=2)
-    G[missing] = 0
-    n = 6 * len(predicted.window)
-    G = G.reshape(len(r), -1)
-    G[:, :n] = G[:, :n] @ _root(predicted.window.covariance)
-    G[:, n:] = G[:, n:] @ _root(predicted.noise)
+    W = W @ J
+    W[missing] = 0
+    by_window, by_motion = points.by_window(W).reshape(len(r), -1), (W @ points.by_camera).reshape(-1, 6)
+    G = np.concatenate([by_window @ _root(predicted.window.covariance), by_motion @ _root(predicted.noise)], axis=1)
     b, M = G.T @ r, G.T @ G
     M[np.diag_indices_from(M)] += 1
     return float(r @ r - b @ np.linalg.solve(M, b)), int((~missing).sum())

@@ -6,7 +6,6 @@ import gtsam
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, to_pose3
-from backends.smoother.landmarks import Track
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.path import Path
 from backends.smoother.solver import FAILURES, Change, SolverError
@@ -18,8 +17,8 @@ _ITERATIONS = 30  # numerics: of Levenberg-Marquardt at most
 _AS_FORETOLD = 0.75  # of the gain that the linear problem promises: with less, a step was not a small one
 
 
-def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[tuple[Track, int]]]:
-    """All factors and first values, and the tracks with the places of their smart factors."""
+def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, dict[int, int]]:
+    """All factors and first values, and the places of the smart factors of the landmarks' tracks, by slot."""
     change = Change()
     add_poses(change, make, log, log.history.restarted)
     for rows in log.history.finished:
@@ -30,10 +29,10 @@ def whole_problem(make: FactorMaker, log: MeasurementLog) -> tuple[Change, list[
         known = log.history.known.get(log.history.owner[key])
         if known is not None and not known.is_before(log.history.first):
             change.factors.add(make.known(key, known))
-    places = []
-    for track in log.landmarks.tracks.values():
+    places = {}
+    for slot, track in log.landmarks.tracks.items():
         if track.informative:
-            places.append((track, change.factors.size()))
+            places[slot] = change.factors.size()
             change.factors.add(make.smart(track.points, track.keys))
     return change, places
 
@@ -98,11 +97,13 @@ def stepped(change: Change) -> gtsam.Values:
         linear = graph.linearize(values)
         step = linear.optimize()
         better = values.retract(step)
-        before, foretold, after = graph.error(values), linear.error(step), graph.error(better)
+        before, after = graph.error(values), graph.error(better)
+        # Of the linear problem before the step: smart factors project away what their triangulation leaves over.
+        foretold = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     except FAILURES as error:
         raise SolverError(f"gtsam: {' '.join(str(error).split())[:200]}") from error
-    if not before - after >= _AS_FORETOLD * (before - foretold) >= 0:
-        raise SolverError(f"the step was not a small one (error {before:.6g} to {after:.6g}, not {foretold:.6g})")
+    if not before - after >= _AS_FORETOLD * foretold >= 0:
+        raise SolverError(f"the step was not a small one (error {before:.6g} to {after:.6g}, foretold −{foretold:.6g})")
     return better
 
 

@@ -1,7 +1,8 @@
 """Restores the measurement log after an interrupted call.
 
-Lists of rows only grow at their end or are replaced, so it is enough to keep their lengths; arrays are copied. Earlier
-poses may have been revised since; these newer values are as good.
+Lists of rows only grow at their end or are replaced, so it is enough to keep their lengths; arrays are copied, and so
+are dictionaries, whose values are never changed unless they are lists. Earlier poses may have been revised since; these
+newer values are as good.
 """
 
 from __future__ import annotations
@@ -19,18 +20,10 @@ def snapshot(log: MeasurementLog) -> Callable[[], None]:
     """A function that restores the log to its present state."""
     parts = (log.path, log.measurements, log.landmarks, log.history)
     states = [_state(part) for part in parts]
-    # There are hundreds, in every call: no function is called for each.
-    tracks = [
-        (slot, t, len(t.rows), t.rows, t.points, t.keys, t.stereo, t.factor) for slot, t in log.landmarks.tracks.items()
-    ]
 
     def restore() -> None:
         for part, state in zip(parts, states):
             _put_back(part, state)
-        for _, track, count, rows, points, keys, stereo, factor in tracks:
-            track.rows, track.points, track.keys = rows[:count], points[:count], keys[:count]
-            track.stereo, track.factor = stereo, factor
-        log.landmarks.tracks = {slot: track for slot, track, *_ in tracks}
 
     return restore
 
@@ -47,7 +40,7 @@ def _state(part: Any) -> dict[str, Any]:
             out[name] = value.copy()
         elif isinstance(value, list):
             out[name] = (value, len(value))
-        elif isinstance(value, dict) and name != "tracks":  # all values of one are of the same type
+        elif isinstance(value, dict):  # all values of one are of the same type
             lists = isinstance(next(iter(value.values()), None), list)
             out[name] = (value.copy(), [len(v) for v in value.values()] if lists else None)
         else:

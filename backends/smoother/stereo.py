@@ -98,16 +98,6 @@ class RectifiedStereo:
         return (p * depth[:, None]) @ self.rectified_rig.R_left
 
 
-def by_pose(J: Array, local: Array) -> Array:
-    """Jacobians (N, k, 6) by the camera pose's perturbation, from those by the local point (N, k, 3)."""
-    out = np.empty((*J.shape[:2], 6))
-    x, y, z = local[:, 0, None], local[:, 1, None], local[:, 2, None]
-    a, b, c = J[:, :, 0], J[:, :, 1], J[:, :, 2]
-    out[:, :, 0], out[:, :, 1], out[:, :, 2] = b * z - c * y, c * x - a * z, a * y - b * x  # J hat(local)
-    np.negative(J, out=out[:, :, 3:])
-    return out
-
-
 def _scale(rectified_rig: RectifiedRig) -> float:
     """Mean stretch of the left image by rectification."""
     rig = rectified_rig.original

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from backends.smoother import landmark_kernels as kernels
 from backends.smoother.landmarks import Landmarks
 from backends.smoother.measurement_log import Measurements
 from backends.smoother.pose_set import PoseSet
 from backends.smoother.stereo import RectifiedStereo
 from slam.data import IndexArray
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, points_by_pose
 
 #: numerics: Landmarks are refined until a step would lessen their sum of squares by less than this, in at most so many.
 _GAIN, _REFINEMENTS = 0.01, 10
@@ -27,47 +28,37 @@ _BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies b
 
 def linearise(
     stereo: RectifiedStereo, sigma: float, poses: Array, measurements: Measurements, points: Array, rows: IndexArray
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Linearise the measurements `rows` (M, K), −1 for none, of the landmarks at `points` (M, 3).
 
     Returns:
-        Jacobians E (M, K, 3, 3) by the landmarks and residuals (M, K, 3), measured less predicted, both in units of
-        the pixel noise; what is missing is zero.
+        the information of each measurement on its landmark (M, K, 3, 3), the gradient of all of a landmark together
+        (M, 3), and their sum of squares (M,), to which each that has the landmark behind its camera adds `_BEHIND`.
     """
-    shape = rows.shape
-    T = poses[measurements.frame[rows]].reshape(-1, 4, 4)
-    R = T[:, :3, :3]
-    offset = np.repeat(points, shape[1], axis=0) - T[:, :3, 3]
-    h, J = stereo.project((offset[:, None, :] @ R)[:, 0])
-    r = measurements.z[rows].reshape(-1, 3) - h
-    missing = ~np.isfinite(r) | (rows.reshape(-1, 1) < 0)
-    r[missing] = 0
-    J[missing] = 0
-    E = J @ np.swapaxes(R, 1, 2)
-    return E.reshape(*shape, 3, 3) / sigma, r.reshape(*shape, 3) / sigma
+    information, gradient, squares, behind = kernels.information_of(
+        stereo.intrinsics, stereo.rectified_rig.R_left, poses, measurements.frame, measurements.z, points, rows, sigma
+    )
+    return information, gradient, squares + _BEHIND * behind
 
 
 def position_step(
-    E: Array, r: Array, older: Array, moved: Array, prior: Array, offset: Array, damping: Array | float = 0.0
+    information: Array, gradient: Array, prior: Array, offset: Array, damping: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
     """Gauss-Newton steps (M, 3) of the positions, their covariances (M, 3, 3) where all poses are known, and gains.
 
-    `older` (M, 3, 3) is the information of measurements that are not linearised here, about positions that are `moved`
-    (M, 3) from the present ones; `prior` (M, 3, 3) is prior information about positions `offset` (M, 3) from these.
-    `damping` (M,) multiplies the information's diagonal. The gain (M,) is the decrease of the sum of squares by a step,
-    to first order.
+    `information` (M, 3, 3) and `gradient` (M, 3) are those of measurements, `prior` (M, 3, 3) is prior information
+    about positions `offset` (M, 3) from the present ones. `damping` (M,) multiplies the information's diagonal. The
+    gain (M,) is the decrease of the sum of squares by a step, to first order.
     """
-    count, width = r.shape[:2]
-    E = E.reshape(count, 3 * width, 3)
-    Et = np.swapaxes(E, 1, 2)
-    information = Et @ E + older + prior
+    information = information + prior
     # Far points leave their depth nearly free: the little that is added keeps the inverse finite.
-    information += np.eye(3) * (1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-12)
-    information += np.eye(3) * information * np.reshape(damping, (-1, 1, 1))
+    diagonal = np.einsum("mii->mi", information)
+    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-12
+    diagonal *= 1 + np.reshape(damping, (-1, 1))
     covariance = np.linalg.inv(information)
-    gradient = Et @ r.reshape(count, 3 * width, 1) + older @ moved[:, :, None] + prior @ offset[:, :, None]
-    step = covariance @ gradient
-    return step[:, :, 0], covariance, (gradient * step).sum(axis=(1, 2))
+    gradient = gradient + (prior @ offset[:, :, None])[:, :, 0]
+    step = (covariance @ gradient[:, :, None])[:, :, 0]
+    return step, covariance, (gradient * step).sum(axis=1)
 
 
 def refined(
@@ -81,26 +72,27 @@ def refined(
     prior, mean = marks.prior[slots], marks.mean[slots]
 
     def at(x: Array, m: IndexArray) -> tuple[Array, Array, Array]:
-        E, r = linearise(stereo, sigma, poses, measurements, x, rows[m])
-        behind = (rows[m] >= 0) & (E == 0).all(axis=(2, 3))
-        cost = (r**2).sum(axis=(1, 2)) + _form(older[m], start[m] - x) + _form(prior[m], mean[m] - x)
-        return E, r, cost + _BEHIND * behind.sum(axis=1)
+        information, gradient, squares = linearise(stereo, sigma, poses, measurements, x, rows[m])
+        moved = start[m] - x
+        gradient += (older[m] @ moved[:, :, None])[:, :, 0]
+        squares += _form(older[m], moved) + _form(prior[m], mean[m] - x)
+        return information.sum(axis=1) + older[m], gradient, squares
 
     x, damping, todo = start.copy(), np.zeros(len(slots)), np.arange(len(slots))
-    E, r, cost = at(x, todo)
+    information, gradient, cost = at(x, todo)
     for _ in range(_REFINEMENTS):
         step, _, gain = position_step(
-            E[todo], r[todo], older[todo], start[todo] - x[todo], prior[todo], mean[todo] - x[todo], damping[todo]
+            information[todo], gradient[todo], prior[todo], mean[todo] - x[todo], damping[todo]
         )
         todo, step = todo[gain > _GAIN], step[gain > _GAIN]
         if not len(todo):
             break
         tried = x[todo] + step
-        E_new, r_new, cost_new = at(tried, todo)
+        information_new, gradient_new, cost_new = at(tried, todo)
         better = cost_new < cost[todo]
         rows_better = todo[better]
-        x[rows_better], E[rows_better], r[rows_better] = tried[better], E_new[better], r_new[better]
-        cost[rows_better] = cost_new[better]
+        x[rows_better], cost[rows_better] = tried[better], cost_new[better]
+        information[rows_better], gradient[rows_better] = information_new[better], gradient_new[better]
         damping[todo] = np.where(better, 0.1 * damping[todo], np.maximum(10 * damping[todo], _DAMPING))
     return x
 
@@ -117,17 +109,10 @@ def by_poses(known: PoseSet, measurements: Measurements, landmarks: Landmarks, s
     Older measurements that are no longer kept count for the pose next to the oldest kept one. A prior depends on no
     pose.
     """
-    rows, count, width = landmarks.recent[slots], len(slots), len(known)
-    if not width:
-        return np.zeros((count, 3, 0))
-    frames = measurements.frame[rows] if measurements.count else np.zeros_like(rows)
-    place = np.minimum(np.searchsorted(known.frames, frames), width - 1)
-    share = (place[:, None, :] == np.arange(width)[None, :, None]).astype(float)
-    information = (share @ landmarks.information[slots].reshape(*rows.shape, 9)).reshape(count, width, 3, 3)
-    oldest = np.where(rows >= 0, place, width - 1).min(axis=1)
-    information[np.arange(count), oldest] += landmarks.older[slots]
-    by_pose = landmarks.covariance[slots][:, None] @ information @ _moved_with(known.poses, landmarks.position[slots])
-    return np.swapaxes(by_pose, 1, 2).reshape(count, 3, 6 * width)
+    return np.asarray(kernels.carried_by(
+        known.frames, known.poses, measurements.frame, landmarks.position[slots], landmarks.recent[slots],
+        landmarks.information[slots], landmarks.older[slots], landmarks.covariance[slots],
+    ))  # fmt: skip
 
 
 class WindowJacobians:
@@ -152,18 +137,9 @@ class WindowJacobians:
         return self._jacobians[slots]
 
 
-def _moved_with(poses: Array, points: Array) -> Array:
-    """G (M, W, 3, 6): how points (M, 3) move that are fixed to poses (W, 4, 4), by the poses' perturbation."""
-    R = poses[None, :, :3, :3]
-    x, y, z = np.moveaxis(points[:, None] - poses[None, :, :3, 3], 2, 0)
-    zero = np.zeros_like(x)
-    turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=2).reshape(*x.shape, 3, 3)  # −hat of the offset
-    return np.concatenate([turn @ R, np.broadcast_to(R, turn.shape)], axis=3)
-
-
 def moved_with_pose(T: Array, points: Array) -> Array:
     """How points (M, 3) move that are fixed to a pose (4, 4), by its perturbation (M, 3, 6)."""
-    return _moved_with(T[None], points)[:, 0]
+    return np.asarray(-T[:3, :3] @ points_by_pose((points - T[:3, 3]) @ T[:3, :3]))
 
 
 def quadratic(A: Array, P: Array) -> Array:

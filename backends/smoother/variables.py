@@ -14,6 +14,8 @@ from backends.smoother.stereo import RectifiedStereo
 _POSE = "x"
 _BALLAST = "z"
 _LETTERS = "ABCDEFGHIJKLMNOP"
+_INDEX_BITS = 56  # numerics: of a key, below those of its letter; asking gtsam for each key would take longer
+_FIRST_POSE = int(gtsam.symbol(_POSE, 0))
 _FINEST = 1e-3  # cost: threshold of the first letter [m]; each next one's is twice as large
 
 #: cost: Distance of near landmarks, in baselines; what is nearer is hardly seen by both cameras.
@@ -22,7 +24,7 @@ _NEAR = 8.0
 
 def pose_key(frame: int) -> int:
     """Variable of a frame's pose."""
-    return int(gtsam.symbol(_POSE, frame))
+    return _FIRST_POSE + frame
 
 
 def landmark_key(number: int, threshold: float = _FINEST) -> int:
@@ -38,7 +40,7 @@ def ballast_key(number: int) -> int:
 
 def size_of(key: int) -> int:
     """Degrees of freedom of a pose or landmark."""
-    return 6 if gtsam.symbolChr(key) == ord(_POSE) else 3
+    return 6 if key >> _INDEX_BITS == ord(_POSE) else 3
 
 
 def put(values: gtsam.Values, key: int, of: gtsam.Values) -> None:

@@ -12,7 +12,7 @@ from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker
 from backends.smoother.marginal import MarginalPrior
-from backends.smoother.prediction import PredictedPoints, residual_noise
+from backends.smoother.prediction import residual_noise
 from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Observations
@@ -149,9 +149,8 @@ def test_a_place_in_the_world_that_is_hardly_known_does_not_move():
 def test_a_landmark_close_by_does_not_explain_any_pixel():
     stereo = RectifiedStereo.of(KITTI)
     local, own = np.array([[-0.5, -1.0, 1.4]]), np.diag([0.05, 0.05, 1.5])[None] ** 2
-    none = np.zeros((1, 3, 0))
     z = np.array([[585.0, 131.6, 570.8]])  # of a point 27 m away
-    noise = residual_noise(stereo, 0.7, PredictedPoints(local, none, np.zeros((1, 3, 6)), own), z)
+    noise = residual_noise(stereo, 0.7, local, own, z)
     h, _ = stereo.project(local)
     r = (z - h)[0]
     assert r @ np.linalg.solve(noise[0], r) > 1000
@@ -169,6 +168,24 @@ def test_a_track_that_cannot_be_triangulated_does_not_end_the_solver():
         values.insert(pose_key(i), gtsam.Pose3(gtsam.Rot3.ClosestTo(pose[:3, :3]), pose[:3, 3]))
     factor = make.smart([make.point(row) for row in z], [pose_key(i) for i in range(3)])
     factor.linearize(values)
+
+
+@pytest.mark.parametrize(("depth", "refined"), [(10.0, False), (30.0, False), (300.0, True)])
+def test_only_far_points_are_refined_and_near_ones_are_the_same_without(depth, refined):
+    stereo, rng = RectifiedStereo.of(KITTI), np.random.default_rng(0)
+    make = FactorMaker(stereo, EstimatorModels(pixel_sigma=0.7))
+    values, keys, points = gtsam.Values(), [pose_key(i) for i in range(5)], []
+    for i, key in enumerate(keys):
+        values.insert(key, gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * i, 0.0, 0.5 * i])))
+        z, _ = stereo.project(np.array([[1.0 - 0.1 * i, 0.5, depth - 0.5 * i]]))
+        points.append(make.point((z[0] + 0.7 * rng.standard_normal(3)).tolist()))
+    assert make._is_far(points) == refined
+    assert make._is_far([*points[:-1], make.point([600.0, 180.0, np.nan])])
+    if not refined:
+        as_it_is = make.smart(points, keys).linearize(values).information()
+        make._linear = make._refined
+        with_more = make.smart(points, keys).linearize(values).information()
+        np.testing.assert_allclose(as_it_is, with_more, atol=0.03 * np.abs(with_more).max())
 
 
 def test_a_map_may_be_looked_at_before_the_camera_is_in_it():

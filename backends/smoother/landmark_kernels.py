@@ -1,0 +1,120 @@
+"""Compiled loops of `backends.smoother.uncertainty`: over landmarks and the poses that measured them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.runtime.compilation import kernel
+
+_NEAREST = 1e-6  # numerics: no depth below this [m] is projected
+
+
+@kernel
+def information_of(camera, R_left, poses, frames, z, points, rows, sigma):
+    """What measurements say of landmarks, linearised at their positions.
+
+    Args:
+        camera: f, u0, v0, baseline (4,) of the rectified rig.
+        R_left: rotation (3, 3) from left-camera to rectified coordinates.
+        poses: T_world_left (F, 4, 4).
+        frames: in which each measurement was made (n,).
+        z: measurements (n, 3), NaN where missing.
+        points: landmarks in world coordinates (M, 3).
+        rows: measurements of each landmark (M, K), −1 for none.
+        sigma: pixel noise [px].
+
+    Returns:
+        the information of each measurement on the landmark (M, K, 3, 3) [1/m²], the gradient (M, 3) of all together
+        towards their optimum, half the negative derivative of the sum of squares, which is the third (M,), and the
+        number of measurements whose landmark lies behind the camera (M,): they count for nothing in the others.
+    """
+    count, most = rows.shape
+    information, gradient = np.zeros((count, most, 3, 3)), np.zeros((count, 3))
+    squares, behind = np.zeros(count), np.zeros(count)
+    f, weight = camera[0], 1 / (sigma * sigma)
+    centre = (camera[1], camera[2], camera[1])
+    Q, q, d = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for m in range(count):
+        for k in range(most):
+            row = rows[m, k]
+            if row < 0:
+                continue
+            frame = frames[row]
+            for i in range(3):
+                q[i] = 0.0
+                for j in range(3):
+                    Q[i, j] = 0.0
+                    for h in range(3):
+                        Q[i, j] += R_left[i, h] * poses[frame, j, h]
+                    q[i] += Q[i, j] * (points[m, j] - poses[frame, j, 3])
+            if not q[2] >= _NEAREST:
+                behind[m] += 1
+                continue
+            scale = f / q[2]
+            for c in range(3):  # uL, vL, uR
+                axis = 1 if c == 1 else 0
+                ratio = (q[axis] - (camera[3] if c == 2 else 0.0)) / q[2]
+                r = z[row, c] - centre[c] - f * ratio
+                if not np.isfinite(r):
+                    continue
+                squares[m] += weight * r * r
+                for i in range(3):
+                    d[i] = scale * (Q[axis, i] - ratio * Q[2, i])
+                for i in range(3):
+                    gradient[m, i] += weight * r * d[i]
+                    for j in range(3):
+                        information[m, k, i, j] += weight * d[i] * d[j]
+    return information, gradient, squares, behind
+
+
+@kernel
+def carried_by(known, poses, frames, points, rows, information, older, covariance):
+    """How poses carry landmarks along: Jacobians (M, 3, 6 W) of the positions by the poses.
+
+    Args:
+        known: frames of the poses (W,), ascending.
+        poses: T_world_left (W, 4, 4).
+        frames: in which each measurement was made (n,).
+        points: landmarks in world coordinates (M, 3).
+        rows: measurements of each landmark (M, K), −1 for none.
+        information: of each measurement on the landmark (M, K, 3, 3).
+        older: of measurements before these (M, 3, 3); it counts for the pose of the oldest of these.
+        covariance: of the landmarks where all poses are known (M, 3, 3).
+    """
+    count, most, width = len(points), rows.shape[1], len(known)
+    out = np.zeros((count, 3, 6 * width))
+    places, d = np.empty(most, np.int64), np.empty(3)
+    share, C, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(count):
+        oldest = width - 1
+        for k in range(most):
+            places[k] = -1
+            if rows[m, k] >= 0:
+                place = 0
+                while place < width - 1 and known[place] < frames[rows[m, k]]:
+                    place += 1
+                places[k] = place
+                oldest = min(oldest, place)
+        for w in range(width):
+            for i in range(3):
+                d[i] = points[m, i] - poses[w, i, 3]
+                for j in range(3):
+                    share[i, j] = older[m, i, j] if w == oldest else 0.0
+                    for k in range(most):
+                        if places[k] == w:
+                            share[i, j] += information[m, k, i, j]
+            for i in range(3):
+                for j in range(3):
+                    C[i, j] = 0.0
+                    for h in range(3):
+                        C[i, j] += covariance[m, i, h] * share[h, j]
+            for i in range(3):  # C times the negative cross product matrix of d
+                D[i, 0] = C[i, 2] * d[1] - C[i, 1] * d[2]
+                D[i, 1] = C[i, 0] * d[2] - C[i, 2] * d[0]
+                D[i, 2] = C[i, 1] * d[0] - C[i, 0] * d[1]
+            for i in range(3):
+                for j in range(3):
+                    for h in range(3):
+                        out[m, i, 6 * w + j] += D[i, h] * poses[w, h, j]
+                        out[m, i, 6 * w + 3 + j] += C[i, h] * poses[w, h, j]
+    return out
