@@ -27,7 +27,7 @@ class SmootherConfig:
         ConfigurationError: a value is out of its range.
     """
 
-    track: int = 6
+    track: int = 10
     explicit: int = 300
     relinearise: float = 0.01
     window: int = 12
