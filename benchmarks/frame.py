@@ -4,11 +4,10 @@
 
 Three image sizes, both back ends, detector of moving objects on, reading left out. Frame by frame, in turns: each back
 end, one ``cv2.SIFT`` with 800 features on the left image, and `orb_odometry`. Then each back end by itself with
-overlap (`StereoSlam.run`): the time from result to result. Then, with ``--orbslam3``, ORB-SLAM3 on the same images as
-fast as it goes; PYTHON is the interpreter of an environment in which ``orbslam3-python`` is installed (``python -m venv
-E && E/bin/pip install orbslam3-python``), which is never imported here. Median times, with overlap means, because the
-times of two frames in work at once are not independent; compare the ratios, not the milliseconds. ORB-SLAM3's
-vocabulary is a small one of rendered images, good for tracking.
+overlap (`StereoSlam.run`): the time from one result to the next. Then, with ``--orbslam3``, ORB-SLAM3 on the same
+images as fast as it goes; PYTHON is the interpreter of an environment in which ``orbslam3-python`` is installed
+(``python -m venv E && E/bin/pip install orbslam3-python``), which is never imported here. Median times;
+compare the ratios, not the milliseconds. ORB-SLAM3's vocabulary is a small one of rendered images, good for tracking.
 
 The first size is that of KITTI odometry 06 where SLAM_DATA has it, else of the same size rendered.
 """
@@ -171,11 +170,7 @@ def rows(size: Size, times: dict[str, Times]) -> Iterable[list[str]]:
     """A row for each, medians over the frames that count."""
     sequence, last = open_sequence(size.sequence), slice(size.skipped, None)
     stamps = np.array([f.stamp for f in sequence.frames(0, size.skipped + size.counted)])
-    overlap = [OVERLAP.format(name) for name in BACKENDS]
-    medians = {
-        name: (np.mean if name in overlap else np.median)([t.wall[last], t.cpu[last]], axis=1)
-        for name, t in times.items()
-    }
+    medians = {name: np.median([t.wall[last], t.cpu[last]], axis=1) for name, t in times.items()}
     for name, t in times.items():
         ratios = [medians[name] / medians[other] if other in medians else None for other in (SIFT, ORBSLAM3)]
         seen = np.array([p is not None for p in t.poses])

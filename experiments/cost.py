@@ -38,7 +38,7 @@ PARTS = (
     Part(
         "frame", "Whole frames",
         "Median times of a frame, images in memory, the detector of moving objects on, and their ratios to `cv2.SIFT` "
-        "on one image and to ORB-SLAM3 on the same images; with overlap, mean times from one result to the next. CPU "
+        "on one image and to ORB-SLAM3 on the same images; with overlap, times from one result to the next. CPU "
         "time adds up all threads. Frames lost: without a pose.",
     ),
     Part(
