@@ -273,7 +273,8 @@ class StereoSlam:
             corrected = self.calibration.correct(aligned.features)
         corrected = replace(corrected, images=None)
         pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
-        moving = self.objects.newly_moving(corrected, matches.ids, matches.rows, self._positions, pose)
+        ages = index - landmarks.last_seen[landmarks.rows(matches.ids)]
+        moving = self.objects.newly_moving(corrected, matches.ids, matches.rows, ages, self._positions, pose)
         held = np.union1d(self.objects.suspects, moving)
         rows = matches.rows[isin(matches.ids, held)]
         return AssociatedFrame(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)

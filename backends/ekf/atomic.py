@@ -13,7 +13,7 @@ def all_or_nothing(method: _F) -> _F:
     """Put the object back as it was where the method does not come to its end, as by an interrupt from the keyboard.
 
     The object offers ``saved()``, which returns a function that does so. The parts of a filter make that cheap: they
-    replace their arrays and never change one in place, or note what stood there.
+    replace their arrays, or note what stood there before they change one in place.
     """
 
     @wraps(method)

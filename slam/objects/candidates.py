@@ -124,7 +124,7 @@ class Candidate:
         unseen: number of frames without a track.
         members: rows of the tracks that support it in this frame.
         radius: of the region [m].
-        way: how far its velocity has taken it since (3,) [m].
+        way: how far its velocity has taken it since it began (3,) [m].
     """
 
     state: Array

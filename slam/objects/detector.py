@@ -89,13 +89,14 @@ class MovingObjectDetector:
             revise_tracks(self.tracks, self.bodies, self._poses, self.slot, self.rig, correct)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
-    ) -> IdArray:
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
+    ) -> IdArray:  # fmt: skip
         """See `slam.objects.modes.ObjectDetector`."""
         if not 0 <= self._frame < self.config.window - 1:
             return np.zeros(0, np.int64)
-        self._first = self._first.after(ids, places, self._frame)
         pixels, now = membership.measured(features, rows), self._frame + 1
+        self._first = self._first.after(ids, places, np.maximum(now - ages, 0))
         return ids[moving_landmarks(self.rig, T_world_left, self._first.of(ids), pixels, now, self.sigma, self.config)]
 
     # ------------------------------------------------------------------------------------------- a step, first part

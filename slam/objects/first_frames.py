@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.data import BoolArray, IdArray
+from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.objects.config import ObjectsConfig
@@ -46,13 +47,13 @@ class FirstSights:
         """Of no landmark yet."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.int64))
 
-    def after(self, ids: IdArray, places: Places, frame: int) -> FirstSights:
-        """A copy with those of the landmarks `ids` (K,) that are new, seen first in `frame`."""
-        new = np.setdiff1d(ids, self.ids)
-        joined = np.concatenate([self.ids, new])
+    def after(self, ids: IdArray, places: Places, frame: IdArray) -> FirstSights:
+        """A copy with those of the landmarks `ids` (K,) that are new, seen first in the frames `frame` (K,)."""
+        new = np.flatnonzero(~isin(ids, self.ids))
+        joined = np.concatenate([self.ids, ids[new]])
         order = np.argsort(joined, kind="stable")
-        points = np.concatenate([self.points, places(new)])
-        frames = np.concatenate([self.frame, np.full(len(new), frame)])
+        points = np.concatenate([self.points, places(ids[new])])
+        frames = np.concatenate([self.frame, frame[new]])
         return FirstSights(joined[order], points[order], frames[order])
 
     def of(self, ids: IdArray) -> FirstSights:
@@ -88,7 +89,8 @@ def moving_landmarks(
     moved = Displacements(was - T_world_left[:3, 3], points[known] - was, 0.5 * (A + ridge), lag)
     place = np.column_stack([local[:, :2] / local[:, 2:], np.log(local[:, 2])])
     scene = classify_scene(moved, place, config.suspect, config.min_support, (_LEAST_NOISE / sigma) ** 2)
+    rest = np.ones(len(known), bool)
     for group in scene.groups:
-        moves[known[group.members]] = True
-    moves[known[scene.alone > config.doubtful * tail(scene.alone)]] = True
+        rest[group.members] = False
+    moves[known[~rest | (scene.alone > config.doubtful * tail(scene.alone[rest]))]] = True
     return moves

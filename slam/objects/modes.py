@@ -27,14 +27,16 @@ class ObjectDetector(Protocol):
         ...
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
-    ) -> IdArray:
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
+    ) -> IdArray:  # fmt: skip
         """Ids of landmarks that move in the run's first frames, before it is known what moves: see `suspects`.
 
         Args:
             features: of the frame, before the back end's update.
             ids: of the landmarks found in it (K,).
             rows: of their features (K,).
+            ages: frames since each was last measured, or joined the map (K,).
             places: gives the positions of landmarks (K, 3) in the world [m] by their ids.
             T_world_left: the camera's pose (4, 4), as far as it is known.
         """
@@ -73,8 +75,9 @@ class NoDetector:
     suspects: IdArray = np.zeros(0, np.int64)
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
-    ) -> IdArray:
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
+    ) -> IdArray:  # fmt: skip
         """None does."""
         return self.suspects
 

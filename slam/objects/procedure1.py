@@ -258,8 +258,9 @@ class Procedure1Detector:
         self._last: tuple[float, Array] | None = None
 
     def newly_moving(
-        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, places: Places, T_world_left: Array
-    ) -> IdArray:
+        self, features: StereoFeatures, ids: IdArray, rows: IndexArray, ages: IdArray, places: Places,
+        T_world_left: Array,
+    ) -> IdArray:  # fmt: skip
         """None is known to."""
         return self.suspects
 

@@ -102,15 +102,14 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
         scale = max(least_scale, median(alone[rest]) / _MEDIAN)
         alone = alone / scale
         group = _next_group(problem, windows, place, alone, scale, rest, test, support)
-        if group is None:
-            return Scene(groups, alone)
-        rest[group.members] = False
-        group = replace(group, test=group.test / tail(alone[rest]))
-        if group.test < limit(test, len(group.members)):  # nor would the next ones pass
-            return Scene(groups, alone)
-        groups.append(group)
-        if rest.sum() < n / 3:
-            return Scene(groups, alone)
+        if group is not None:
+            groups.append(group)
+            rest[group.members] = False
+        if group is None or rest.sum() < n / 3:
+            break
+    heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
+    groups = [replace(group, test=group.test / heavier) for group in groups]
+    return Scene([group for group in groups if group.test > limit(test, len(group.members))], alone)
 
 
 def tail(alone: Array) -> float:
@@ -119,7 +118,7 @@ def tail(alone: Array) -> float:
     The errors of a track last for some frames where a camera goes around what it sees, and those of false tracks are
     of any size. Where that is so in the whole scene, small groups of such tracks agree by chance.
     """
-    return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE)
+    return max(1.0, float(np.quantile(alone, 0.75)) / _UPPER_QUARTILE) if len(alone) else 1.0
 
 
 def _next_group(

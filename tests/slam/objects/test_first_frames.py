@@ -67,10 +67,32 @@ def test_landmarks_without_a_right_pixel_are_not_tested_and_few_say_nothing():
 
 
 def test_first_sights_stay_as_they_were():
-    first = FirstSights.none().after(np.array([5, 2]), lambda ids: np.outer(ids, [1.0, 0, 0]), 0)
-    later = first.after(np.array([2, 3]), lambda ids: np.outer(ids, [10.0, 0, 0]), 4).of(np.array([3, 2, 5]))
-    assert later.points[:, 0].tolist() == [30.0, 2.0, 5.0]
-    assert later.frame.tolist() == [4, 0, 0]
+    first = FirstSights.none().after(np.array([5, 2]), lambda ids: np.outer(ids, [1.0, 0, 0]), np.array([0, 1]))
+    later = first.after(np.array([2, 3]), lambda ids: np.outer(ids, [10.0, 0, 0]), np.array([7, 4]))
+    some = later.of(np.array([3, 2, 5]))
+    assert some.points[:, 0].tolist() == [30.0, 2.0, 5.0]
+    assert some.frame.tolist() == [4, 1, 0]
+
+
+def test_first_sights_are_of_the_frame_in_which_landmarks_joined_the_map():
+    """Also of those that are not found again in the next frame; their displacement is taken for the true time."""
+    sequence = slam.open_sequence("synthetic:aisle?density=40")
+    system = slam.StereoSlam(sequence.rig, None, "ekf", config=SystemConfig.for_kind(sequence.kind, None, "ekf"))
+    joined = {}
+    for k in range(8):
+        result = system.process_features(sequence.simulate(k).features)
+        joined.update(dict.fromkeys(result.added.tolist(), k))
+    first = system.objects._first
+    assert len(first.ids) > 20 and any(first.frame > 0)
+    assert [joined[i] for i in first.ids.tolist()] == first.frame.tolist()
+
+
+def test_a_large_group_does_not_hide_single_landmarks_that_move():
+    first, pixels = scene((0.05, 0.0, 0.0), near=30, count=100)
+    pixels[[40, 60, 80], 0] += 8.0
+    pixels[[40, 60, 80], 2] += 8.0
+    moves = moving_landmarks(RIG, np.eye(4), first, pixels, 3, SIGMA, ObjectsConfig())
+    assert moves[[40, 60, 80]].all() and moves[:30].sum() >= 28
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])

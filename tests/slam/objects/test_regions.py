@@ -84,3 +84,17 @@ def test_where_errors_have_heavy_tails_a_small_group_that_agrees_by_chance_does_
     assert len(found[False].groups) == 1
     assert not found[True].groups
     assert tail(found[True].alone) > 1.5 > tail(found[False].alone)
+
+
+def test_three_bodies_with_a_third_of_the_tracks_do_not_hide_each_other():
+    """The tail of errors is that of the tracks in no group: bodies together may have more than a quarter of all."""
+    moved, view = scene(count=200, near=24, shift=(0.006, 0.0, 0.0))
+    for start, x, shift in ((24, 0.45, (0.0, -0.008, 0.0)), (48, -0.45, (0.0, 0.007, 0.003))):
+        rows = slice(start, start + 24)
+        moved.points[rows] = np.column_stack(
+            [RNG.uniform(x - 0.05, x + 0.05, 24), RNG.uniform(-0.1, 0.1, 24), RNG.uniform(0.95, 1.05, 24)]
+        )
+        view[rows] = np.column_stack([moved.points[rows, :2] / moved.points[rows, 2:], np.log(moved.points[rows, 2])])
+        moved.d[rows] += shift
+    found = classify_scene(moved, view, 30.0, 4)
+    assert sorted(int(group.members.min()) // 24 for group in found.groups) == [0, 1, 2]
