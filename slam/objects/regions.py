@@ -88,7 +88,8 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
         place: where tracks are seen (N, 3): x/z, y/z, and log z.
         test: χ²(6) from which a large group moved; see `limit`.
         support: least number of tracks in a group.
-        least_scale: of χ², by which that of the rest is divided where its median is larger than it should be.
+        least_scale: every χ² is divided by the ratio of the rest's median to what it should be, and by this at least;
+            below 1 the noise may turn out smaller than modelled.
     """
     n = len(moved.d)
     if n < 3 * support:
