@@ -28,6 +28,7 @@ BUILT_IN = {
         "batch": "backends.batch:BatchBackend",
         "ekf": "backends.ekf:EkfBackend",
         "smoother": "backends.smoother:SmootherBackend",
+        "window": "backends.window:WindowBackend",
     },
     "frontends": {"surf": "frontends.surf:SurfFrontend"},
 }

@@ -1,0 +1,61 @@
+"""The papers' motion model on poses alone: the next pose, and its derivatives.
+
+Paper B, section 2 prints ``r_k = r_{k−1} + (v_{k−1} + w_v) Δt``, ``v_k = v_{k−1} + w_v``, and the same for the angles:
+the velocity jumps at the start of the interval and then stays. So a velocity is the difference of two successive poses,
+and what is left of the model is that two successive velocities differ by white noise w. The linear velocity is one in
+world axes, the angular velocity a body rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.geometry.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
+from slam.models import EstimatorModels
+
+LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
+
+
+def velocity_sigmas(models: EstimatorModels, dt: float, first: bool) -> Array:
+    """Standard deviations (6,) of the change of [ω, v] over `dt` [s]; of the velocity itself in the first interval."""
+    linear, angular = models.motion.velocity_variance(dt)
+    variances = np.repeat([angular, linear], 3)
+    if first:
+        variances = variances + np.repeat(
+            [models.initial_angular_velocity_sigma**2, models.initial_velocity_sigma**2], 3
+        )
+    return np.sqrt(variances)
+
+
+def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:
+    """The pose after T1 at the velocity between T0 and T1.
+
+    Returns:
+        T2 (4, 4), its Jacobians (6, 6) by the perturbations of T0 and T1, and by w = [w_ω, w_v].
+    """
+    s = dt12 / dt01
+    R0, R1 = T0[:3, :3], T1[:3, :3]
+    a = so3_log(R0.T @ R1)
+    step = so3_exp(s * a)
+    R2 = R1 @ step
+    right, inverse_left = so3_left_jacobian(-s * a), np.linalg.inv(so3_left_jacobian(a))
+    J0, J1, Jw = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    J0[:3, :3] = -s * right @ inverse_left
+    J1[:3, :3] = step.T + s * right @ inverse_left.T
+    J0[3:, 3:] = -s * R2.T @ R0
+    J1[3:, 3:] = (1 + s) * R2.T @ R1
+    Jw[:3, :3] = dt12 * right
+    Jw[3:, 3:] = dt12 * R2.T
+    return pose(R2, T1[:3, 3] + s * (T1[:3, 3] - T0[:3, 3])), J0, J1, Jw
+
+
+def predict_from_rest(T0: Array, dt: float) -> tuple[Array, Array, Array]:
+    """The pose after the first one, whose velocity is unknown with mean zero.
+
+    Returns:
+        T1 (4, 4), its Jacobian (6, 6) by the perturbation of T0, and by the velocity [ω, v].
+    """
+    Jw = np.zeros((6, 6))
+    Jw[:3, :3] = dt * np.eye(3)
+    Jw[3:, 3:] = dt * T0[:3, :3].T
+    return T0.copy(), np.eye(6), Jw

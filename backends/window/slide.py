@@ -1,0 +1,110 @@
+"""The window moves on: one of its poses leaves, and what it has measured becomes part of the prior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from backends.window.config import WindowConfig
+from backends.window.problem import motion_between, problem
+from backends.window.state import State
+from slam.data import BoolArray
+from slam.geometry.se3 import Array
+from slam.models import EstimatorModels
+from slam.window.marginal import marginalised
+from slam.window.problem import Camera
+
+
+def slid(s: State, camera: Camera, models: EstimatorModels, config: WindowConfig) -> State:
+    """The state with one pose less.
+
+    The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
+    that it has measured join the prior, if they are still measured: they keep their covariance with all the others.
+    Those that nothing will measure again leave with all their measurements, and so do landmarks beyond the prior's
+    limit, which are then estimated afresh.
+
+    Raises:
+        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    """
+    leaving = 0 if s.frames[-1] - s.frames[0] > config.reference else 1
+    marks, rows, places, count = s.landmarks, s.rows, s.places, len(s.landmarks)
+    here, there = np.zeros(count, bool), np.zeros(count, bool)
+    here[rows.point[rows.pose == leaving]] = True
+    here[places.point[places.pose == leaving]] = True
+    there[rows.point[rows.pose != leaving]] = True
+    known = np.zeros(count, bool)
+    known[places.point[places.pose == leaving]] = True
+    known |= marks.information[:, 0, 0] > 0
+    alive = marks.ids >= 0
+    member = np.zeros(count, bool)
+    member[s.prior.points] = True
+
+    joins = here & ~member & alive & (there | known)
+    ends = (member & ~alive) | (here & ~member & ~alive & (there | known))
+    surplus = int((member & alive).sum() + joins.sum()) - config.landmarks
+    if surplus > 0:
+        ends, joins = _without_oldest(surplus, s, member & alive, joins, ends, there)
+    absorbed_row = (rows.pose == leaving) & (member | joins)[rows.point] | ends[rows.point]
+    absorbed_place = (places.pose == leaving) | ends[places.point]
+    motion = motion_between(s, models)
+    motion = motion.select((motion.poses == leaving).any(axis=1))
+
+    part = problem(s, camera, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
+    w = part.window
+    keeps = (member | joins | ends)[part.points]
+    information = np.where(keeps[:, None, None], w.information, 0.0)
+    w = replace(w, information=information)
+    joining = np.flatnonzero(joins[part.points])
+    prior, _, cost = marginalised(w, leaving, ends[s.prior.points], joining)
+    stays = ~absorbed_row & (rows.pose != leaving)
+    free = marks.information.copy()
+    free[joins | ends] = 0.0
+    s = replace(
+        s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
+        poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
+        rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
+        prior=replace(prior, points=part.points[prior.points]), cost=s.cost - cost,
+        landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),
+    )  # fmt: skip
+    return _compact(s)
+
+
+def _without_oldest(
+    surplus: int, s: State, members: BoolArray, joins: BoolArray, ends: BoolArray, there: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """More landmarks end, and fewer join: members out of view that were measured longest ago, then those that join."""
+    ends, joins = ends.copy(), joins.copy()
+    out_of_view = np.flatnonzero(members & ~there)
+    oldest = out_of_view[np.argsort(s.landmarks.last[out_of_view], kind="stable")][:surplus]
+    ends[oldest] = True
+    surplus -= len(oldest)
+    if surplus > 0:
+        last = np.flatnonzero(joins)[::-1][:surplus]
+        joins[last], ends[last] = False, True
+    return ends, joins
+
+
+def _earlier(rows, leaving):  # type: ignore[no-untyped-def]
+    """Rows or places of a window without one pose."""
+    return replace(rows, pose=rows.pose - (rows.pose > leaving))
+
+
+def _without(P: Array, leaving: int) -> Array:
+    keep = np.ones(len(P), bool)
+    keep[6 * leaving : 6 * leaving + 6] = False
+    return P[np.ix_(keep, keep)]
+
+
+def _compact(s: State) -> State:
+    """Without landmarks that were removed and take no part any more."""
+    marks = s.landmarks
+    used = marks.ids >= 0
+    used[s.rows.point], used[s.places.point], used[s.prior.points] = True, True, True
+    if used.all():
+        return s
+    index = np.cumsum(used) - 1
+    return replace(
+        s, landmarks=marks.select(used), rows=replace(s.rows, point=index[s.rows.point]),
+        places=replace(s.places, point=index[s.places.point]), prior=replace(s.prior, points=index[s.prior.points]),
+    )  # fmt: skip

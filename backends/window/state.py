@@ -1,0 +1,125 @@
+"""What the window back end knows: a frozen value that a call replaces when all of it is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from slam.data import IdArray, IndexArray
+from slam.errors import MeasurementError
+from slam.geometry.se3 import Array
+from slam.window.problem import Places, RelativePrior, Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """A row for each landmark, and for each that was removed but still has measurements in the window.
+
+    Attributes:
+        ids: (S,), −1 of those that were removed.
+        position: in world coordinates (S, 3) [m].
+        local: covariance (S, 3, 3) [m²] in the coordinates of the newest pose that was solved for.
+        world: covariance (S, 3, 3) [m²] in world coordinates.
+        last: number of the frame that measured it last (S,).
+        mean, information: what was known of it beforehand, in world coordinates, and is not in the prior yet: position
+            (S, 3) and information (S, 3, 3), zero for nothing.
+    """
+
+    ids: IdArray
+    position: Array
+    local: Array
+    world: Array
+    last: IndexArray
+    mean: Array
+    information: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def none(cls) -> Landmarks:
+        """No landmark."""
+        three, nine = np.zeros((0, 3)), np.zeros((0, 3, 3))
+        return cls(np.zeros(0, np.int64), three, nine, nine, np.zeros(0, np.int64), three, nine)
+
+    def joined(self, other: Landmarks) -> Landmarks:
+        """These and others."""
+        return Landmarks(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
+
+    def select(self, keep: np.ndarray) -> Landmarks:
+        """Some of the rows (a mask)."""
+        return Landmarks(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    @cached_property
+    def order(self) -> IndexArray:
+        """Rows of the landmarks in the map, by ascending id."""
+        rows = np.argsort(self.ids, kind="stable")
+        return rows[np.searchsorted(self.ids[rows], 0) :]
+
+    def rows_of(self, ids: IdArray) -> IndexArray:
+        """Rows of landmarks.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
+        ids = np.asarray(ids, np.int64)
+        known = self.ids[self.order]
+        at = np.searchsorted(known, ids).clip(0, max(len(known) - 1, 0))
+        bad = known[at] != ids if len(known) else np.ones(len(ids), bool)
+        if bad.any():
+            raise MeasurementError(f"window: landmark {ids[bad][0]} is not in the map")
+        return self.order[at]
+
+    def require_new(self, ids: IdArray) -> None:
+        """Raise MeasurementError if one of the ids is in the map, or occurs twice."""
+        taken = np.isin(ids, self.ids)
+        if taken.any():
+            raise MeasurementError(f"window: landmark {ids[taken][0]} is in the map already")
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The window.
+
+    Attributes:
+        frames: numbers of its frames (K,), ascending; the last one is the newest.
+        stamps: their times (K,) [s].
+        poses: T_world_left (K, 4, 4).
+        covariance: of the poses together (6 K, 6 K).
+        solved: place in the window of the newest pose that was solved for.
+        begun: number of the frame in which the present problem begins: the first, or that of a restart.
+        rows: measurements, by place in the window and row of the landmark.
+        places: landmarks placed relative to a pose.
+        prior: what left the window says of its poses but the newest, and of landmarks.
+        cost: sum of squares at the estimate.
+        landmarks: the map.
+        contradicted: updates in succession in which most observations agreed on another pose than was expected.
+    """
+
+    frames: IndexArray
+    stamps: Array
+    poses: Array
+    covariance: Array
+    solved: int
+    begun: int
+    rows: Rows
+    places: Places
+    prior: RelativePrior
+    cost: float
+    landmarks: Landmarks = field(default_factory=Landmarks.none)
+    contradicted: int = 0
+
+    @classmethod
+    def empty(cls) -> State:
+        """Before the first prediction."""
+        none = np.zeros(0, np.int64)
+        return cls(
+            none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), 0, 0, Rows.none(), Places.none(),
+            RelativePrior.none(), 0.0,
+        )  # fmt: skip
+
+    def with_landmarks(self, landmarks: Landmarks) -> State:
+        """With another map."""
+        return replace(self, landmarks=landmarks)

@@ -1,0 +1,635 @@
+"""Compiled loops of the window: normal equations with landmarks eliminated, steps back to poses and points.
+
+Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a chart
+of inverse distance: with c the chart's centre, ``p = c + B (α, β, 1) / ρ``, so that what a camera near c measures is
+almost linear in (α, β, ρ), however far the point. Unknowns stand in the order: points of the prior, then free poses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.kernels.linear import invert_symmetric, row_times
+from slam.kernels.se3 import adjoint, between, log, move, rotation_vector, transform_back
+from slam.kernels.stereo import by_pose, residual
+from slam.runtime.compilation import helper, kernel
+
+#: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
+KNOWN, ELIMINATED = -2, -1
+
+NEAR = 1e-6  # numerics: no distance below this [m] is inverted
+_BEHIND = 1e4  # numerics: squared whitened residual of a point that is behind its camera
+
+
+@kernel
+def charts(poses, centre, points, place, basis, reference):
+    """Derivatives E (N, 3, 3) of all points by their charts' coordinates (α, β, ρ).
+
+    A point of the prior has the prior's chart, centred at the pose `reference`; any other has one about its own
+    direction from the pose `centre`.
+    """
+    E, e = np.empty((len(points), 3, 3)), np.empty((3, 3))
+    s, q, n = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(len(points)):
+        if place[m] >= 0:
+            T, B = poses[reference], basis[place[m]]
+            transform_back(T, points[m], q)
+            for i in range(3):
+                s[i] = B[0, i] * q[0] + B[1, i] * q[1] + B[2, i] * q[2]
+                for j in range(3):
+                    e[i, j] = T[i, 0] * B[0, j] + T[i, 1] * B[1, j] + T[i, 2] * B[2, j]
+            r, a, b = s[2], s[0] / s[2], s[1] / s[2]
+        else:
+            r = 0.0
+            for i in range(3):
+                n[i] = points[m, i] - poses[centre, i, 3]
+                r += n[i] * n[i]
+            r = max(np.sqrt(r), NEAR)
+            for i in range(3):
+                n[i] /= r
+            _basis(n, e)
+            a, b = 0.0, 0.0
+        for i in range(3):
+            E[m, i, 0], E[m, i, 1] = e[i, 0] * r, e[i, 1] * r
+            E[m, i, 2] = -(e[i, 2] + a * e[i, 0] + b * e[i, 1]) * r * r
+    return E
+
+
+@helper
+def _chart(T, point, basis, origin, q, s, D):
+    """Coordinates s = (α, β, ρ) less `origin` (3,) of a point from a pose T, and D (3, 3), their derivatives by q = Rᵀ (p − t).
+
+    Whether the point is in the half space that the chart covers.
+    """
+    transform_back(T, point, q)
+    x = basis[0, 0] * q[0] + basis[1, 0] * q[1] + basis[2, 0] * q[2]
+    y = basis[0, 1] * q[0] + basis[1, 1] * q[1] + basis[2, 1] * q[2]
+    r = basis[0, 2] * q[0] + basis[1, 2] * q[1] + basis[2, 2] * q[2]
+    if not r > NEAR:
+        return False
+    w = 1.0 / r
+    s[0], s[1], s[2] = x * w - origin[0], y * w - origin[1], w - origin[2]
+    for j in range(3):
+        D[0, j] = (basis[j, 0] - x * w * basis[j, 2]) * w
+        D[1, j] = (basis[j, 1] - y * w * basis[j, 2]) * w
+        D[2, j] = -basis[j, 2] * w * w
+    return True
+
+
+@helper
+def _basis(n, e):
+    """Columns of e (3, 3): two axes across the unit vector n, and n."""
+    k = 0
+    if abs(n[1]) < abs(n[k]):
+        k = 1
+    if abs(n[2]) < abs(n[k]):
+        k = 2
+    # across both n and the axis that it is least along
+    size = 0.0
+    for i in range(3):
+        e[i, 2] = n[i]
+        e[i, 0] = (1.0 if i == k else 0.0) - n[k] * n[i]
+        size += e[i, 0] * e[i, 0]
+    size = 1.0 / np.sqrt(size)
+    for i in range(3):
+        e[i, 0] *= size
+    e[0, 1] = n[1] * e[2, 0] - n[2] * e[1, 0]
+    e[1, 1] = n[2] * e[0, 0] - n[0] * e[2, 0]
+    e[2, 1] = n[0] * e[1, 0] - n[1] * e[0, 0]
+
+
+@kernel
+def relative_charts(T, points):
+    """Charts of points (N, 3) about their directions from a pose T: bases (N, 3, 3) in its axes, and coordinates (N, 3)."""
+    B, s, q = np.empty((len(points), 3, 3)), np.zeros((len(points), 3)), np.empty(3)
+    for m in range(len(points)):
+        transform_back(T, points[m], q)
+        r = max(np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]), NEAR)
+        for i in range(3):
+            q[i] /= r
+        _basis(q, B[m])
+        s[m, 2] = 1.0 / r
+    return B, s
+
+
+@kernel
+def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, weight, H, b):
+    """Add the rows' normal equations to H (n, n), lower triangle, and b (n,); eliminate points that are not the prior's.
+
+    Args:
+        camera: f, u0, v0, baseline (4,) of the rectified rig.
+        R_left: rotation (3, 3) from left-camera to rectified coordinates.
+        poses, column: poses (K, 4, 4) and their first unknowns (K,), −1 for a fixed one.
+        points, place: points (N, 3), and what they are (N,), see `KNOWN`.
+        E: their charts (N, 3, 3).
+        pose, point, z, weight: of each row the pose and point it is of (M,), (uL, vL, uR) (M, 3), NaN where missing, and
+            1 / σ (M,), zero for a row that does not count.
+        H, b: are added to.
+
+    Returns:
+        squared whitened residual of each row (M,); information (N, 3, 3) and gradient (N, 3) of each point by its rows;
+        each row's cross information (M, 6, 3) of pose and point.
+    """
+    count, rows = len(points), len(pose)
+    information, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    cross, squares = np.zeros((rows, 6, 3)), np.zeros(rows)
+    q, r, D, J, Jp = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
+    for m in range(rows):
+        w = weight[m]
+        if w == 0.0:
+            continue
+        transform_back(poses[pose[m]], points[point[m]], q)
+        if not residual(camera, R_left, q, z[m], r, D):
+            squares[m] = _BEHIND
+            continue
+        for i in range(3):
+            if np.isnan(r[i]):
+                r[i] = 0.0
+                for j in range(3):
+                    D[i, j] = 0.0
+            r[i] *= w
+            squares[m] += r[i] * r[i]
+            for j in range(3):
+                D[i, j] *= w
+        _add_row(poses, column, place, E, pose[m], point[m], q, r, D, J, Jp, H, b, information, gradient, cross[m])
+    return squares, information, gradient, cross
+
+
+@helper
+def _add_row(poses, column, place, E, k, l, q, r, D, J, Jp, H, b, information, gradient, cross):
+    """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
+    T = poses[k]
+    free = place[l] != KNOWN
+    if free:
+        for i in range(3):
+            x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
+            for j in range(3):
+                Jp[i, j] = x * E[l, 0, j] + y * E[l, 1, j] + z * E[l, 2, j]
+        for a in range(3):
+            gradient[l, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
+            for c in range(3):
+                information[l, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
+    at = column[k]
+    if at < 0:
+        return
+    for i in range(3):
+        by_pose(D[i], q, J[i])
+    for a in range(6):
+        b[at + a] += J[0, a] * r[0] + J[1, a] * r[1] + J[2, a] * r[2]
+        for c in range(a + 1):
+            H[at + a, at + c] += J[0, a] * J[0, c] + J[1, a] * J[1, c] + J[2, a] * J[2, c]
+        if free:
+            for c in range(3):
+                cross[a, c] = J[0, a] * Jp[0, c] + J[1, a] * Jp[1, c] + J[2, a] * Jp[2, c]
+
+
+@kernel
+def place_rows(poses, column, points, place, E, pose, point, basis, origin, root, H, b, information, gradient):
+    """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` of each is unit noise. See `linearise`.
+
+    Args:
+        pose, point: of each row (Q,).
+        basis, origin: its chart in the pose's axes (Q, 3, 3), and where it stood in it (Q, 3).
+        root: square root of its information (Q, 3, 3).
+
+    Returns:
+        sum of squares, and each row's cross information (Q, 6, 3).
+    """
+    cross, cost = np.zeros((len(pose), 6, 3)), 0.0
+    q, s, D, W = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    J, Jp, r = np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    for m in range(len(pose)):
+        if not _chart(poses[pose[m]], points[point[m]], basis[m], origin[m], q, s, D):
+            cost += _BEHIND
+            continue
+        for i in range(3):
+            r[i] = -row_times(root[m], i, s)
+            cost += r[i] * r[i]
+            for j in range(3):
+                W[i, j] = root[m, i, 0] * D[0, j] + root[m, i, 1] * D[1, j] + root[m, i, 2] * D[2, j]
+        _add_row(poses, column, place, E, pose[m], point[m], q, r, W, J, Jp, H, b, information, gradient, cross[m])
+    return cost, cross
+
+
+@kernel
+def own_priors(points, place, E, mean, own, information, gradient):
+    """Add independent priors of points in world coordinates: mean (N, 3), information (N, 3, 3). Returns their cost."""
+    cost, d, v = 0.0, np.empty(3), np.empty(3)
+    for l in range(len(points)):
+        if own[l, 0, 0] == 0.0 or place[l] == KNOWN:
+            continue
+        for i in range(3):
+            d[i] = mean[l, i] - points[l, i]
+        for i in range(3):
+            v[i] = own[l, i, 0] * d[0] + own[l, i, 1] * d[1] + own[l, i, 2] * d[2]
+            cost += v[i] * d[i]
+        for a in range(3):
+            gradient[l, a] += E[l, 0, a] * v[0] + E[l, 1, a] * v[1] + E[l, 2, a] * v[2]
+            for c in range(3):
+                for i in range(3):
+                    for j in range(3):
+                        information[l, a, c] += E[l, i, a] * own[l, i, j] * E[l, j, c]
+    return cost
+
+
+@kernel
+def eliminate(column, place, pose, cross, first, order, information, gradient, H, b):
+    """Take points into H and b: those of the prior as unknowns, the others eliminated.
+
+    Args:
+        first, order: rows by point: those of point l are ``order[first[l]:first[l + 1]]``.
+
+    Returns:
+        inverses (N, 3, 3) of the information of points that are eliminated.
+    """
+    inverse, W, v = np.zeros_like(information), np.empty((6, 3)), np.empty(3)
+    for l in range(len(place)):
+        d = place[l]
+        if d >= 0:
+            for i in range(3):
+                b[3 * d + i] += gradient[l, i]
+                for j in range(i + 1):
+                    H[3 * d + i, 3 * d + j] += information[l, i, j]
+            for o in range(first[l], first[l + 1]):
+                m = order[o]
+                at = column[pose[m]]
+                if at >= 0:
+                    for i in range(6):
+                        for j in range(3):
+                            H[at + i, 3 * d + j] += cross[m, i, j]
+        elif d == ELIMINATED:
+            # what nothing measures along some direction (depth, of one left pixel) gets next to no information there
+            trace = information[l, 0, 0] + information[l, 1, 1] + information[l, 2, 2]
+            if trace == 0.0:
+                continue
+            for i in range(3):
+                information[l, i, i] += 1e-12 * trace + 1e-9
+            invert_symmetric(information[l], 0.0, inverse[l])
+            S = inverse[l]
+            for i in range(3):
+                v[i] = S[i, 0] * gradient[l, 0] + S[i, 1] * gradient[l, 1] + S[i, 2] * gradient[l, 2]
+            for o in range(first[l], first[l + 1]):
+                m = order[o]
+                at = column[pose[m]]
+                if at < 0:
+                    continue
+                for i in range(6):
+                    b[at + i] -= cross[m, i, 0] * v[0] + cross[m, i, 1] * v[1] + cross[m, i, 2] * v[2]
+                    for j in range(3):
+                        W[i, j] = cross[m, i, 0] * S[0, j] + cross[m, i, 1] * S[1, j] + cross[m, i, 2] * S[2, j]
+                for o2 in range(first[l], first[l + 1]):
+                    m2 = order[o2]
+                    to = column[pose[m2]]
+                    if to < 0 or to > at:
+                        continue
+                    for i in range(6):
+                        for j in range(6):
+                            H[at + i, to + j] -= (
+                                W[i, 0] * cross[m2, j, 0] + W[i, 1] * cross[m2, j, 1] + W[i, 2] * cross[m2, j, 2]
+                            )
+    return inverse
+
+
+@kernel
+def by_point(point, count):
+    """Rows by point: `first` (count + 1,) and `order` (M,), see `eliminate`."""
+    first, order = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64)
+    for m in range(len(point)):
+        first[point[m] + 1] += 1
+    for l in range(count):
+        first[l + 1] += first[l]
+    at = first.copy()
+    for m in range(len(point)):
+        order[at[point[m]]] = m
+        at[point[m]] += 1
+    return first, order
+
+
+@kernel
+def prior_rows(poses, points, members, T, relative, basis, origin, pose_of, delta, A):
+    """Where unknowns stand relative to the prior's: δ (n,), and its derivative A (n, 6) by the reference pose.
+
+    Args:
+        poses, points: all of them.
+        members: points of the prior (D,).
+        T: where the reference pose stood (4, 4).
+        relative: where the prior's poses stood before it (P, 4, 4), the first is the identity.
+        basis, origin: charts of the points in its axes (D, 3, 3), and where they stood in them (D, 3).
+        pose_of: indices of the prior's poses (P,); the first is the reference.
+        delta, A: are overwritten; points first.
+
+    Returns:
+        False where a point has left the half space of its chart.
+    """
+    q, s, D, J = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    M, N, Ad = np.empty((3, 4)), np.empty((3, 4)), np.empty((6, 6))
+    now, at = poses[pose_of[0]], 3 * len(members)
+    for d in range(len(members)):
+        if not _chart(now, points[members[d]], basis[d], origin[d], q, s, D):
+            return False
+        for i in range(3):
+            delta[3 * d + i] = s[i]
+            by_pose(D[i], q, A[3 * d + i])
+    for p in range(len(pose_of)):
+        if p == 0:
+            between(T, now, M)
+        else:
+            between(poses[pose_of[p]], now, N)
+            adjoint(N, Ad)
+            between(now, poses[pose_of[p]], N)
+            between(relative[p], N, M)
+        log(M, q, J, delta[at : at + 6])
+        for i in range(6):
+            for j in range(6):
+                A[at + i, j] = (1.0 if i == j else 0.0) if p == 0 else -Ad[i, j]
+        at += 6
+    return True
+
+
+@kernel
+def motion_rows(poses, column, triple, interval, weight, H, b):
+    """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares.
+
+    Args:
+        triple: three successive poses (V, 3); −1 first where the first velocity itself is noise.
+        interval: times between them (V, 2) [s].
+        weight: 1 / σ of the change [ω, v] (V, 6).
+    """
+    cost = 0.0
+    J, r = np.empty((6, 18)), np.empty(6)
+    a, c, Ja, Jc = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    R = np.empty((3, 4))
+    for m in range(len(triple)):
+        i0, i1, i2 = triple[m]
+        d0, d1 = interval[m]
+        for i in range(6):
+            for j in range(18):
+                J[i, j] = 0.0
+        between(poses[i1], poses[i2], R)
+        rotation_vector(R, c, Jc)  # J⁻¹; by the later pose its transpose counts, by the earlier one −J⁻¹
+        for i in range(3):
+            r[i] = c[i] / d1
+            r[3 + i] = (poses[i2, i, 3] - poses[i1, i, 3]) / d1
+            for j in range(3):
+                J[i, 12 + j] = Jc[j, i] / d1
+                J[i, 6 + j] = -Jc[i, j] / d1
+                J[3 + i, 15 + j] = poses[i2, i, j] / d1
+                J[3 + i, 9 + j] = -poses[i1, i, j] / d1
+        if i0 >= 0:
+            between(poses[i0], poses[i1], R)
+            rotation_vector(R, a, Ja)
+            for i in range(3):
+                r[i] -= a[i] / d0
+                r[3 + i] -= (poses[i1, i, 3] - poses[i0, i, 3]) / d0
+                for j in range(3):
+                    J[i, 6 + j] -= Ja[j, i] / d0
+                    J[i, j] = Ja[i, j] / d0
+                    J[3 + i, 9 + j] -= poses[i1, i, j] / d0
+                    J[3 + i, 3 + j] = poses[i0, i, j] / d0
+        for i in range(6):
+            r[i] *= weight[m, i]
+            cost += r[i] * r[i]
+            for j in range(18):
+                J[i, j] *= weight[m, i]
+        for p in range(3):
+            at = -1 if triple[m, p] < 0 else column[triple[m, p]]
+            if at < 0:
+                continue
+            for i in range(6):
+                for k in range(6):
+                    b[at + i] -= J[k, 6 * p + i] * r[k]
+            for o in range(3):
+                to = -1 if triple[m, o] < 0 else column[triple[m, o]]
+                if to < 0 or to > at:
+                    continue
+                for i in range(6):
+                    for j in range(6):
+                        for k in range(6):
+                            H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]
+    return cost
+
+
+@kernel
+def step(poses, column, points, place, E, pose, cross, first, order, inverse, gradient, x):
+    """Poses (K, 4, 4) and points (N, 3) after a step x (n,) of the unknowns; eliminated points follow."""
+    new, to = poses.copy(), points.copy()
+    for k in range(len(poses)):
+        if column[k] >= 0:
+            move(new[k], x[column[k] : column[k] + 6])
+    d, v = np.empty(3), np.empty(3)
+    for l in range(len(points)):
+        if place[l] >= 0:
+            for i in range(3):
+                d[i] = x[3 * place[l] + i]
+        elif place[l] == ELIMINATED and inverse[l, 0, 0] > 0.0:
+            for i in range(3):
+                v[i] = gradient[l, i]
+            for o in range(first[l], first[l + 1]):
+                m = order[o]
+                at = column[pose[m]]
+                if at >= 0:
+                    for i in range(3):
+                        for j in range(6):
+                            v[i] -= cross[m, j, i] * x[at + j]
+            for i in range(3):
+                d[i] = inverse[l, i, 0] * v[0] + inverse[l, i, 1] * v[1] + inverse[l, i, 2] * v[2]
+        else:
+            continue
+        _displace(points[l], E[l], d, to[l])
+    return new, to
+
+
+@helper
+def _displace(p, E, d, out):
+    """The point after a step d of its chart: its inverse distance is changed, not its distance.
+
+    With ``E = [e₁ r, e₂ r, −u r²]`` and u the point's direction: ``p + (E₀ d₀ + E₁ d₁ + E₂ d₂) / (1 + r d₂)``.
+    """
+    r = np.sqrt(E[0, 0] * E[0, 0] + E[1, 0] * E[1, 0] + E[2, 0] * E[2, 0])
+    scale = max(1.0 + r * d[2], 0.1)
+    for i in range(3):
+        out[i] = p[i] + (E[i, 0] * d[0] + E[i, 1] * d[1] + E[i, 2] * d[2]) / scale
+
+
+@kernel
+def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior):
+    """Covariances (N, 3, 3) of points in the newest camera's coordinates, and in the world.
+
+    Args:
+        T: the newest pose (4, 4); its unknowns begin at `newest`.
+        X: ``L⁻¹`` (n, n) of the normal equations' Cholesky factor.
+        P_poses: joint covariance (6 F, 6 F) of the free poses; their unknowns begin at `prior` = 3 D.
+    """
+    count, n = len(points), len(X)
+    camera, world = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
+    own, by = np.empty((3, 3)), np.empty((3, 6))
+    A, AP = np.zeros((3, len(P_poses))), np.zeros((3, len(P_poses)))
+    q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
+    at = newest - prior
+    for l in range(count):
+        d = place[l]
+        if d >= 0:
+            for i in range(3):
+                for j in range(i + 1):
+                    total = 0.0
+                    for row in range(3 * d + i, n):
+                        total += X[row, 3 * d + i] * X[row, 3 * d + j]
+                    own[i, j] = own[j, i] = total
+                for j in range(6):
+                    total = 0.0
+                    for row in range(newest + j, n):
+                        total += X[row, 3 * d + i] * X[row, newest + j]
+                    by[i, j] = total
+        elif d == ELIMINATED and inverse[l, 0, 0] > 0.0:
+            for i in range(3):
+                for j in range(len(P_poses)):
+                    A[i, j] = 0.0
+            for o in range(first[l], first[l + 1]):
+                m = order[o]
+                to = column[pose[m]] - prior
+                if column[pose[m]] < 0:
+                    continue
+                for i in range(3):
+                    for j in range(6):
+                        for a in range(3):
+                            A[i, to + j] -= inverse[l, i, a] * cross[m, j, a]
+            for i in range(3):
+                for j in range(len(P_poses)):
+                    AP[i, j] = 0.0
+            for i in range(3):
+                for a in range(len(P_poses)):
+                    if A[i, a] != 0.0:
+                        for j in range(len(P_poses)):
+                            AP[i, j] += A[i, a] * P_poses[a, j]
+            for i in range(3):
+                for j in range(3):
+                    total = inverse[l, i, j]
+                    for a in range(len(P_poses)):
+                        total += AP[i, a] * A[j, a]
+                    own[i, j] = total
+                for j in range(6):
+                    by[i, j] = AP[i, at + j]
+        else:
+            continue
+        _congruent(E[l], own, tmp, world[l])
+        # q = Rᵀ (p − t): δq = Rᵀ E d + hat(q) ω − v
+        for i in range(3):
+            q[i] = 0.0
+            for k in range(3):
+                q[i] += T[k, i] * (points[l, k] - T[k, 3])
+            for j in range(3):
+                D[i, j] = T[0, i] * E[l, 0, j] + T[1, i] * E[l, 1, j] + T[2, i] * E[l, 2, j]
+        G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
+        G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
+        G[0, 3] = G[1, 4] = G[2, 5] = -1.0
+        _congruent(D, own, tmp, camera[l])
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for a in range(6):
+                    for c in range(3):
+                        total += D[i, c] * by[c, a] * G[j, a] + G[i, a] * by[c, a] * D[j, c]
+                    for c in range(6):
+                        total += G[i, a] * P_poses[at + a, at + c] * G[j, c]
+                camera[l, i, j] += total
+    return camera, world
+
+
+@helper
+def _congruent(D, S, tmp, out):
+    """``D S Dᵀ`` into out (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            tmp[i, j] = D[i, 0] * S[0, j] + D[i, 1] * S[1, j] + D[i, 2] * S[2, j]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = tmp[i, 0] * D[j, 0] + tmp[i, 1] * D[j, 1] + tmp[i, 2] * D[j, 2]
+
+
+@kernel
+def left_out_distances(camera, R_left, T, points, z, covariances, sigma):
+    """Squared distance (M,) of each row from what all others predict for it, at the solution, with 3 or 2 numbers.
+
+    With r the residual, ``rᵀ (σ² 1 − J C Jᵀ)⁻¹ r``, C the point's covariance (3, 3) in the newest camera T, in which
+    the row itself takes part. ∞ where the point is not in front of the camera.
+    """
+    out, q, r, D = np.empty(len(points)), np.empty(3), np.empty(3), np.empty((3, 3))
+    S, tmp, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(len(points)):
+        transform_back(T, points[m], q)
+        if not residual(camera, R_left, q, z[m], r, D):
+            out[m] = np.inf
+            continue
+        if np.isnan(r[2]):
+            r[2] = D[2, 0] = D[2, 1] = D[2, 2] = 0.0
+        _congruent(D, covariances[m], tmp, S)
+        for i in range(3):
+            for j in range(3):
+                S[i, j] = (sigma * sigma if i == j else 0.0) - S[i, j]
+        for i in range(3):  # a row that alone fixes its point has no residual
+            S[i, i] += 1e-6 * sigma * sigma
+        invert_symmetric(S, 0.0, inverse)
+        total = 0.0
+        for i in range(3):
+            total += r[i] * row_times(inverse, i, r)
+        out[m] = total if total >= 0.0 else np.inf
+    return out
+
+
+@kernel
+def lower_inverse(L):
+    """``L⁻¹`` of a lower triangular L (n, n), by blocks that double in size."""
+    n, size = len(L), 32
+    X = np.zeros((n, n))
+    for start in range(0, n, size):
+        stop = min(start + size, n)
+        for j in range(start, stop):
+            X[j, j] = 1.0 / L[j, j]
+            for i in range(j + 1, stop):
+                total = 0.0
+                for k in range(j, i):
+                    total += L[i, k] * X[k, j]
+                X[i, j] = -total / L[i, i]
+    while size < n:
+        for start in range(0, n - size, 2 * size):
+            middle, stop = start + size, min(start + 2 * size, n)
+            below = np.ascontiguousarray(L[middle:stop, start:middle])
+            first = np.ascontiguousarray(X[start:middle, start:middle])
+            last = np.ascontiguousarray(X[middle:stop, middle:stop])
+            X[middle:stop, start:middle] = -np.dot(last, np.dot(below, first))
+        size *= 2
+    return X
+
+
+@kernel
+def chart_changes(T, points, basis, E):
+    """How chart coordinates from a pose T (4, 4) change, by those of other charts, and by the pose.
+
+    Args:
+        points: (D, 3) in the world, with derivatives E (D, 3, 3) by the other charts' coordinates.
+        basis: charts from T (D, 3, 3).
+
+    Returns:
+        present coordinates (D, 3), and their derivatives (D, 3, 3) and (D, 3, 6).
+    """
+    origin, change, by = np.empty((len(points), 3)), np.empty((len(points), 3, 3)), np.empty((len(points), 3, 6))
+    q, D, zero, row = np.empty(3), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    for d in range(len(points)):
+        _chart(T, points[d], basis[d], zero, q, origin[d], D)
+        for i in range(3):
+            by_pose(D[i], q, by[d, i])
+            for k in range(3):
+                row[k] = row_times(T, k, D[i])
+            for j in range(3):
+                change[d, i, j] = row[0] * E[d, 0, j] + row[1] * E[d, 1, j] + row[2] * E[d, 2, j]
+    return origin, change, by
+
+
+@kernel
+def symmetric(H):
+    """A symmetric matrix (n, n) by its lower triangle."""
+    out = np.empty_like(H)
+    for i in range(len(H)):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = H[i, j]
+    return out

@@ -1,0 +1,121 @@
+"""What leaves a window, as a prior on what stays and as a conditional that finds it again later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+
+from slam.geometry.arrays import Array, BoolArray, IndexArray
+from slam.geometry.se3 import adjoint, inverse
+from slam.window import kernels
+from slam.window.problem import RelativePrior, Window
+from slam.window.solver import linearised
+
+#: numerics: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
+_JITTER = (0.0, 1e-13, 1e-11, 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """Where what left stands, given what stayed: ``x = mean − gain y``, to first order.
+
+    x and y are the changes since it left: of poses as tangent vectors, of points in the world.
+
+    Attributes:
+        mean: (g,), points first.
+        gain: (g, s), points first.
+    """
+
+    mean: Array
+    gain: Array
+
+
+def marginalised(
+    w: Window, pose: int, leaving: BoolArray, joining: IndexArray
+) -> tuple[RelativePrior, Conditional, float]:
+    """Marginalise a pose and some of the prior's points out of a window, with all that is measured of them.
+
+    The window holds just that: the prior, the rows of the pose that leaves and of the points that leave, and what else
+    is known of them. All of its points that are neither in the prior nor join it leave as well.
+
+    Args:
+        w: the window, all poses free.
+        pose: which pose leaves. If it is the first, the next one takes its place as the reference.
+        leaving: which of the prior's points leave (D,).
+        joining: other points of the window that join the prior (J,).
+
+    Returns:
+        the prior on the other poses and the points that stay, in their order, then those that joined (points as indices
+        of this window), and where the pose, then the points of the prior that left, are given the others; and what all that cost at the present values.
+
+    Raises:
+        numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
+    """
+    w, count = _with_joined(w, joining), len(w.prior.points) + len(joining)
+    reference = 1 if pose == 0 else 0
+    e = linearised(w, reference)
+    H = kernels.symmetric(e.H)
+    points = np.concatenate([leaving, np.zeros(len(joining), bool)])
+    gone = np.concatenate([np.repeat(points, 3), np.repeat(np.arange(len(w.poses)) == pose, 6)])
+    L = _root(H[np.ix_(gone, gone)])
+    W, v = solve_triangular(L, H[np.ix_(gone, ~gone)], trans="T"), solve_triangular(L, e.b[gone], trans="T")
+    information, vector = H[np.ix_(~gone, ~gone)] - W.T @ W, e.b[~gone] - W.T @ v
+    conditional = Conditional(solve_triangular(L, v), solve_triangular(L, W))
+
+    members, poses = w.prior.points[~points], np.delete(w.poses, pose, axis=0)
+    D, n = len(members), len(information)
+    if reference:
+        basis, _ = kernels.relative_charts(poses[0], w.points[members])
+    else:
+        basis = w.prior.basis[~points]
+    origin, change, by = kernels.chart_changes(poses[0], w.points[members], basis, e.E[members])
+    if reference:  # coordinates from another pose
+        back = np.linalg.inv(change)
+        rows = (np.swapaxes(back, 1, 2) @ information[: 3 * D].reshape(D, 3, n)).reshape(3 * D, n)
+        information = np.concatenate([rows, information[3 * D :]])
+        columns = (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
+        information = np.concatenate([columns, information[:, 3 * D :]], axis=1)
+        vector = np.concatenate([(np.swapaxes(back, 1, 2) @ vector[: 3 * D].reshape(D, 3, 1)).ravel(), vector[3 * D :]])
+    # x = δ − A δ₀ of all but the reference
+    relative = inverse(poses[0]) @ poses
+    A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])
+    at = slice(3 * D, 3 * D + 6)
+    V = information @ A
+    information[:, at], information[at] = V, V.T
+    information[at, at] = A.T @ V
+    vector = vector.copy()
+    vector[at] = A.T @ vector
+    prior = RelativePrior(
+        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, 0.5 * (information + information.T), vector
+    )
+    return prior, conditional, e.cost
+
+
+def _with_joined(w: Window, joining: IndexArray) -> Window:
+    """The window with more points in its prior, of which it says nothing yet."""
+    if not len(joining):
+        return w
+    p, D, J = w.prior, len(w.prior.points), len(joining)
+    basis, origin = kernels.relative_charts(w.poses[0], w.points[joining])
+    old = np.concatenate([np.ones(3 * D, bool), np.zeros(3 * J, bool), np.ones(6 * len(p.relative), bool)])
+    information, vector = np.zeros((len(old), len(old))), np.zeros(len(old))
+    information[np.ix_(old, old)], vector[old] = p.information, p.vector
+    prior = replace(
+        p, points=np.concatenate([p.points, joining]), basis=np.concatenate([p.basis, basis]),
+        origin=np.concatenate([p.origin, origin]), information=information, vector=vector,
+    )  # fmt: skip
+    return replace(w, prior=prior)
+
+
+def _root(H: Array) -> Array:
+    """Upper triangular R with ``Rᵀ R = H``; where nothing is known of a row, as little as can be is added."""
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    S = H / np.outer(scale, scale)
+    for jitter in _JITTER:
+        try:
+            return np.asarray(cholesky(S + jitter * np.eye(len(S)))) * scale
+        except LinAlgError:
+            continue
+    raise np.linalg.LinAlgError("the information of what leaves a window is not positive definite")

@@ -1,0 +1,225 @@
+"""What a window is: poses, points, what was measured, and what is known besides. Frozen dataclasses of arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from slam.geometry.arrays import Array, IndexArray
+from slam.geometry.rig import StereoRig
+from slam.window import kernels
+
+KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Measurements of points from poses, a row each.
+
+    Attributes:
+        pose, point: indices of the pose and the point (M,).
+        z: rectified pixels (uL, vL, uR) (M, 3); uR is NaN where there is no right pixel.
+        weight: 1 / σ (M,) [1/px]; 0 for a row that does not count.
+    """
+
+    pose: IndexArray
+    point: IndexArray
+    z: Array
+    weight: Array
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    @classmethod
+    def none(cls) -> Rows:
+        """No measurement."""
+        return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0))
+
+    def select(self, keep: np.ndarray) -> Rows:
+        """Some of the rows (a mask or indices)."""
+        return Rows(self.pose[keep], self.point[keep], self.z[keep], self.weight[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Points that are known relative to a pose, a row each; the error of their inverse distance is Gaussian.
+
+    Attributes:
+        pose, point: indices of the pose and the point (Q,).
+        basis, origin: the chart in the pose's axes (Q, 3, 3), and the point's coordinates in it (Q, 3).
+        root: square root of its information there (Q, 3, 3).
+    """
+
+    pose: IndexArray
+    point: IndexArray
+    basis: Array
+    origin: Array
+    root: Array
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    @classmethod
+    def none(cls) -> Places:
+        """No such point."""
+        none = np.zeros(0, np.intp)
+        return cls(none, none, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+    def select(self, keep: np.ndarray) -> Places:
+        """Some of the rows (a mask or indices)."""
+        return Places(self.pose[keep], self.point[keep], self.basis[keep], self.origin[keep], self.root[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Constant velocity, disturbed by noise: a row for each two successive intervals (paper B, section 2).
+
+    Attributes:
+        poses: indices of three successive poses (V, 3); −1 first where the first velocity is noise with mean zero.
+        interval: times between them (V, 2) [s].
+        weight: 1 / σ of the velocity's change [ω, v] (V, 6).
+    """
+
+    poses: IndexArray
+    interval: Array
+    weight: Array
+
+    @classmethod
+    def none(cls) -> Motion:
+        """No motion model."""
+        return cls(np.zeros((0, 3), np.intp), np.zeros((0, 2)), np.zeros((0, 6)))
+
+    def select(self, keep: np.ndarray) -> Motion:
+        """Some of the rows (a mask or indices)."""
+        return Motion(self.poses[keep], self.interval[keep], self.weight[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePrior:
+    """A Gaussian on the first poses and some points relative to the first pose, and on that pose in the world.
+
+    A run goes on for longer than its place in the world is known well, so what stays may move by metres as one. A prior
+    on each in the world would then be off by the square of the turn times the distance, and bend a stiff block of poses
+    and points. This one does not change where all of them move together; what is known of the place in the world is
+    held by the first pose alone.
+
+    With δ = [coordinates of each point in its chart, Log(T⁻¹ T₀), Log(M_i⁻¹ T₀⁻¹ T_i)] of the points and poses as they
+    are, it costs ``δᵀ Λ δ − 2 ηᵀ δ``.
+
+    Attributes:
+        points: indices of its points (D,).
+        basis, origin: their charts in the first pose's axes (D, 3, 3), and their coordinates there (D, 3).
+        T: where the first pose stood (4, 4).
+        relative: where each pose stood before the first (P, 4, 4); the first is the identity.
+        information: Λ (n, n), n = 3 D + 6 P.
+        vector: η (n,).
+    """
+
+    points: IndexArray
+    basis: Array
+    origin: Array
+    T: Array
+    relative: Array
+    information: Array
+    vector: Array
+
+    @classmethod
+    def of_pose(cls, T: Array, covariance: Array) -> RelativePrior:
+        """The first pose is T (4, 4) with a covariance (6, 6)."""
+        none, information = np.zeros(0, np.intp), np.linalg.inv(covariance)
+        information = 0.5 * (information + information.T)
+        return cls(none, np.zeros((0, 3, 3)), np.zeros((0, 3)), T, np.eye(4)[None], information, np.zeros(6))
+
+    @classmethod
+    def none(cls) -> RelativePrior:
+        """Nothing is known."""
+        zero = np.zeros((0, 0))
+        return cls(
+            np.zeros(0, np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.eye(4), np.zeros((0, 4, 4)), zero, zero[0:0].reshape(0)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """The rectified rig that measures.
+
+    Attributes:
+        parameters: `slam.geometry.rig.StereoRig.rectified_parameters` (7,).
+        R_left: rotation (3, 3) from left-camera to rectified axes.
+    """
+
+    parameters: Array
+    R_left: Array
+
+    @classmethod
+    def of(cls, rig: StereoRig) -> Camera:
+        """That of a rig as calibrated; its pixels have to be rectified."""
+        return cls(rig.rectified.rig.rectified_parameters, np.ascontiguousarray(rig.rectified.R_left))
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A few poses, many points, and what is known of them.
+
+    Attributes:
+        camera: that measures.
+        poses: T_world_left (K, 4, 4).
+        points: in world coordinates (N, 3) [m].
+        rows: measurements.
+        free: which poses are unknown (K,); None for all. Those of the prior must be.
+        known: which points are exact (N,); None for none.
+        mean, information: independent priors of points in world coordinates (N, 3), (N, 3, 3) [1/m²], zero for none;
+            None for no point.
+        places: points that are known relative to a pose.
+        motion: constant velocity between successive poses.
+        prior: what is known of the first poses and of some points together.
+    """
+
+    camera: Camera
+    poses: Array
+    points: Array
+    rows: Rows
+    free: np.ndarray | None = None
+    known: np.ndarray | None = None
+    mean: Array | None = None
+    information: Array | None = None
+    places: Places = field(default_factory=Places.none)
+    motion: Motion = field(default_factory=Motion.none)
+    prior: RelativePrior = field(default_factory=RelativePrior.none)
+
+    @cached_property
+    def place(self) -> IndexArray:
+        """What each point is to the solver (N,), see `slam.window.kernels`."""
+        place = np.full(len(self.points), ELIMINATED)
+        if self.known is not None:
+            place[self.known] = KNOWN
+        place[self.prior.points] = np.arange(len(self.prior.points))
+        return place
+
+    @cached_property
+    def column(self) -> IndexArray:
+        """First unknown of each pose (K,), −1 for a fixed one."""
+        first = 3 * len(self.prior.points)
+        if self.free is None:
+            return first + 6 * np.arange(len(self.poses))
+        column = np.full(len(self.poses), -1)
+        column[self.free] = first + 6 * np.arange(int(self.free.sum()))
+        return column
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns, without the points that are eliminated."""
+        return 3 * len(self.prior.points) + 6 * int((self.column >= 0).sum())
+
+    @cached_property
+    def by_point(self) -> tuple[IndexArray, IndexArray]:
+        """Rows, then places, by point: see `slam.window.kernels.eliminate`."""
+        first, order = kernels.by_point(np.concatenate([self.rows.point, self.places.point]), len(self.points))
+        return first, order
+
+    @cached_property
+    def pose_of_row(self) -> IndexArray:
+        """Pose of each row, then of each place."""
+        return np.concatenate([self.rows.pose, self.places.pose])

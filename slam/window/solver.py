@@ -1,0 +1,197 @@
+"""Gauss-Newton over a window with its points eliminated, and the covariances of what it finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
+
+from slam.geometry.arrays import Array, IndexArray
+from slam.window import kernels
+from slam.window.problem import RelativePrior, Window
+
+_STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
+_HALVINGS = 8  # numerics: of a step that does not lessen the cost
+_CLOSE = 1e-2  # numerics: decrease of the cost, by a step with the last factor, that makes that step the last
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """A window linearised at its present values: ``H x = b``, points eliminated.
+
+    Attributes:
+        window: what was linearised.
+        H: information of the unknowns (n, n), lower triangle.
+        b: (n,).
+        cost: sum of squares of everything, with the prior's ``δᵀ Λ δ − 2 ηᵀ δ``.
+        squares: squared whitened residual of each row (M,).
+        E: derivatives of points by their charts' coordinates (N, 3, 3).
+        inverse: inverse information of each eliminated point (N, 3, 3).
+        gradient: of each point by its own rows (N, 3).
+        cross: information that each row, then each place, shares between pose and point (M + Q, 6, 3).
+    """
+
+    window: Window
+    H: Array
+    b: Array
+    cost: float
+    squares: Array
+    E: Array
+    inverse: Array
+    gradient: Array
+    cross: Array
+
+    @cached_property
+    def factor(self) -> Array:
+        """Lower triangular L (n, n) with ``L Lᵀ = H``.
+
+        Raises:
+            numpy.linalg.LinAlgError: H is not positive definite: something is not determined.
+        """
+        L, info = dpotrf(self.H.T, lower=0, clean=0, overwrite_a=0)
+        if info or not np.isfinite(L[-1:, -1:]).all():
+            raise np.linalg.LinAlgError("the window's information is not positive definite")
+        return np.asarray(L)  # upper triangle, Lᵀ in Fortran's order
+
+    def step(self, factor: Array) -> tuple[Array, float]:
+        """Step of the unknowns (n,) by a factor of these or nearby equations, and the decrease of cost it expects."""
+        x = dpotrs(factor, self.b, lower=0)[0]
+        return x, float(x @ self.b)
+
+    def after(self, x: Array) -> Window:
+        """The window after a step of the unknowns."""
+        w = self.window
+        poses, points = kernels.step(
+            w.poses, w.column, w.points, w.place, self.E, w.pose_of_row, self.cross, *w.by_point, self.inverse,
+            self.gradient, x,
+        )  # fmt: skip
+        moved = replace(w, poses=poses, points=points)
+        for name in ("place", "column", "by_point", "pose_of_row"):  # these do not change
+            moved.__dict__[name] = getattr(w, name)
+        return moved
+
+
+def linearised(w: Window, centre: int = 0) -> NormalEquations:
+    """The normal equations of a window at its present values.
+
+    Args:
+        w: the window.
+        centre: the pose from which inverse distances of points outside the prior count.
+    """
+    n, rows, c = w.unknowns, w.rows, w.camera
+    H, b = np.zeros((n, n)), np.zeros(n)
+    cost = _begin_with_prior(w, H, b)
+    E = kernels.charts(w.poses, centre, w.points, w.place, w.prior.basis, 0)
+    squares, information, gradient, cross = kernels.linearise(
+        c.parameters, c.R_left, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, H, b
+    )
+    cost += float(squares.sum())
+    if len(w.places):
+        p = w.places
+        more, its = kernels.place_rows(
+            w.poses, w.column, w.points, w.place, E, p.pose, p.point, p.basis, p.origin, p.root, H, b, information,
+            gradient,
+        )  # fmt: skip
+        cost, cross = cost + more, np.concatenate([cross, its])
+    if w.information is not None and w.mean is not None:
+        cost += kernels.own_priors(w.points, w.place, E, w.mean, w.information, information, gradient)
+    if len(w.motion.poses):
+        m = w.motion
+        cost += kernels.motion_rows(w.poses, w.column, m.poses, m.interval, m.weight, H, b)
+    inverse = kernels.eliminate(
+        w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, H, b
+    )
+    return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
+
+
+def _begin_with_prior(w: Window, H: Array, b: Array) -> float:
+    """Begin the normal equations with the prior; returns its cost, ∞ where a point has left its chart."""
+    prior, n = w.prior, len(w.prior.vector)
+    if not n:
+        return 0.0
+    delta, A = np.empty(n), np.empty((n, 6))
+    there = np.arange(len(prior.relative))
+    if not kernels.prior_rows(
+        w.poses, w.points, prior.points, prior.T, prior.relative, prior.basis, prior.origin, there, delta, A
+    ):
+        return np.inf
+    reference = slice(3 * len(prior.points), 3 * len(prior.points) + 6)
+    V, pull = prior.information @ A, prior.vector - prior.information @ delta
+    by_reference = A.T @ pull
+    part = H[:n, :n]
+    part[:] = prior.information
+    part[:, reference], part[reference] = V, V.T
+    part[reference, reference] = A.T @ V
+    b[:n] = pull
+    b[reference] = by_reference
+    return float(-delta @ (pull + prior.vector))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solved window.
+
+    Attributes:
+        window: poses and points as found.
+        equations: linearised next to the solution.
+        cost: at the solution.
+        steps: number of factors that it took.
+    """
+
+    window: Window
+    equations: NormalEquations
+    cost: float
+    steps: int
+
+    @cached_property
+    def inverse_factor(self) -> Array:
+        """``L⁻¹`` (n, n), lower triangular."""
+        return np.asarray(kernels.lower_inverse(self.equations.factor.T))
+
+    @cached_property
+    def pose_covariance(self) -> Array:
+        """Joint covariance (6 F, 6 F) of the free poses, perturbed on the right."""
+        first = 3 * len(self.window.prior.points)
+        X = self.inverse_factor[first:, first:]
+        return np.asarray(X.T @ X)
+
+    def point_covariances(self, pose: int) -> tuple[Array, Array]:
+        """Covariances (N, 3, 3) of all points in the coordinates of a pose, and in the world. Those of known ones are 0."""
+        w, e = self.window, self.equations
+        return kernels.point_relations(
+            w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
+            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.prior.points),
+        )  # fmt: skip
+
+
+def solve(window: Window, centre: int = 0) -> Solution:
+    """The most probable poses and points, by Gauss-Newton with halved steps.
+
+    Raises:
+        numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
+    """
+    now = linearised(window, centre)
+    x, _ = now.step(now.factor)
+    for taken in range(1, _STEPS + 1):
+        following = _descended(now, x, centre)
+        if following is None:
+            return Solution(now.window, now, now.cost, taken)
+        x, rest = following.step(now.factor)
+        if not np.isfinite(rest):
+            raise np.linalg.LinAlgError("a window's step is not finite")
+        if rest < _CLOSE:  # so near the end the last factor serves once more
+            return Solution(following.after(x), now, following.cost - rest, taken)
+        now = following
+        x, _ = now.step(now.factor)
+    return Solution(now.window, now, now.cost, _STEPS)
+
+
+def _descended(now: NormalEquations, x: Array, centre: int) -> NormalEquations | None:
+    """The equations after a step, or after the longest of its halves that does not raise the cost; None for none."""
+    for halving in range(_HALVINGS):
+        following = linearised(now.after(0.5**halving * x), centre)
+        if following.cost <= now.cost + 1e-9 * abs(now.cost) + 1e-12:
+            return following
+    return None
