@@ -1,7 +1,7 @@
 """The measurement (uL, vL, uR) [px] of a point by a rectified stereo rig, and its derivatives.
 
-``uL = u0 + fu x/z, vL = v0 + fv y/z, uR = u0' + f' (x + b)/z`` of a point (x, y, z) in rectified axes. The camera (7,) is
-`slam.geometry.rig.StereoRig.rectified_parameters`: fu, fv, u0, v0, f', u0', b, of which b is minus the baseline [m].
+``uL = u0 + fu x/z, vL = v0 + fv y/z, uR = u0' + f' (x + b)/z`` of a point (x, y, z) in rectified axes. The camera
+(7,) is `slam.geometry.rig.StereoRig.rectified_parameters`: fu, fv, u0, v0, f', u0', b; b is minus the baseline [m].
 Derivatives by the rig's own parameters are `slam.calibration.model_kernels.field`.
 """
 
@@ -17,7 +17,7 @@ NEAREST = 1e-9  #: numerics: no depth up to this [m] is projected
 
 @helper
 def offsets(camera, x, y, depth):
-    """Pixels less the principal points, ``uL − u0, vL − v0, uR − u0'``, and the inverse depth; NaN behind the camera."""
+    """Pixels less principal points, ``uL − u0, vL − v0, uR − u0'``, and the inverse depth; NaN behind the camera."""
     inverse = 1.0 / depth if depth > NEAREST else np.nan
     return camera[0] * x * inverse, camera[1] * y * inverse, camera[4] * (x + camera[6]) * inverse, inverse
 
@@ -40,11 +40,8 @@ def residual(camera, R_left, local, measured, r, J):
     x, y, depth = row_times(R_left, 0, local), row_times(R_left, 1, local), row_times(R_left, 2, local)
     left, row, right, inverse = offsets(camera, x, y, depth)
     front = depth > NEAREST
-    r[0], r[1], r[2] = (
-        measured[0] - (left + camera[2]),
-        measured[1] - (row + camera[3]),
-        measured[2] - (right + camera[5]),
-    )
+    r[0], r[1] = measured[0] - (left + camera[2]), measured[1] - (row + camera[3])
+    r[2] = measured[2] - (right + camera[5])
     if not front:
         inverse = left = row = right = 0.0
     u, v, w = camera[0] * inverse, camera[1] * inverse, camera[4] * inverse

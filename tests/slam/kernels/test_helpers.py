@@ -114,7 +114,7 @@ def predicted(pose, point):
 
 def test_stereo_residual_and_its_derivatives():
     world = reference.transform(T, POINT[None])[0]
-    measured = predicted(T, world) + [1.0, -2.0, 3.0]
+    measured = predicted(T, world) + np.array([1.0, -2.0, 3.0])
     r, J, by_pose, by_point = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     assert call(stereo.residual, CAMERA, R_LEFT, POINT, measured, r, J)
     np.testing.assert_allclose(r, [1.0, -2.0, 3.0], atol=1e-11)
