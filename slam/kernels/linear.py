@@ -15,22 +15,25 @@ def factorise(M, n):
     """
     for i in range(n):
         for j in range(i + 1):
+            value = M[i, j]
             for h in range(j):
-                M[i, j] -= M[i, h] * M[j, h] * M[h, h]
-            if j < i:
-                M[i, j] /= M[j, j]
+                value -= M[i, h] * M[j, h] * M[h, h]
+            M[i, j] = value if i == j else value / M[j, j]
 
 
 @helper
 def solve_factorised(M, n, v):
     """``M⁻¹ v`` in place of v (n,), where M has been through `factorise`."""
     for i in range(n):
+        value = v[i]
         for h in range(i):
-            v[i] -= M[i, h] * v[h]
+            value -= M[i, h] * v[h]
+        v[i] = value
     for i in range(n - 1, -1, -1):
-        v[i] /= M[i, i]
+        value = v[i] / M[i, i]
         for h in range(i + 1, n):
-            v[i] -= M[h, i] * v[h]
+            value -= M[h, i] * v[h]
+        v[i] = value
 
 
 @helper
