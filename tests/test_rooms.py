@@ -12,12 +12,13 @@ SLAM = ROOT / "slam"
 #: What a room may import, besides itself. Modules at the root of `slam` are two rooms: "data" and "system".
 MAY_IMPORT = {
     "runtime": set(),
-    "geometry": {"runtime", "data"},
+    "kernels": {"runtime"},
+    "geometry": {"kernels", "runtime", "data"},
     "data": {"geometry"},
-    "tracking": {"data", "geometry", "runtime"},
-    "calibration": {"data", "geometry", "runtime"},
+    "tracking": {"data", "geometry", "kernels", "runtime"},
+    "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracking", "data", "geometry", "runtime"},
-    "objects": {"tracking", "data", "geometry", "runtime"},
+    "objects": {"tracking", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.se3 import transform_back
+from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import kernel
-
-_NEAREST = 1e-6  # numerics: no depth below this [m] is projected
 
 
 @kernel
@@ -14,7 +14,7 @@ def information_of(camera, R_left, poses, frames, z, points, rows, sigma):
     """What measurements say of landmarks, linearised at their positions.
 
     Args:
-        camera: f, u0, v0, baseline (4,) of the rectified rig.
+        camera: of the rectified rig (7,), see `slam.kernels.stereo`.
         R_left: rotation (3, 3) from left-camera to rectified coordinates.
         poses: T_world_left (F, 4, 4).
         frames: in which each measurement was made (n,).
@@ -31,37 +31,25 @@ def information_of(camera, R_left, poses, frames, z, points, rows, sigma):
     count, most = rows.shape
     information, gradient = np.zeros((count, most, 3, 3)), np.zeros((count, 3))
     squares, behind = np.zeros(count), np.zeros(count)
-    f, weight = camera[0], 1 / (sigma * sigma)
-    centre = (camera[1], camera[2], camera[1])
-    Q, q, d = np.empty((3, 3)), np.empty(3), np.empty(3)
+    weight = 1 / (sigma * sigma)
+    local, r, J, d = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     for m in range(count):
         for k in range(most):
             row = rows[m, k]
             if row < 0:
                 continue
-            frame = frames[row]
-            for i in range(3):
-                q[i] = 0.0
-                for j in range(3):
-                    Q[i, j] = 0.0
-                    for h in range(3):
-                        Q[i, j] += R_left[i, h] * poses[frame, j, h]
-                    q[i] += Q[i, j] * (points[m, j] - poses[frame, j, 3])
-            if not q[2] >= _NEAREST:
+            T = poses[frames[row]]
+            transform_back(T, points[m], local)
+            if not residual(camera, R_left, local, z[row], r, J):
                 behind[m] += 1
                 continue
-            scale = f / q[2]
             for c in range(3):  # uL, vL, uR
-                axis = 1 if c == 1 else 0
-                ratio = (q[axis] - (camera[3] if c == 2 else 0.0)) / q[2]
-                r = z[row, c] - centre[c] - f * ratio
-                if not np.isfinite(r):
+                if not np.isfinite(r[c]):
                     continue
-                squares[m] += weight * r * r
+                squares[m] += weight * r[c] * r[c]
+                by_point(J[c], T, d)
                 for i in range(3):
-                    d[i] = scale * (Q[axis, i] - ratio * Q[2, i])
-                for i in range(3):
-                    gradient[m, i] += weight * r * d[i]
+                    gradient[m, i] += weight * r[c] * d[i]
                     for j in range(3):
                         information[m, k, i, j] += weight * d[i] * d[j]
     return information, gradient, squares, behind

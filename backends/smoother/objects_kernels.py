@@ -7,46 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import column_times
+from slam.kernels.se3 import between, log, rotation_vector, transform
+from slam.kernels.stereo import by_pose, residual
 from slam.runtime.compilation import helper, kernel
 
 FRAME = 12  #: fixed: unknowns of a frame: body pose (6), camera pose (6)
-_NEAREST = 1e-6  # numerics: no depth below this [m] is projected
-_SMALL = 1e-6  # numerics: sine of an angle below which series are exact
-
-
-@helper
-def _turn(R, w, inverse_J):
-    """Rotation vector w (3,) of a rotation by less than a half turn, and its inverse left Jacobian (3, 3)."""
-    a, b, c = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
-    sine = np.sqrt(a * a + b * b + c * c)
-    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1))
-    scale, bend = 1.0, 1 / 12
-    if not sine < _SMALL:
-        scale, half = angle / sine, 0.5 * angle
-        bend = (1 - half / np.tan(half)) / (4 * half * half)
-    x, y, z = scale * a, scale * b, scale * c
-    w[0], w[1], w[2] = x, y, z
-    square = x * x + y * y + z * z
-    for i in range(3):
-        for j in range(3):
-            inverse_J[i, j] = bend * w[i] * w[j]
-        inverse_J[i, i] += 1 - bend * square
-    inverse_J[0, 1] += 0.5 * z
-    inverse_J[0, 2] -= 0.5 * y
-    inverse_J[1, 0] -= 0.5 * z
-    inverse_J[1, 2] += 0.5 * x
-    inverse_J[2, 0] += 0.5 * y
-    inverse_J[2, 1] -= 0.5 * x
-
-
-@helper
-def _between(A, B, out):
-    """``A⁻¹ B`` of poses (4, 4)."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-        out[i, 3] = A[0, i] * (B[0, 3] - A[0, 3]) + A[1, i] * (B[1, 3] - A[1, 3]) + A[2, i] * (B[2, 3] - A[2, 3])
-
 
 # ---------------------------------------------------------------------------------------------- measurements
 
@@ -58,7 +24,7 @@ def add_measurements(H, g, camera, R_left, sigma, z, Y, points, first_point):
     Args:
         H: (U, U), changed in place.
         g: (U,), changed in place.
-        camera: f, u0, v0, baseline (4,) of the rectified rig.
+        camera: of the rectified rig (7,), see `slam.kernels.stereo`.
         R_left: rotation (3, 3) from left-camera to rectified coordinates.
         sigma: pixel noise [px].
         z: (n, p, 3), NaN where there is none.
@@ -66,34 +32,20 @@ def add_measurements(H, g, camera, R_left, sigma, z, Y, points, first_point):
         points: in body coordinates (p, 3).
         first_point: where the points' unknowns begin.
     """
-    f, u0, v0, baseline = camera
-    h, q, r = np.empty(3), np.empty(3), np.empty(3)
-    J, G = np.empty((3, 3)), np.empty((3, FRAME))
+    h, r, J, G = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, FRAME))
     for i in range(len(z)):
         R, start = Y[i], FRAME * i
         for j in range(len(points)):
             if np.isnan(z[i, j, 0]) and np.isnan(z[i, j, 1]) and np.isnan(z[i, j, 2]):
                 continue
-            for k in range(3):
-                h[k] = R[k, 0] * points[j, 0] + R[k, 1] * points[j, 1] + R[k, 2] * points[j, 2] + R[k, 3]
-            for k in range(3):
-                q[k] = R_left[k, 0] * h[0] + R_left[k, 1] * h[1] + R_left[k, 2] * h[2]
-            if not q[2] >= _NEAREST:
+            transform(R, points[j], h)
+            if not residual(camera, R_left, h, z[i, j], r, J):
                 continue
-            w = 1 / q[2]
-            scale = f * w
-            left, row = scale * q[0], scale * q[1]
-            right = left - scale * baseline
-            r[0], r[1], r[2] = z[i, j, 0] - u0 - left, z[i, j, 1] - v0 - row, z[i, j, 2] - u0 - right
             for k in range(3):
-                J[0, k] = (scale * R_left[0, k] - left * w * R_left[2, k]) / sigma
-                J[1, k] = (scale * R_left[1, k] - row * w * R_left[2, k]) / sigma
-                J[2, k] = (scale * R_left[0, k] - right * w * R_left[2, k]) / sigma
-                r[k] /= sigma
-            for k in range(3):
-                if not np.isfinite(r[k]):
-                    r[k] = 0.0
-                    J[k] = 0.0
+                known = np.isfinite(r[k])
+                r[k] = r[k] / sigma if known else 0.0
+                for c in range(3):
+                    J[k, c] = J[k, c] / sigma if known else 0.0
                 _derivatives(J[k], R, points[j], h, G[k])
             _add(H, g, G, r, start, first_point + 3 * j)
 
@@ -105,14 +57,11 @@ def _derivatives(J, R, point, h, out):
     Those by the point in the body stand at 3 to 5.
     """
     for k in range(3):
-        out[3 + k] = J[0] * R[0, k] + J[1] * R[1, k] + J[2] * R[2, k]
-        out[9 + k] = -J[k]
+        out[3 + k] = column_times(R, k, J)
     out[0] = out[5] * point[1] - out[4] * point[2]
     out[1] = out[3] * point[2] - out[5] * point[0]
     out[2] = out[4] * point[0] - out[3] * point[1]
-    out[6] = J[1] * h[2] - J[2] * h[1]
-    out[7] = J[2] * h[0] - J[0] * h[2]
-    out[8] = J[0] * h[1] - J[1] * h[0]
+    by_pose(J, h, out[6:])
 
 
 @helper
@@ -146,7 +95,7 @@ def velocities(T, stamps):
         for i in range(3):
             for j in range(3):
                 turn[i, j] = B[i, 0] * A[j, 0] + B[i, 1] * A[j, 1] + B[i, 2] * A[j, 2]
-        _turn(turn, w, inverse_J)
+        rotation_vector(turn, w, inverse_J)
         for i in range(3):
             velocity[m, i] = w[i] * per_second
             velocity[m, 3 + i] = (B[i, 3] - A[i, 3]) * per_second
@@ -209,24 +158,24 @@ def relinearised(H, g, T0, X0, points0, T, X, points):
     """
     n, first = len(T), FRAME * len(T)
     delta = np.empty(len(g))
-    D, w, inverse_J = np.empty((3, 4)), np.empty(3), np.empty((3, 3))
+    D, w, inverse_J, moved = np.empty((3, 4)), np.empty(3), np.empty((3, 3)), np.empty(3)
     for m in range(n):
         for at, (A, B) in enumerate(((T0[m], T[m]), (X0[m], X[m]))):
-            _between(A, B, D)
-            _turn(D, w, inverse_J)
-            start = FRAME * m + 6 * at
-            for i in range(3):
-                delta[start + i] = w[i]
-                delta[start + 3 + i] = inverse_J[i, 0] * D[0, 3] + inverse_J[i, 1] * D[1, 3] + inverse_J[i, 2] * D[2, 3]
-    _between(T0[0], T[0], D)
+            between(A, B, D)
+            log(D, w, inverse_J, delta[FRAME * m + 6 * at :])
+    between(T0[0], T[0], D)
     for j in range(len(points)):
         old, now, at = points0[j], points[j], first + 3 * j
+        transform(D, now, moved)
         for i in range(3):
-            delta[at + i] = D[i, 0] * now[0] + D[i, 1] * now[1] + D[i, 2] * now[2] + D[i, 3] - old[i] - delta[3 + i]
+            delta[at + i] = moved[i] - old[i] - delta[3 + i]
         delta[at] += old[1] * delta[2] - old[2] * delta[1]
         delta[at + 1] += old[2] * delta[0] - old[0] * delta[2]
         delta[at + 2] += old[0] * delta[1] - old[1] * delta[0]
-    out, vector = H.copy(), g - H @ delta
+    out, vector = H.copy(), g.copy()
+    for i in range(len(g)):
+        for j in range(len(g)):
+            vector[i] -= H[i, j] * delta[j]
     # A turn of the frame moves a point by the cross product with where it is: only that has changed.
     for j in range(len(points)):
         at = first + 3 * j

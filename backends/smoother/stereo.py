@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from backends.smoother.pose_kernels import NEAREST
 from slam.data import Observations
 from slam.geometry.rig import RectifiedRig, StereoRig
+from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
 from slam.geometry.se3 import Array
 
 
@@ -38,8 +38,8 @@ class RectifiedStereo:
 
     @cached_property
     def intrinsics(self) -> Array:
-        """f, u0, v0, baseline (4,), for compiled loops."""
-        return np.array([self.f, self.u0, self.v0, self.baseline])
+        """Of the rectified rig (7,), as `StereoRig.rectified_parameters`, where both cameras have one u0."""
+        return np.array([self.f, self.f, self.u0, self.v0, self.f, self.u0, -self.baseline])
 
     @classmethod
     def of(cls, rig: StereoRig) -> RectifiedStereo:
@@ -73,29 +73,14 @@ class RectifiedStereo:
         Points that are not in front of the camera give NaN measurements and zero Jacobians.
         """
         R = self.rectified_rig.R_left
-        p = local @ R.T
-        behind = p[:, 2] < NEAREST
-        w = 1 / np.where(behind, np.nan, p[:, 2])
-        f_w = self.f * w
-        z = np.empty((len(p), 3))
-        z[:, 0] = self.u0 + f_w * p[:, 0]
-        z[:, 1] = self.v0 + f_w * p[:, 1]
-        z[:, 2] = z[:, 0] - f_w * self.baseline
-        J = np.zeros((len(p), 3, 3))
-        J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 0] = f_w
-        J[:, 0, 2] = (self.u0 - z[:, 0]) * w
-        J[:, 1, 2] = (self.v0 - z[:, 1]) * w
-        J[:, 2, 2] = (self.u0 - z[:, 2]) * w
-        if behind.any():
-            J[behind] = 0
+        z, J = project_rectified(self.intrinsics, local @ R.T, True)
+        J[np.isnan(z[:, 0])] = 0
         return z, J if self.rectified_rig.original.is_rectified else J @ R
 
     def triangulate(self, z: Array) -> Array:
         """Points (N, 3) in the left camera's coordinates; NaN where the disparity is not positive or missing."""
-        disparity = z[:, 0] - z[:, 2]
-        depth = self.f * self.baseline / np.where(disparity > 0, disparity, np.nan)
-        p = np.stack([(z[:, 0] - self.u0) / self.f, (z[:, 1] - self.v0) / self.f, np.ones(len(z))], axis=1)
-        return (p * depth[:, None]) @ self.rectified_rig.R_left
+        points = triangulate_rectified(self.intrinsics, np.ascontiguousarray(z[:, :2]), np.ascontiguousarray(z[:, 2:]))
+        return np.asarray(points @ self.rectified_rig.R_left)
 
 
 def _scale(rectified_rig: RectifiedRig) -> float:

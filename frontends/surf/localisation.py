@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.kernels.linear import invert
 from slam.runtime.compilation import disjoint_vector_helper, helper, kernel, vector_helper
 
 _STEP = 1.0 / 15.0  # of the finite differences in position, in units of the size
@@ -100,22 +101,18 @@ def _sample(pixels, stride, x, y, size, bend, corners, fractions, parts, lanes, 
 
 
 @helper
-def _inverse_curvature(c, inverse):
+def _inverse_curvature(c, hessian, inverse):
     """Inverse of the Hessian (3, 3) of the responses, in units of the finite differences; False unless a maximum."""
     v = 2.0 * c[1, 1, 1]
     xx, yy, ss = c[1, 1, 0] + c[1, 1, 2] - v, c[1, 0, 1] + c[1, 2, 1] - v, c[0, 1, 1] + c[2, 1, 1] - v
     xy = 0.25 * (c[1, 2, 2] - c[1, 0, 2] - c[1, 2, 0] + c[1, 0, 0])
     xs = 0.25 * (c[2, 1, 2] - c[0, 1, 2] - c[2, 1, 0] + c[0, 1, 0])
     ys = 0.25 * (c[2, 2, 1] - c[0, 2, 1] - c[2, 0, 1] + c[0, 0, 1])
-    cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
-    det = xx * cxx + xy * cxy + xs * cxs
-    if not (xx < 0.0 and xx * yy - xy * xy > 0.0 and det < 0.0):
-        return False
-    inverse[0, 0], inverse[0, 1], inverse[0, 2] = cxx / det, cxy / det, cxs / det
-    inverse[1, 1], inverse[1, 2] = (xx * ss - xs * xs) / det, (xy * xs - xx * ys) / det
-    inverse[2, 2] = (xx * yy - xy * xy) / det
-    inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
-    return True
+    hessian[0, 0], hessian[1, 1], hessian[2, 2] = xx, yy, ss
+    hessian[0, 1] = hessian[1, 0] = xy
+    hessian[0, 2] = hessian[2, 0] = xs
+    hessian[1, 2] = hessian[2, 1] = ys
+    return invert(hessian, inverse) < 0.0 and xx < 0.0 and xx * yy - xy * xy > 0.0
 
 
 def localise(
@@ -142,13 +139,13 @@ def localise(
     lanes = int(_WIDEST * size.max(initial=0.0)) + 2 * _LANES
     _localise(
         integral.reshape(-1), integral.shape, x, y, size, reach, np.empty(10, np.uint64), np.empty(10),
-        np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty(3), out,
+        np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), out,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube, inverse, step, out):
+def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube, hessian, inverse, step, out):
     """The same into `out`, on the flat integral image and with work space."""
     rows, stride = shape
     lanes = parts.size // 3
@@ -161,7 +158,7 @@ def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube,
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
             _sample(pixels, stride, u, v, s, bend, corners, fractions, parts, lanes, cube)
-            if bend and not _inverse_curvature(cube, inverse):
+            if bend and not _inverse_curvature(cube, hessian, inverse):
                 break
             gx, gy = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
             gs = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])

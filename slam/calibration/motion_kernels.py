@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import whitener
 from slam.runtime.compilation import kernel
 
 
@@ -48,15 +49,7 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
                 W[i, j] = noise[i, j]
                 for k in range(3):
                     W[i, j] += B[i, k] * J_point[n, j, k]
-        # The inverse of its Cholesky factor.
-        a = 1.0 / np.sqrt(W[0, 0])
-        b, c = W[1, 0] * a, W[2, 0] * a
-        e = 1.0 / np.sqrt(W[1, 1] - b * b)
-        g = (W[2, 1] - b * c) * e
-        h = 1.0 / np.sqrt(W[2, 2] - c * c - g * g)
-        white[n, 0, 0], white[n, 1, 1], white[n, 2, 2] = a, e, h
-        white[n, 1, 0], white[n, 2, 1], white[n, 2, 0] = -b * a * e, -g * e * h, (b * g * e - c) * a * h
-        white[n, 0, 1] = white[n, 0, 2] = white[n, 1, 2] = 0.0
+        whitener(W, white[n])
         for i in range(3):
             residual[n, i] = 0.0
             for j in range(i + 1):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import factorise, solve_factorised
+from slam.kernels.se3 import compose, exp, transform
+from slam.kernels.stereo import offsets
 from slam.runtime.compilation import helper, kernel
-
-_SMALL_SQUARE = 1e-4  # numerics: of an angle [rad²], below which series are exact to double precision
 
 
 @kernel
@@ -46,8 +47,8 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
         most: number of steps at most.
         converged: step [rad], [m] after which a pose is good.
     """
-    fu, fv, u0, v0, right_fu, right_u0, shift = cameras
     normal, step, local = np.empty((6, 6)), np.empty(6), np.empty(3)
+    change, before = np.empty((3, 4)), np.empty((4, 4))
     for h in range(len(poses)):
         for _ in range(most):
             for i in range(6):  # slices take seconds to compile
@@ -56,24 +57,29 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
                     normal[i, j] = 0.0
             for k in range(rows.shape[1]):
                 m = rows[h, k]
-                _transform(poses[h], points[m], local)
-                if not local[2] > 1e-9:
+                transform(poses[h], points[m], local)
+                offset = offsets(cameras, local[0], local[1], local[2])
+                inverse = offset[3]
+                if np.isnan(inverse):
                     continue
-                inverse = 1.0 / local[2]
-                x, y, right_x = local[0] * inverse, local[1] * inverse, (local[0] + shift) * inverse
                 for i in range(3):
-                    f, ray, centre = fu, x, u0
-                    if i == 1:
-                        f, ray, centre = fv, y, v0
-                    elif i == 2:
-                        f, ray, centre = right_fu, right_x, right_u0
-                    error = measured[m, i] - (f * ray + centre)
+                    f, centre = (cameras[0], cameras[2]) if i == 0 else (cameras[1], cameras[3])
+                    if i == 2:
+                        f, centre = cameras[4], cameras[5]
+                    error = measured[m, i] - (offset[i] + centre)
                     if np.isfinite(error):
                         across, down = (0.0, f * inverse) if i == 1 else (f * inverse, 0.0)
-                        _add_row(local, across, down, -f * ray * inverse, error, normal, step)
+                        _add_row(local, across, down, -offset[i] * inverse, error, normal, step)
             _damp_and_solve(normal, step)
-            _move(step, poses[h])
-            if np.abs(step).max() < converged:
+            exp(step, change)
+            for i in range(4):
+                for j in range(4):
+                    before[i, j] = poses[h, i, j]
+            compose(change, before, poses[h])
+            largest = 0.0
+            for i in range(6):
+                largest = max(largest, abs(step[i]))
+            if largest < converged:
                 break
 
 
@@ -87,25 +93,17 @@ def errors_rectified(cameras, points, measured, poses):
         measured: (M, 3) = (uL, vL, uR); uR is NaN where there is none, and does not count.
         poses: T_left_world (H, 4, 4).
     """
-    fu, fv, u0, v0, right_fu, right_u0, shift = cameras
     errors, local = np.empty((len(poses), len(points))), np.empty(3)
     for h in range(len(poses)):
         for m in range(len(points)):
-            _transform(poses[h], points[m], local)
-            inverse = 1.0 / local[2] if local[2] > 1e-9 else np.nan
-            error = abs(measured[m, 0] - (fu * local[0] * inverse + u0))
-            down = abs(measured[m, 1] - (fv * local[1] * inverse + v0))
-            right = abs(measured[m, 2] - (right_fu * (local[0] + shift) * inverse + right_u0))
+            transform(poses[h], points[m], local)
+            left, row, right, _ = offsets(cameras, local[0], local[1], local[2])
+            error, down = abs(measured[m, 0] - (left + cameras[2])), abs(measured[m, 1] - (row + cameras[3]))
+            right = abs(measured[m, 2] - (right + cameras[5]))
             if down > error or np.isnan(down):
                 error = down
             errors[h, m] = right if right > error else error
     return errors
-
-
-@helper
-def _transform(T, point, out):
-    for i in range(3):
-        out[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2] + T[i, 3]
 
 
 @helper
@@ -127,49 +125,5 @@ def _damp_and_solve(normal, right):
         damping += 1e-9 * normal[m, m]
     for m in range(6):
         normal[m, m] += damping
-    _solve(normal, right)
-
-
-@helper
-def _move(step, T):
-    """``exp(step) T`` into T: see `slam.geometry.se3.exp`."""
-    x, y, z = step[0], step[1], step[2]
-    square = x * x + y * y + z * z
-    if square < _SMALL_SQUARE:
-        a = 1 - square / 6 * (1 - square / 20 * (1 - square / 42))
-        b = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56))
-        c = 1 / 6 - square / 120 * (1 - square / 42 * (1 - square / 72))
-    else:
-        angle = np.sqrt(square)
-        a = np.sin(angle) / angle
-        b = 2 * np.sin(0.5 * angle) ** 2 / square
-        c = (1 - a) / square
-    W, turn, before = np.zeros((3, 3)), np.empty((3, 3)), T.copy()
-    W[0, 1], W[0, 2], W[1, 2] = -z, y, -x
-    W[1, 0], W[2, 0], W[2, 1] = z, -y, x
-    for i in range(3):
-        T[i, 3] += step[3 + i]
-        for j in range(3):
-            twice = step[i] * step[j] - (square if i == j else 0.0)  # of W W
-            turn[i, j] = a * W[i, j] + b * twice  # less the unit matrix
-            T[i, 3] += (b * W[i, j] + c * twice) * step[3 + j]
-    for i in range(3):
-        for j in range(4):
-            for k in range(3):
-                T[i, j] += turn[i, k] * before[k, j]
-
-
-@helper
-def _solve(M, v):
-    """``M⁻¹ v`` into v (6,) by M = L D Lᵀ, which overwrites the lower triangle of M (6, 6)."""
-    for i in range(6):
-        for j in range(i + 1):
-            for h in range(j):
-                M[i, j] -= M[i, h] * M[j, h] * M[h, h]
-            if j < i:
-                M[i, j] /= M[j, j]
-                v[i] -= M[i, j] * v[j]
-    for i in range(5, -1, -1):
-        v[i] /= M[i, i]
-        for h in range(i + 1, 6):
-            v[i] -= M[h, i] * v[h]
+    factorise(normal, 6)
+    solve_factorised(normal, 6, right)

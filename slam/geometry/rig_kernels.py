@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.stereo import offsets
 from slam.runtime.compilation import kernel
 
 
@@ -16,16 +17,12 @@ def project_rectified(cameras, points, jacobian):
         points: in left-camera coordinates (N, 3); rows of those behind the camera become NaN.
         jacobian: whether to work out the derivatives; else there are no rows of them.
     """
-    fu, fv, u0, v0, right_fu, right_u0, shift = cameras
     z, J = np.empty((len(points), 3)), np.zeros((len(points) if jacobian else 0, 3, 3))
     for n in range(len(points)):
-        depth = points[n, 2]
-        inverse = 1.0 / depth if depth > 1e-9 else np.nan
-        u, v = fu * points[n, 0] * inverse, fv * points[n, 1] * inverse
-        right_u = right_fu * (points[n, 0] + shift) * inverse
-        z[n, 0], z[n, 1], z[n, 2] = u + u0, v + v0, right_u + right_u0
+        u, v, right_u, inverse = offsets(cameras, points[n, 0], points[n, 1], points[n, 2])
+        z[n, 0], z[n, 1], z[n, 2] = u + cameras[2], v + cameras[3], right_u + cameras[5]
         if jacobian:
-            J[n, 0, 0], J[n, 1, 1], J[n, 2, 0] = fu * inverse, fv * inverse, right_fu * inverse
+            J[n, 0, 0], J[n, 1, 1], J[n, 2, 0] = cameras[0] * inverse, cameras[1] * inverse, cameras[4] * inverse
             J[n, 0, 2], J[n, 1, 2], J[n, 2, 2] = -u * inverse, -v * inverse, -right_u * inverse
     return z, J
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import factorise, invert, invert_symmetric, solve_factorised, square
+from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import helper, kernel
 
 _NEAREST = 1e-9  # numerics: no distance below this [m] is divided by
@@ -43,9 +45,9 @@ def agreed_correction(y, information, seen, J, axes, shift, P, known, sigma, lea
             for j in range(3):
                 gaps[k, i] += axes[i, j] * seen[k, j]
                 own[i, j] = information[k, i, j] + (least if i == j else 0.0)
-        _derivatives(y[k], D[k])
-        _invert_symmetric(own, noise)
-        _invert(J[k], own)
+        point_by_motion(y[k], 1.0, D[k])
+        invert_symmetric(own, 0.0, noise)
+        invert(J[k], own)
         for i in range(3):
             for j in range(3):
                 B[i, j] = sigma * (axes[i, 0] * own[0, j] + axes[i, 1] * own[1, j] + axes[i, 2] * own[2, j])
@@ -59,9 +61,9 @@ def agreed_correction(y, information, seen, J, axes, shift, P, known, sigma, lea
                 spread[i, j] = noise[i, j]
                 for h in range(6):
                     spread[i, j] += DP[i, h] * D[k, j, h]
-        _invert_symmetric(noise, weight[k])
-        _invert_symmetric(spread, own)
-        agrees[k] = _square(own, gaps[k]) < limit
+        invert_symmetric(noise, 0.0, weight[k])
+        invert_symmetric(spread, 0.0, own)
+        agrees[k] = square(own, gaps[k]) < limit
     change, gap = np.zeros(6), np.empty(3)
     while agrees.sum() >= fewest:
         _solve(known, D, weight, gaps, agrees, change)
@@ -73,9 +75,9 @@ def agreed_correction(y, information, seen, J, axes, shift, P, known, sigma, lea
                 gap[i] = gaps[k, i]
                 for h in range(6):
                     gap[i] -= D[k, i, h] * change[h]
-            square = _square(weight[k], gap)
-            if not square <= most:
-                worst, most = k, square
+            distance = square(weight[k], gap)
+            if not distance <= most:
+                worst, most = k, distance
         if most < limit:
             return change, agrees, True
         agrees[worst] = False
@@ -108,55 +110,6 @@ def drift_roots(points, first, now, turned, density):
 
 
 @helper
-def _derivatives(y, out):
-    """Derivatives (3, 6) of a point y (3,) of a body, in the predicted body's axes, by [θ, τ]; `out` is zero before."""
-    out[0, 1], out[0, 2], out[1, 2] = y[2], -y[1], y[0]
-    out[1, 0], out[2, 0], out[2, 1] = -y[2], y[1], -y[0]
-    out[0, 3] = out[1, 4] = out[2, 5] = 1.0
-
-
-@helper
-def _square(M, v):
-    """``vᵀ M v``."""
-    square = 0.0
-    for i in range(3):
-        square += v[i] * (M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2])
-    return square
-
-
-@helper
-def _invert(M, out):
-    """Inverse of a matrix (3, 3)."""
-    for j in range(3):
-        a, b = (j + 1) % 3, (j + 2) % 3
-        for i in range(3):
-            c, d = (i + 1) % 3, (i + 2) % 3
-            out[i, j] = M[a, c] * M[b, d] - M[a, d] * M[b, c]
-    determinant = M[0, 0] * out[0, 0] + M[0, 1] * out[1, 0] + M[0, 2] * out[2, 0]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] /= determinant
-
-
-@helper
-def _invert_symmetric(M, out):
-    """Inverse of a symmetric positive definite matrix (3, 3), by M = L D Lᵀ."""
-    d0 = M[0, 0]
-    l10, l20 = M[1, 0] / d0, M[2, 0] / d0
-    d1 = M[1, 1] - l10 * M[1, 0]
-    rest = M[2, 1] - l20 * M[1, 0]
-    l21 = rest / d1
-    d2 = M[2, 2] - l20 * M[2, 0] - l21 * rest
-    m20 = l10 * l21 - l20  # of the inverse of L
-    out[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
-    out[1, 0] = out[0, 1] = -l10 / d1 - m20 * l21 / d2
-    out[2, 0] = out[0, 2] = m20 / d2
-    out[1, 1] = 1 / d1 + l21 * l21 / d2
-    out[2, 1] = out[1, 2] = -l21 / d2
-    out[2, 2] = 1 / d2
-
-
-@helper
 def _solve(known, D, weight, gaps, agrees, out):
     """The correction (6,) by the points that agree: the normal equations, solved by their L D Lᵀ."""
     H, WD = known.copy(), np.empty((3, 6))
@@ -171,14 +124,5 @@ def _solve(known, D, weight, gaps, agrees, out):
             out[h] += WD[0, h] * gaps[k, 0] + WD[1, h] * gaps[k, 1] + WD[2, h] * gaps[k, 2]
             for j in range(h + 1):
                 H[h, j] += D[k, 0, h] * WD[0, j] + D[k, 1, h] * WD[1, j] + D[k, 2, h] * WD[2, j]
-    for i in range(6):
-        for j in range(i + 1):
-            for h in range(j):
-                H[i, j] -= H[i, h] * H[j, h] * H[h, h]
-            if j < i:
-                H[i, j] /= H[j, j]
-                out[i] -= H[i, j] * out[j]
-    for i in range(5, -1, -1):
-        out[i] /= H[i, i]
-        for h in range(i + 1, 6):
-            out[i] -= H[h, i] * out[h]
+    factorise(H, 6)
+    solve_factorised(H, 6, out)

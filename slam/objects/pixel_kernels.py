@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.se3 import transform
+from slam.kernels.stereo import by_point
 from slam.runtime.compilation import helper, kernel
 
 _NEIGHBOURS = 8  # cost: features looked at in a window: the nearest ones
 _RIGHT_SIGMAS = 4.0  # standard deviations that a right pixel may be off
-
-
-@helper
-def _into_world(T, v, out):
-    """A direction in world axes."""
-    for i in range(3):
-        out[i] = T[i, 0] * v[0] + T[i, 1] * v[1] + T[i, 2] * v[2]
 
 
 @kernel
@@ -74,14 +69,12 @@ def information_in_world(points, usable, J, measured, T_world_left, sigma):
     out, A, dof = np.empty((len(points), 3)), np.zeros((len(points), 3, 3)), np.zeros(len(points), np.int8)
     g = np.empty(3)
     for n in range(len(points)):
-        _into_world(T_world_left, points[n], out[n])
-        for i in range(3):
-            out[n, i] += T_world_left[i, 3]
+        transform(T_world_left, points[n], out[n])
         if not usable[n]:
             continue
         dof[n] = 2 if np.isnan(measured[n, 2]) else 3
         for k in range(dof[n]):
-            _into_world(T_world_left, J[n, k], g)
+            by_point(J[n, k], T_world_left, g)
             for i in range(3):
                 for j in range(3):
                     A[n, i, j] += g[i] * g[j] / (sigma * sigma)
@@ -172,7 +165,7 @@ def continue_tracks(
 def _pixel_deviations(J, T_world_left, P, more, sigma, g, out):
     """Deviations (3,) of the pixels (uL, vL, uR) of a point that is not known exactly; `g` (3,) is overwritten."""
     for i in range(3):
-        _into_world(T_world_left, J[i], g)
+        by_point(J[i], T_world_left, g)
         square = sigma * sigma
         for j in range(3):
             for k in range(3):

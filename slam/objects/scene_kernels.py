@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import factorise, solve_factorised, square
+from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import helper, kernel
 
 _CELLS = 2**12  # more than there are windows along an axis
@@ -20,18 +22,15 @@ _SPREAD = 0x1E3779B97F4A7C15  # numerics: an odd number that spreads codes over 
 def normal_equations(points, d, W, lag):
     """Each track's Λ (N, 21), η (N, 6), and dᵀ W d (N,), of displacements d with information W at `points`."""
     n = len(d)
-    L, eta, dWd = np.empty((n, 21)), np.zeros((n, 6)), np.zeros(n)
-    J, WJ = np.zeros((3, 6)), np.empty((3, 6))
+    L, eta, dWd = np.empty((n, 21)), np.zeros((n, 6)), np.empty(n)
+    J, WJ = np.empty((3, 6)), np.empty((3, 6))
     for m in range(n):
-        x, y, z, t = points[m, 0], points[m, 1], points[m, 2], lag[m]
-        J[0, 1], J[0, 2], J[1, 2] = t * z, -t * y, t * x
-        J[1, 0], J[2, 0], J[2, 1] = -t * z, t * y, -t * x
-        J[0, 3] = J[1, 4] = J[2, 5] = t
+        point_by_motion(points[m], lag[m], J)
         for i in range(3):
             for j in range(6):
                 WJ[i, j] = W[m, i, 0] * J[0, j] + W[m, i, 1] * J[1, j] + W[m, i, 2] * J[2, j]
                 eta[m, j] += WJ[i, j] * d[m, i]
-            dWd[m] += d[m, i] * (W[m, i, 0] * d[m, 0] + W[m, i, 1] * d[m, 1] + W[m, i, 2] * d[m, 2])
+        dWd[m] = square(W[m], d[m])
         k = 0
         for i in range(6):
             for j in range(i + 1):
@@ -69,8 +68,7 @@ def common_motion(L, eta, dWd, rows, prior, pull, soft, sharp):
         changed = False
         for m in range(len(dWd)):
             if rows[m]:
-                square = _square(L[m], eta[m], dWd[m], motion, products)
-                share = min(1.0, pull / max(square, 1e-9))
+                share = min(1.0, pull / max(_square(L[m], eta[m], dWd[m], motion, products), 1e-9))
                 changed = changed or share < 1.0 or weight[m] < 1.0
                 weight[m] = np.sqrt(share) if k < soft else share
         if not changed:  # nor would it in the next round
@@ -121,15 +119,13 @@ def _square(L, eta, dWd, motion, products):
 
 @helper
 def _factorise(triangle, prior, out):
-    """A triangle's matrix, with `prior` (6,) on its diagonal, as L D Lᵀ: L below the diagonal of `out`, D on it."""
+    """A triangle's matrix, with `prior` (6,) on its diagonal, through `factorise`."""
     k = 0
     for i in range(6):
         for j in range(i + 1):
-            value = triangle[k] + (prior[i] if i == j else 0.0)
+            out[i, j] = triangle[k] + (prior[i] if i == j else 0.0)
             k += 1
-            for h in range(j):
-                value -= out[i, h] * out[j, h] * out[h, h]
-            out[i, j] = value if i == j else value / out[j, j]
+    factorise(out, 6)
 
 
 @helper
@@ -137,13 +133,7 @@ def _solve(factor, right, out):
     """The solution for a right side (6,), from `_factorise`."""
     for i in range(6):
         out[i] = right[i]
-        for h in range(i):
-            out[i] -= factor[i, h] * out[h]
-    for i in range(6):
-        out[i] /= factor[i, i]
-    for i in range(5, -1, -1):
-        for h in range(i + 1, 6):
-            out[i] -= factor[h, i] * out[h]
+    solve_factorised(factor, 6, out)
 
 
 @helper
@@ -312,12 +302,16 @@ def window_tests(starts, tracks, L, eta, weight, brought, rest, asked, support, 
             if rest[n]:
                 _add_weighted(inside, L[n], weight[n])
                 _add_weighted(told_inside, eta[n], weight[n])
-        outside[:], told_outside[:] = total - inside, told - told_inside
+        for k in range(21):  # expressions of arrays take seconds to compile
+            outside[k] = total[k] - inside[k]
+        for i in range(6):
+            told_outside[i] = told[i] - told_inside[i]
         _factorise(inside, prior, own)
         _factorise(outside, prior, other)
         _solve(own, told_inside, gap)
         _solve(other, told_outside, motion)
-        gap -= motion
+        for i in range(6):
+            gap[i] -= motion[i]
         _times(inside, prior, gap, left)
         _times(outside, prior, gap, right)
         _solve(both, right, motion)

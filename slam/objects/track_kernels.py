@@ -9,49 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import column_times, invert_symmetric, row_times, square, trace, turn, turn_back
+from slam.kernels.se3 import point_by_motion, transform
 from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
 _PART = 1e-6  # numerics: for a part of it
 _LEAST = 1e-12  # numerics: and this for windows that are empty
-
-
-# ---------------------------------------------------------------------------------------------- 3x3 matrices
-
-
-@helper
-def _invert(M, ridge, out):
-    """Inverse of a symmetric matrix with `ridge` on its diagonal, by M = L D Lᵀ."""
-    d0 = M[0, 0] + ridge
-    l10, l20 = M[1, 0] / d0, M[2, 0] / d0
-    d1 = M[1, 1] + ridge - l10 * M[1, 0]
-    rest = M[2, 1] - l20 * M[1, 0]
-    l21 = rest / d1
-    d2 = M[2, 2] + ridge - l20 * M[2, 0] - l21 * rest
-    m20 = l10 * l21 - l20  # of the inverse of L
-    out[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
-    out[1, 0] = out[0, 1] = -l10 / d1 - m20 * l21 / d2
-    out[2, 0] = out[0, 2] = m20 / d2
-    out[1, 1] = 1 / d1 + l21 * l21 / d2
-    out[2, 1] = out[1, 2] = -l21 / d2
-    out[2, 2] = 1 / d2
-
-
-@helper
-def _trace(M):
-    return M[0, 0] + M[1, 1] + M[2, 2]
-
-
-@helper
-def _row_times(M, i, v):
-    """Entry i of M v."""
-    return M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2]
-
-
-@helper
-def _column_times(M, i, v):
-    """Entry i of Mᵀ v."""
-    return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
 
 
 @helper
@@ -64,7 +28,7 @@ def _add(total, M, factor):
 @helper
 def _add_times(total, M, v, factor):
     for i in range(3):
-        total[i] += factor * _row_times(M, i, v)
+        total[i] += factor * row_times(M, i, v)
 
 
 @helper
@@ -72,26 +36,6 @@ def _multiply(A, B, out):
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@helper
-def _turn(R, M, out):
-    """``R M Rᵀ`` of a symmetric M."""
-    for i in range(3):
-        x, y, z = _row_times(M, 0, R[i]), _row_times(M, 1, R[i]), _row_times(M, 2, R[i])
-        for j in range(3):
-            out[i, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2]
-
-
-@helper
-def _turn_back(R, M, out):
-    """``Rᵀ M R`` of a symmetric M."""
-    for i in range(3):
-        x = M[0, 0] * R[0, i] + M[0, 1] * R[1, i] + M[0, 2] * R[2, i]
-        y = M[1, 0] * R[0, i] + M[1, 1] * R[1, i] + M[1, 2] * R[2, i]
-        z = M[2, 0] * R[0, i] + M[2, 1] * R[1, i] + M[2, 2] * R[2, i]
-        for j in range(3):
-            out[i, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]
 
 
 # ---------------------------------------------------------------------------------------------- windows of tracks
@@ -126,11 +70,11 @@ def places_known(position, covariance, rows, T_world_left, farthest):
         n = rows[m]
         for i in range(3):
             away[i] = position[n, i] - T_world_left[i, 3]
-        depth = _column_times(T_world_left, 2, away)
-        if depth > farthest * np.sqrt(_trace(covariance[n])):
+        depth = column_times(T_world_left, 2, away)
+        if depth > farthest * np.sqrt(trace(covariance[n])):
             known[count] = n
             for i in range(2):
-                place[count, i] = _column_times(T_world_left, i, away) / depth
+                place[count, i] = column_times(T_world_left, i, away) / depth
             place[count, 2] = np.log(depth)
             count += 1
     return known[:count], place[:count]
@@ -143,9 +87,9 @@ def leave_window(ids, A, p, dof, older_A, older_b, older_age, slot, memory):
         if ids[n] < 0:
             continue
         leaving = A[n, slot]
-        older_age[n] = memory * (older_age[n] + _trace(older_A[n])) + A.shape[1] * _trace(leaving)
+        older_age[n] = memory * (older_age[n] + trace(older_A[n])) + A.shape[1] * trace(leaving)
         for i in range(3):
-            older_b[n, i] = memory * older_b[n, i] + _row_times(leaving, i, p[n, slot])
+            older_b[n, i] = memory * older_b[n, i] + row_times(leaving, i, p[n, slot])
             for j in range(3):
                 older_A[n, i, j] = memory * older_A[n, i, j] + leaving[i, j]
         leaving[:] = 0.0
@@ -163,9 +107,9 @@ def fit_fixed_points(A, p, anchor, rows, position, covariance):
         for w in range(A.shape[1]):
             _add(total, A[n, w], 1.0)
             _add_times(told, A[n, w], p[n, w], 1.0)
-        _invert(total, _RIDGE * _trace(total) + _LEAST, covariance[n])
+        invert_symmetric(total, _RIDGE * trace(total) + _LEAST, covariance[n])
         for i in range(3):
-            position[n, i] = anchor[n, i] + _row_times(covariance[n], i, told)
+            position[n, i] = anchor[n, i] + row_times(covariance[n], i, told)
 
 
 @kernel
@@ -198,21 +142,21 @@ def constant_velocities(A, p, rows, times, prior):
             _add(M2, Aw, t * t)
             _add_times(b0, Aw, pw, 1.0)
             _add_times(b1, Aw, pw, t)
-        _invert(M0, _RIDGE * _trace(M0) + _LEAST, P0)
+        invert_symmetric(M0, _RIDGE * trace(M0) + _LEAST, P0)
         _multiply(P0, M1, G)
         for i in range(3):
-            told[i] = b1[i] - _column_times(G, i, b0)
+            told[i] = b1[i] - column_times(G, i, b0)
             for j in range(3):
                 S[i, j] = M2[i, j] - (G[0, i] * M1[0, j] + G[1, i] * M1[1, j] + G[2, i] * M1[2, j])
             S[i, i] += prior
-        _invert(S, _RIDGE * _trace(S) + _LEAST, PV[m])
+        invert_symmetric(S, _RIDGE * trace(S) + _LEAST, PV[m])
         for i in range(3):
-            velocity[m, i] = _row_times(PV[m], i, told)
+            velocity[m, i] = row_times(PV[m], i, told)
             test[m] += velocity[m, i] * told[i]
-        _turn(G, PV[m], P[m])
+        turn(G, PV[m], P[m])
         _add(P[m], P0, 1.0)
         for i in range(3):
-            points[m, i] = _row_times(P0, i, b0) - _row_times(G, i, velocity[m])
+            points[m, i] = row_times(P0, i, b0) - row_times(G, i, velocity[m])
     return points, P, velocity, PV, test
 
 
@@ -252,18 +196,18 @@ def displaced(A, p, dof, older_A, older_b, older_age, rows, ages, most_recent):
             if ages[w] < recent:
                 _add(now, A[n, w], 1.0)
                 _add_times(b_now, A[n, w], p[n, w], 1.0)
-                late += ages[w] * _trace(A[n, w])
+                late += ages[w] * trace(A[n, w])
             else:
                 _add(before, A[n, w], 1.0)
                 _add_times(b_before, A[n, w], p[n, w], 1.0)
-                early += ages[w] * _trace(A[n, w])
-        lag[m] = max(early / max(_trace(before), _LEAST) - late / max(_trace(now), _LEAST), 1.0)
-        _invert(now, _PART * _trace(now) + 1e3 * _LEAST, P_now)
-        _invert(before, _PART * _trace(before) + 1e3 * _LEAST, P_before)
+                early += ages[w] * trace(A[n, w])
+        lag[m] = max(early / max(trace(before), _LEAST) - late / max(trace(now), _LEAST), 1.0)
+        invert_symmetric(now, _PART * trace(now) + 1e3 * _LEAST, P_now)
+        invert_symmetric(before, _PART * trace(before) + 1e3 * _LEAST, P_before)
         for i in range(3):
-            d[m, i] = _row_times(P_now, i, b_now) - _row_times(P_before, i, b_before)
+            d[m, i] = row_times(P_now, i, b_now) - row_times(P_before, i, b_before)
         _add(P_now, P_before, 1.0)
-        _invert(P_now, 0.0, W[m])
+        invert_symmetric(P_now, 0.0, W[m])
     return d, W, lag
 
 
@@ -275,12 +219,12 @@ def _into_body(A, p, dof, anchor, history, known, points, turned, there):
     """One track's window in a body's coordinates, into `points` (W, 3), `turned` (W, 3, 3), and `there` (W,)."""
     for w in range(len(dof)):
         T = history[w]
-        x, y, z = p[w, 0] + anchor[0] - T[0, 3], p[w, 1] + anchor[1] - T[1, 3], p[w, 2] + anchor[2] - T[2, 3]
+        away = p[w, 0] + anchor[0] - T[0, 3], p[w, 1] + anchor[1] - T[1, 3], p[w, 2] + anchor[2] - T[2, 3]
         for i in range(3):
-            points[w, i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
+            points[w, i] = column_times(T, i, away)
         there[w] = known[w] and dof[w] > 0
         if there[w]:
-            _turn_back(T, A[w], turned[w])
+            turn_back(T, A[w], turned[w])
         else:
             turned[w] = 0.0
 
@@ -292,22 +236,19 @@ def _mean(points, A, mean):
     for w in range(len(points)):
         _add(total, A[w], 1.0)
         _add_times(told, A[w], points[w], 1.0)
-    _invert(total, _PART * _trace(total) + _LEAST, P)
+    invert_symmetric(total, _PART * trace(total) + _LEAST, P)
     for i in range(3):
-        mean[i] = _row_times(P, i, told)
+        mean[i] = row_times(P, i, told)
 
 
 @helper
 def _square(points, A, mean):
     """χ² of "one fixed point" for a window's points (W, 3) with information (W, 3, 3); `mean` is overwritten."""
     _mean(points, A, mean)
-    square = 0.0
+    total = 0.0
     for w in range(len(points)):
-        x, y, z = points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]
-        square += x * (A[w, 0, 0] * x + A[w, 0, 1] * y + A[w, 0, 2] * z)
-        square += y * (A[w, 1, 0] * x + A[w, 1, 1] * y + A[w, 1, 2] * z)
-        square += z * (A[w, 2, 0] * x + A[w, 2, 1] * y + A[w, 2, 2] * z)
-    return square
+        total += square(A[w], (points[w, 0] - mean[0], points[w, 1] - mean[1], points[w, 2] - mean[2]))
+    return total
 
 
 @kernel
@@ -395,14 +336,12 @@ def squares_from_box(position, covariance, rows, T, lower, upper, reach):
         if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 >= reach**2:
             continue
         for i in range(3):
-            y = _column_times(T, i, offset)
+            y = column_times(T, i, offset)
             inside[i] = y - min(max(y, lower[i]), upper[i])
         for i in range(3):
-            away[i] = _row_times(T, i, inside)
-        _invert(covariance[n], _RIDGE * _trace(covariance[n]) + _LEAST, P)
-        squares[m] = 0.0
-        for i in range(3):
-            squares[m] += away[i] * _row_times(P, i, away)
+            away[i] = row_times(T, i, inside)
+        invert_symmetric(covariance[n], _RIDGE * trace(covariance[n]) + _LEAST, P)
+        squares[m] = square(P, away)
     return squares
 
 
@@ -427,14 +366,14 @@ def improve_members(A, p, anchor, rows, slot, T, local, information):
         for i in range(3):
             away[i] = p[n, slot, i] + anchor[n, i] - T[i, 3]
         for i in range(3):
-            gap[i] = _column_times(T, i, away) - local[n, i]
-        _turn_back(T, A[n, slot], turned)
+            gap[i] = column_times(T, i, away) - local[n, i]
+        turn_back(T, A[n, slot], turned)
         for i in range(3):
-            told[i] = _row_times(turned, i, gap)
+            told[i] = row_times(turned, i, gap)
         _add(information[n], turned, 1.0)
-        _invert(information[n], _RIDGE * _trace(information[n]), P)
+        invert_symmetric(information[n], _RIDGE * trace(information[n]), P)
         for i in range(3):
-            local[n, i] += _row_times(P, i, told)
+            local[n, i] += row_times(P, i, told)
 
 
 @kernel
@@ -453,21 +392,17 @@ def members_ahead(local, information, rows, T, P_body, least):
     own, J, JP = np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 6))
     for m in range(len(rows)):
         y = local[rows[m]]
-        for i in range(3):
-            points[m, i] = _row_times(T, i, y) + T[i, 3]
-        J[:] = 0.0
-        J[0, 1], J[0, 2], J[1, 2] = y[2], -y[1], y[0]
-        J[1, 0], J[2, 0], J[2, 1] = -y[2], y[1], -y[0]
-        J[0, 3] = J[1, 4] = J[2, 5] = 1.0
+        transform(T, y, points[m])
+        point_by_motion(y, 1.0, J)
         for i in range(3):
             for j in range(6):
                 JP[i, j] = 0.0
                 for k in range(6):
                     JP[i, j] += J[i, k] * P_body[k, j]
-        _invert(information[rows[m]], least, own)
+        invert_symmetric(information[rows[m]], least, own)
         for i in range(3):
             for j in range(3):
                 for k in range(6):
                     own[i, j] += JP[i, k] * J[j, k]
-        _turn(T, own, P[m])
+        turn(T, own, P[m])
     return points, P

@@ -1,10 +1,10 @@
 """How functions are compiled by Numba, once on a machine, then they are loaded; how long it takes is counted.
 
 Kernels are called from Python: they let go of the global lock and are cached on disk, in their package's folder or,
-where that is read-only, in the user's cache. Helpers are called from kernels of the same file alone, because Numba
-notices changes in a kernel's own file only. They are always inlined: a call would go to whichever copy of the helper
-the process has got first, its own or that of another kernel, and these are optimised differently. The results would
-depend on whether a kernel was compiled or loaded.
+where that is read-only, in the user's cache. Helpers are called from kernels, of any file that imports them by name:
+what is cached counts only while the sources of all helpers that a kernel calls are what they were. They are always
+inlined: a call would go to whichever copy of the helper the process has got first, its own or that of another kernel,
+and these are optimised differently. The results would depend on whether a kernel was compiled or loaded.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 from slam.errors import ConfigurationError
 from slam.runtime.compile_clock import compile_clock
+from slam.runtime.sources import stamp
 
 try:
     from numba import njit
@@ -51,8 +52,13 @@ disjoint_vector_helper = njit(fastmath=True, pipeline_class=_Disjoint, **_INNER)
 def kernel(function: Callable[..., Any]) -> Any:
     """A compiled function that Python may call; cached where there is a folder for it."""
     try:
-        return njit(cache=True, nogil=True, no_cfunc_wrapper=True, **_NUMPY)(function)
-    except RuntimeError as error:
+        compiled = njit(cache=True, nogil=True, no_cfunc_wrapper=True, **_NUMPY)(function)
+        if compiled is function:  # NUMBA_DISABLE_JIT
+            return function
+        index = compiled._cache._cache_file  # Numba has no public way to say that a kernel depends on other files
+        index._source_stamp = (index._source_stamp, stamp(function, kernel))
+        return compiled
+    except (RuntimeError, AttributeError) as error:
         _LOG.warning("set NUMBA_CACHE_DIR to a folder, or the kernels are compiled in every run: %s", error)
         return njit(nogil=True, no_cfunc_wrapper=True, **_NUMPY)(function)
 

@@ -1,0 +1,143 @@
+"""Linear algebra of small matrices; of symmetric ones only the lower triangle is read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.runtime.compilation import helper
+
+
+@helper
+def factorise(M, n):
+    """``M = L D Lᵀ`` (n, n) in place of its lower triangle: L below the diagonal, D on it.
+
+    ``M_ij ← M_ij − Σ_h<j L_ih L_jh D_h`` and, below the diagonal, ``L_ij = M_ij / D_j``.
+    """
+    for i in range(n):
+        for j in range(i + 1):
+            value = M[i, j]
+            for h in range(j):
+                value -= M[i, h] * M[j, h] * M[h, h]
+            M[i, j] = value if i == j else value / M[j, j]
+
+
+@helper
+def solve_factorised(M, n, v):
+    """``M⁻¹ v`` in place of v (n,), where M has been through `factorise`."""
+    for i in range(n):
+        value = v[i]
+        for h in range(i):
+            value -= M[i, h] * v[h]
+        v[i] = value
+    for i in range(n - 1, -1, -1):
+        value = v[i] / M[i, i]
+        for h in range(i + 1, n):
+            value -= M[h, i] * v[h]
+        v[i] = value
+
+
+@helper
+def invert(M, out):
+    """Inverse (3, 3) of any matrix (3, 3) by its cofactors; returns the determinant."""
+    for j in range(3):
+        a, b = (j + 1) % 3, (j + 2) % 3
+        for i in range(3):
+            c, d = (i + 1) % 3, (i + 2) % 3
+            out[i, j] = M[a, c] * M[b, d] - M[a, d] * M[b, c]
+    determinant = M[0, 0] * out[0, 0] + M[0, 1] * out[1, 0] + M[0, 2] * out[2, 0]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] /= determinant
+    return determinant
+
+
+@helper
+def invert_symmetric(M, ridge, out):
+    """Inverse (3, 3) of a symmetric matrix (3, 3) with `ridge` added to its diagonal, by ``L D Lᵀ``."""
+    d0 = M[0, 0] + ridge
+    l10, l20 = M[1, 0] / d0, M[2, 0] / d0
+    d1 = M[1, 1] + ridge - l10 * M[1, 0]
+    rest = M[2, 1] - l20 * M[1, 0]
+    l21 = rest / d1
+    d2 = M[2, 2] + ridge - l20 * M[2, 0] - l21 * rest
+    m20 = l10 * l21 - l20  # of the inverse of L
+    out[0, 0] = 1 / d0 + l10 * l10 / d1 + m20 * m20 / d2
+    out[1, 0] = out[0, 1] = -l10 / d1 - m20 * l21 / d2
+    out[2, 0] = out[0, 2] = m20 / d2
+    out[1, 1] = 1 / d1 + l21 * l21 / d2
+    out[2, 1] = out[1, 2] = -l21 / d2
+    out[2, 2] = 1 / d2
+
+
+@helper
+def squared_distance(g, C):
+    """``gᵀ C⁻¹ g`` of a vector (3,) by the Cholesky factor of C (3, 3); NaN where C is not positive definite."""
+    a = np.sqrt(C[0, 0])
+    b, c = C[1, 0] / a, C[2, 0] / a
+    d = np.sqrt(C[1, 1] - b * b)
+    e = (C[2, 1] - b * c) / d
+    f = np.sqrt(C[2, 2] - c * c - e * e)
+    x = g[0] / a
+    y = (g[1] - b * x) / d
+    z = (g[2] - c * x - e * y) / f
+    return x * x + y * y + z * z if f > 0.0 else np.nan
+
+
+@helper
+def whitener(C, out):
+    """Inverse (3, 3) of the Cholesky factor of C (3, 3): ``Wᵀ W = C⁻¹``; NaN where C is not positive definite."""
+    a = 1.0 / np.sqrt(C[0, 0])
+    b, c = C[1, 0] * a, C[2, 0] * a
+    e = 1.0 / np.sqrt(C[1, 1] - b * b)
+    g = (C[2, 1] - b * c) * e
+    h = 1.0 / np.sqrt(C[2, 2] - c * c - g * g)
+    out[0, 0], out[1, 1], out[2, 2] = a, e, h
+    out[1, 0], out[2, 1], out[2, 0] = -b * a * e, -g * e * h, (b * g * e - c) * a * h
+    out[0, 1] = out[0, 2] = out[1, 2] = 0.0
+
+
+@helper
+def trace(M):
+    """Trace of a matrix (3, 3)."""
+    return M[0, 0] + M[1, 1] + M[2, 2]
+
+
+@helper
+def row_times(M, i, v):
+    """Entry i of ``M v`` for v (3,)."""
+    return M[i, 0] * v[0] + M[i, 1] * v[1] + M[i, 2] * v[2]
+
+
+@helper
+def column_times(M, i, v):
+    """Entry i of ``Mᵀ v`` for v (3,)."""
+    return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
+
+
+@helper
+def square(M, v):
+    """``vᵀ M v`` for v (3,)."""
+    total = 0.0
+    for i in range(3):
+        total += v[i] * row_times(M, i, v)
+    return total
+
+
+@helper
+def turn(R, M, out):
+    """``R M Rᵀ`` (3, 3) of a symmetric M, of which all is read."""
+    for i in range(3):
+        x, y, z = row_times(M, 0, R[i]), row_times(M, 1, R[i]), row_times(M, 2, R[i])
+        for j in range(3):
+            out[i, j] = x * R[j, 0] + y * R[j, 1] + z * R[j, 2]
+
+
+@helper
+def turn_back(R, M, out):
+    """``Rᵀ M R`` (3, 3) of a symmetric M, of which all is read."""
+    for i in range(3):
+        x = M[0, 0] * R[0, i] + M[0, 1] * R[1, i] + M[0, 2] * R[2, i]
+        y = M[1, 0] * R[0, i] + M[1, 1] * R[1, i] + M[1, 2] * R[2, i]
+        z = M[2, 0] * R[0, i] + M[2, 1] * R[1, i] + M[2, 2] * R[2, i]
+        for j in range(3):
+            out[i, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]

@@ -1,0 +1,83 @@
+"""A kernel is compiled again where a helper in another file has changed, and loaded where nothing has."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from slam.runtime.sources import stamp
+
+ROOT = Path(__file__).parents[3]
+
+HELPERS = """
+from slam.runtime.compilation import helper
+{number}
+@helper
+def _deeper(x):
+    return {factor} * x
+@helper
+def scaled(x):
+    return _deeper(x)
+"""
+CALLER = """
+from slam.kernels.probe import NUMBER, scaled
+from slam.runtime.compilation import kernel
+@kernel
+def times(x):
+    return scaled(x) + NUMBER
+"""
+ASK = """
+from slam.tracking.probe_kernels import times
+print(times(10.0), sum(times.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A copy of what kernels need, with a kernel in one room that calls a helper in another."""
+    for room in ("runtime", "kernels", "tracking"):
+        shutil.copytree(ROOT / "slam" / room, tmp_path / "slam" / room, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "slam/__init__.py").touch()
+    shutil.copy(ROOT / "slam/errors.py", tmp_path / "slam/errors.py")
+    (tmp_path / "slam/tracking/__init__.py").write_text("")
+    (tmp_path / "slam/tracking/probe_kernels.py").write_text(CALLER)
+    return tmp_path
+
+
+def result(package: Path, factor: float, number: str, **variables: str) -> tuple[float, int]:
+    """What the kernel gives with such helpers in a new process, and how often it was loaded from the cache."""
+    (package / "slam/kernels/probe.py").write_text(HELPERS.format(factor=factor, number=f"NUMBER = {number}"))
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", **variables}
+    run = [sys.executable, "-c", ASK]
+    out = subprocess.run(run, env=environment, cwd=package, capture_output=True, text=True, check=True).stdout.split()
+    return float(out[0]), int(out[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["in_tree", "cache_dir"])
+def test_a_change_of_a_helper_in_another_file_compiles_its_callers_again(package, where):
+    folder = {} if where == "in_tree" else {"NUMBA_CACHE_DIR": str(package / "cache")}
+    assert result(package, 2.0, "1.0", **folder) == (21.0, 0)
+    assert result(package, 2.0, "1.0", **folder) == (21.0, 1)
+    assert result(package, 3.0, "1.0", **folder) == (31.0, 0)
+    assert result(package, 3.0, "1.5", **folder) == (31.5, 0)
+    assert result(package, 3.0, "1.5", **folder) == (31.5, 1)
+
+
+def test_a_stamp_covers_helpers_of_helpers_and_numbers(monkeypatch):
+    from slam.kernels import se3, stereo
+    from slam.runtime import sources
+
+    read = []
+    monkeypatch.setattr(sources, "_digest", lambda file, module: read.append(module) or module)
+    before = stamp(stereo.residual.py_func)
+    assert set(read) == {"slam.kernels.stereo", "slam.kernels.linear"}
+    monkeypatch.setattr(stereo, "NEAREST", 2 * stereo.NEAREST)
+    assert stamp(stereo.residual.py_func) != before
+    assert stamp(se3.exp.py_func) == stamp(se3.exp.py_func) != before
