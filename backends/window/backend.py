@@ -172,10 +172,10 @@ class WindowBackend:
         R = s.poses[-1][:3, :3] if len(s.poses) else np.eye(3)
         information = np.linalg.inv(covariances)
         new = Landmarks(
-            np.array(ids, np.int64), np.array(positions, float), R.T @ covariances @ R, np.array(covariances, float),
+            np.array(ids, np.int64), s.serials + np.arange(len(ids)), np.array(positions, float), R.T @ covariances @ R, np.array(covariances, float),
             np.full(len(ids), -1), np.array(positions, float), 0.5 * (information + np.swapaxes(information, 1, 2)),
         )  # fmt: skip
-        self._state = s.with_landmarks(s.landmarks.joined(new))
+        self._done(_with(s, new), ("insert", np.array(ids), positions.copy(), covariances.copy()))
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
@@ -345,10 +345,14 @@ def _with_new(s: State, ids: IdArray, local: Array, covariances: Array) -> State
     turn = s.poses[s.solved][:3, :3].T @ R
     n = len(ids)
     new = Landmarks(
-        np.array(ids, np.int64), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
+        np.array(ids, np.int64), s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
         0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
     )  # fmt: skip
-    return s.with_landmarks(s.landmarks.joined(new))
+    return _with(s, new)
+
+
+def _with(s: State, new: Landmarks) -> State:
+    return replace(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
 
 
 def _placed(s: State, points: IndexArray, local: Array, covariances: Array) -> Places:

@@ -14,6 +14,7 @@ class WindowConfig:
     Attributes:
         poses: number of poses whose measurements are kept and linearised again with every frame.
         reference: frames after which another pose becomes the one that the marginal prior is relative to.
+        lag: least number of poses that are revised with what later frames measure; older ones are final.
         landmarks: most landmarks that keep their covariance with the poses once the first pose that saw them has left.
 
     Raises:
@@ -22,8 +23,9 @@ class WindowConfig:
 
     poses: int = 8
     reference: int = 10
+    lag: int = 50
     landmarks: int = 150
 
     def __post_init__(self) -> None:
-        ranges = {"poses": (3, 10**3), "reference": (1, 10**6), "landmarks": (0, 10**5)}
+        ranges = {"poses": (3, 10**3), "reference": (1, 10**6), "lag": (0, 10**5), "landmarks": (0, 10**5)}
         require_not_negative(self, ranges, "window")

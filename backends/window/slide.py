@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from backends.window.config import WindowConfig
+from backends.window.past import Left
 from backends.window.problem import motion_between, problem
 from backends.window.state import State
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.window.marginal import marginalised
+from slam.window.marginal import Conditional, marginalised
 from slam.window.problem import Camera
 
 
@@ -56,7 +57,9 @@ def slid(s: State, camera: Camera, models: EstimatorModels, config: WindowConfig
     information = np.where(keeps[:, None, None], w.information, 0.0)
     w = replace(w, information=information)
     joining = np.flatnonzero(joins[part.points])
-    prior, _, cost = marginalised(w, leaving, ends[s.prior.points], joining)
+    ending = ends[s.prior.points]
+    prior, conditional, cost = marginalised(w, leaving, ending, joining)
+    past = s.past.with_one(_left(s, leaving, part.points[prior.points], s.prior.points[ending], conditional))
     stays = ~absorbed_row & (rows.pose != leaving)
     free = marks.information.copy()
     free[joins | ends] = 0.0
@@ -64,10 +67,19 @@ def slid(s: State, camera: Camera, models: EstimatorModels, config: WindowConfig
         s, frames=np.delete(s.frames, leaving), stamps=np.delete(s.stamps, leaving),
         poses=np.delete(s.poses, leaving, axis=0), covariance=_without(s.covariance, leaving),
         rows=_earlier(rows.select(stays), leaving), places=_earlier(places.select(~absorbed_place), leaving),
-        prior=replace(prior, points=part.points[prior.points]), cost=s.cost - cost,
+        prior=replace(prior, points=part.points[prior.points]), cost=s.cost - cost, past=past,
         landmarks=replace(marks, information=free), solved=s.solved - (s.solved > leaving),
     )  # fmt: skip
     return _compact(s)
+
+
+def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditional: Conditional) -> Left:
+    """The record of what leaves."""
+    marks, stay = s.landmarks, np.arange(len(s.frames)) != leaving
+    return Left(
+        int(s.frames[leaving]), s.poses[leaving], marks.serial[ended], marks.position[ended], s.frames[stay],
+        s.poses[stay], marks.serial[stayed], marks.position[stayed], conditional.mean, conditional.gain,
+    )  # fmt: skip
 
 
 def _without_oldest(

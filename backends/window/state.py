@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from backends.window.past import Past
 from slam.data import IdArray, IndexArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
@@ -19,6 +20,7 @@ class Landmarks:
 
     Attributes:
         ids: (S,), −1 of those that were removed.
+        serial: number of each in the order of their coming (S,); an id may come back, a serial number not.
         position: in world coordinates (S, 3) [m].
         local: covariance (S, 3, 3) [m²] in the coordinates of the newest pose that was solved for.
         world: covariance (S, 3, 3) [m²] in world coordinates.
@@ -28,6 +30,7 @@ class Landmarks:
     """
 
     ids: IdArray
+    serial: IdArray
     position: Array
     local: Array
     world: Array
@@ -42,7 +45,7 @@ class Landmarks:
     def none(cls) -> Landmarks:
         """No landmark."""
         three, nine = np.zeros((0, 3)), np.zeros((0, 3, 3))
-        return cls(np.zeros(0, np.int64), three, nine, nine, np.zeros(0, np.int64), three, nine)
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), three, nine, nine, np.zeros(0, np.int64), three, nine)
 
     def joined(self, other: Landmarks) -> Landmarks:
         """These and others."""
@@ -95,6 +98,8 @@ class State:
         prior: what left the window says of its poses but the newest, and of landmarks.
         cost: sum of squares at the estimate.
         landmarks: the map.
+        past: poses that have left the window and are still revised.
+        serials: number of landmarks so far.
         contradicted: updates in succession in which most observations agreed on another pose than was expected.
     """
 
@@ -109,6 +114,8 @@ class State:
     prior: RelativePrior
     cost: float
     landmarks: Landmarks = field(default_factory=Landmarks.none)
+    past: Past = field(default_factory=Past)
+    serials: int = 0
     contradicted: int = 0
 
     @classmethod
@@ -119,7 +126,3 @@ class State:
             none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), 0, 0, Rows.none(), Places.none(),
             RelativePrior.none(), 0.0,
         )  # fmt: skip
-
-    def with_landmarks(self, landmarks: Landmarks) -> State:
-        """With another map."""
-        return replace(self, landmarks=landmarks)

@@ -62,7 +62,7 @@ def marginalised(
     L = _root(H[np.ix_(gone, gone)])
     W, v = solve_triangular(L, H[np.ix_(gone, ~gone)], trans="T"), solve_triangular(L, e.b[gone], trans="T")
     information, vector = H[np.ix_(~gone, ~gone)] - W.T @ W, e.b[~gone] - W.T @ v
-    conditional = Conditional(solve_triangular(L, v), solve_triangular(L, W))
+    conditional = _in_world(solve_triangular(L, v), solve_triangular(L, W), e.E[w.prior.points], points)
 
     members, poses = w.prior.points[~points], np.delete(w.poses, pose, axis=0)
     D, n = len(members), len(information)
@@ -91,6 +91,18 @@ def marginalised(
         members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, 0.5 * (information + information.T), vector
     )
     return prior, conditional, e.cost
+
+
+def _in_world(mean: Array, gain: Array, E: Array, leaving: BoolArray) -> Conditional:
+    """The conditional of changes in the world, by that of chart coordinates."""
+    gone, stay = int(leaving.sum()), int((~leaving).sum())
+    g, s = 3 * gone, 3 * stay
+    mean, gain = mean.copy(), gain.copy()
+    back = np.linalg.inv(E[~leaving])
+    gain[:, :s] = np.einsum("gni,nij->gnj", gain[:, :s].reshape(-1, stay, 3), back).reshape(-1, s)
+    mean[:g] = (E[leaving] @ mean[:g].reshape(gone, 3, 1)).ravel()
+    gain[:g] = (E[leaving] @ gain[:g].reshape(gone, 3, -1)).reshape(g, -1)
+    return Conditional(mean, gain)
 
 
 def _with_joined(w: Window, joining: IndexArray) -> Window:

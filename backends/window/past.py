@@ -1,0 +1,69 @@
+"""Poses that have left the window: what later frames measure still moves them, as a smoother would."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.data import IdArray, IndexArray
+from slam.geometry.se3 import Array, exp, inverse, log
+
+
+@dataclass(frozen=True, eq=False)
+class Left:
+    """A pose that left the window, and landmarks that left the prior with it, given all that stayed.
+
+    Attributes:
+        frame, pose: number of its frame, and T_world_left (4, 4) then.
+        serials, points: of landmarks that left (G,), and positions then (G, 3).
+        frames, poses: of poses that stayed (K,), (K, 4, 4).
+        stayed, positions: of landmarks that stayed (D,), (D, 3).
+        mean, gain: changes of landmarks and pose that left are ``mean − gain y`` by those y of what stayed.
+    """
+
+    frame: int
+    pose: Array
+    serials: IdArray
+    points: Array
+    frames: IndexArray
+    poses: Array
+    stayed: IdArray
+    positions: Array
+    mean: Array
+    gain: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Poses that have left, the oldest first."""
+
+    left: tuple[Left, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def with_one(self, one: Left) -> Past:
+        """With one more."""
+        return replace(self, left=(*self.left, one))
+
+    def without(self, count: int) -> Past:
+        """Without the oldest ones."""
+        return replace(self, left=self.left[count:])
+
+    def revised(self, poses: Mapping[int, Array], points: Mapping[int, Array]) -> dict[int, Array]:
+        """Poses (4, 4) by frame, given those of the window by frame and landmarks of its prior by serial number.
+
+        Each pose follows from what stayed when it left, beginning with the one that left last (as in the backward pass
+        of Rauch, Tung and Striebel).
+        """
+        known, where = dict(poses), dict(points)
+        for one in reversed(self.left):
+            moved = [where[serial] for serial in one.stayed.tolist()]
+            y = [(np.array(moved).reshape(-1, 3) - one.positions).ravel()]
+            y.append(log(inverse(one.poses) @ np.array([known[frame] for frame in one.frames.tolist()])).ravel())
+            x = one.mean - one.gain @ np.concatenate(y)
+            known[one.frame] = one.pose @ exp(x[-6:])
+            where.update(zip(one.serials.tolist(), one.points + x[:-6].reshape(-1, 3)))
+        return {one.frame: known[one.frame] for one in self.left}
