@@ -29,7 +29,7 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.tracking.agreement import INFLATION, landmarks_pose
+from slam.window.agreement import INFLATION, landmarks_pose
 
 _PIXELS = 1e5  # guard: no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large

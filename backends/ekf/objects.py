@@ -34,7 +34,7 @@ from slam.geometry.se3 import Array, inverse
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
 from slam.objects.points import MAX_REJECTIONS, MIN_POINTS, Shape, first_frame, points_to_replace, shape_of, with_shape
-from slam.tracking.agreement import INFLATION
+from slam.window.agreement import INFLATION
 
 
 class ObjectFilter:

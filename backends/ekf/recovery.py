@@ -21,7 +21,7 @@ from backends.ekf.covariance import POSE
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.tracking.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
 
 #: The change of [r, φ] (6,) to a pose on which landmarks agree, if there is one.
 Search = Callable[[], "Array | None"]

@@ -10,7 +10,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from backends.smoother import pose_only
 from backends.smoother.belief import Belief
 from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_graph import FactorGraph
@@ -18,10 +17,8 @@ from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
 from backends.smoother.objects import ObjectSmoother
 from backends.smoother.pose_set import PredictedPose
-from backends.smoother.prediction import normalised_innovation, residual_noise, seen_from
-from backends.smoother.recovery import Agreement, agreement, world_covariance
+from backends.smoother.prediction import normalised_innovation
 from backends.smoother.rollback import snapshot
-from backends.smoother.stereo import RectifiedStereo
 from slam.checks import require_guess, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import CopyError, MeasurementError
@@ -34,7 +31,11 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.tracking.agreement import landmarks_pose
+from slam.window import pose_only
+from slam.window.agreement import landmarks_pose
+from slam.window.pose_only import residual_noise, seen_from
+from slam.window.recovery import Agreement, agreement, world_covariance
+from slam.window.stereo import RectifiedStereo
 
 
 class SmootherBackend:

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from backends.smoother import recovery, uncertainty
+from backends.smoother import uncertainty
 from backends.smoother.factor_graph import FactorGraph
 from backends.smoother.pose_set import PoseSet, sound
 from backends.smoother.prediction import (
@@ -26,7 +26,8 @@ from backends.smoother.variables import pose_key
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
-from slam.tracking.agreement import MIN_CONSENSUS
+from slam.window import recovery
+from slam.window.agreement import MIN_CONSENSUS
 
 
 class Belief:

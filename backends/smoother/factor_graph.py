@@ -22,7 +22,7 @@ from backends.smoother.solver import Change, Solver, SolverError
 from backends.smoother.variables import pose_key, thresholds
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, transform
-from slam.tracking.gating import chi_square_gate
+from slam.window.gating import chi_square_gate
 
 #: cost: Poses before the window and all landmarks are read from the solver again once the window's oldest pose has been
 #: revised by so much [m, or sine of an angle].

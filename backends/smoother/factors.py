@@ -12,10 +12,10 @@ import numpy as np
 
 from backends.smoother import motion
 from backends.smoother.landmarks import Known
-from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import pose_key
 from slam.geometry.se3 import Array, hat, nearest_rotation
 from slam.models import EstimatorModels
+from slam.window.stereo import RectifiedStereo
 
 #: cost: Share of its depth to which a point's depth must be known for its linear triangulation to be good enough.
 _WELL_KNOWN = 0.1

@@ -23,7 +23,6 @@ from backends.smoother.objects_window import (
 )
 from backends.smoother.path import Path
 from backends.smoother.pose_set import PoseSet
-from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray, Observations
 from slam.errors import MeasurementError
 from slam.geometry.arrays import isin
@@ -32,6 +31,7 @@ from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations, Sight
 from slam.object_models import ObjectModels
 from slam.objects.points import MAX_REJECTIONS, MIN_POINTS, Shape, first_frame, points_to_replace, shape_of, with_shape
+from slam.window.stereo import RectifiedStereo
 
 _LAG = 4  # frames of a window at least
 _BATCH = 2  # cost: so many frames leave it together: that costs hardly more than for one

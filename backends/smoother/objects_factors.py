@@ -12,10 +12,10 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from backends.smoother import objects_kernels as kernels
-from backends.smoother.stereo import RectifiedStereo
 from slam.data import IndexArray
 from slam.geometry.se3 import Array
 from slam.object_models import ObjectModels
+from slam.window.stereo import RectifiedStereo
 
 
 @dataclass

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backends.smoother import pose_only
 from backends.smoother.objects_factors import first_sigmas, impulse_sigmas, velocities
 from backends.smoother.objects_kernels import FRAME
 from backends.smoother.objects_window import CameraWindow, Window
-from backends.smoother.stereo import RectifiedStereo
 from slam.chi_square import chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array, adjoint, exp, inverse, log, pose, so3_exp, so3_left_jacobian
 from slam.object_models import ObjectModels
 from slam.objects.points import MIN_POINTS
-from slam.tracking.agreement import INFLATION
+from slam.window import pose_only
+from slam.window.agreement import INFLATION
+from slam.window.stereo import RectifiedStereo
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from backends.smoother import objects_kernels as kernels
 from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_kernels import FRAME
-from backends.smoother.pose_kernels import moved
-from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.object_models import ObjectModels
 from slam.objects.points import Shape, drift
+from slam.window.pose_kernels import moved
+from slam.window.stereo import RectifiedStereo
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
 _TURN = 0.01  # a point is seen from elsewhere by no less [rad]; what is less adds up

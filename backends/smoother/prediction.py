@@ -9,12 +9,13 @@ import numpy as np
 from backends.smoother import motion
 from backends.smoother.path import Path
 from backends.smoother.pose_set import PoseSet, PredictedPose
-from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.uncertainty import quadratic
 from slam.data import IndexArray
 from slam.geometry.se3 import Array, points_by_pose
 from slam.models import EstimatorModels
-from slam.tracking.gating import whiteners
+from slam.window.gating import whiteners
+from slam.window.pose_only import seen_from
+from slam.window.stereo import RectifiedStereo
 
 
 def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: float) -> PredictedPose:
@@ -101,28 +102,6 @@ def predict_points(predicted: PredictedPose, points: Array, own: Array, carried:
     """
     local, own = seen_from(predicted.T, points, own)
     return PredictedPoints(predicted, local, own, points_by_pose(local), carried)
-
-
-def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:
-    """Points (M, 3) and their covariances (M, 3, 3) in the coordinates of a camera at T (4, 4)."""
-    R = T[:3, :3]
-    return (points - T[:3, 3]) @ R, R.T @ own @ R
-
-
-def residual_noise(stereo: RectifiedStereo, sigma: float, local: Array, own: Array, z: Array) -> Array:
-    """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
-
-    The landmarks are at `local` (M, 3) in the camera's coordinates, with covariances `own` (M, 3, 3) where all poses
-    are known. Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position,
-    whichever gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
-    """
-    _, J = stereo.project(local)
-    estimated = J @ own @ np.swapaxes(J, 1, 2)
-    _, J = stereo.project(stereo.triangulate(z))
-    measured = J @ own @ np.swapaxes(J, 1, 2)
-    size, other = (np.trace(C, axis1=1, axis2=2) for C in (estimated, measured))
-    smaller = (other > 0) & (other < size)
-    return np.where(smaller[:, None, None], measured, estimated) + sigma**2 * np.eye(3)
 
 
 def normalised_innovation(

@@ -16,9 +16,9 @@ from backends.smoother import landmark_kernels as kernels
 from backends.smoother.landmarks import Landmarks
 from backends.smoother.measurement_log import Measurements
 from backends.smoother.pose_set import PoseSet
-from backends.smoother.stereo import RectifiedStereo
 from slam.data import IndexArray
 from slam.geometry.se3 import Array, points_by_pose
+from slam.window.stereo import RectifiedStereo
 
 #: numerics: Landmarks are refined until a step would lessen their sum of squares by less than this, in at most so many.
 _GAIN, _REFINEMENTS = 0.01, 10

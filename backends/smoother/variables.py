@@ -9,7 +9,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from backends.smoother.stereo import RectifiedStereo
+from slam.window.stereo import RectifiedStereo
 
 _POSE = "x"
 _BALLAST = "z"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.data import IdArray, IndexArray
-from slam.geometry.se3 import Array, exp, inverse, log
+from slam.geometry.se3 import Array, exp, inverse, log, transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,18 @@ class Left:
     mean: Array
     gain: Array
 
+    def moved(self, M: Array) -> Left:
+        """Moved by a rigid motion of the world (4, 4)."""
+        R, g, s = M[:3, :3], self.points.size, self.positions.size
+        mean, gain = self.mean.copy(), self.gain.copy()
+        mean[:g] = (mean[:g].reshape(-1, 3) @ R.T).ravel()
+        gain[:g] = (R @ gain[:g].reshape(len(self.points), 3, gain.shape[1])).reshape(g, gain.shape[1])
+        gain[:, :s] = (gain[:, :s].reshape(len(gain), len(self.stayed), 3) @ R.T).reshape(len(gain), s)
+        return replace(
+            self, pose=M @ self.pose, points=transform(M, self.points), poses=M @ self.poses,
+            positions=transform(M, self.positions), mean=mean, gain=gain,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Past:
@@ -51,6 +63,10 @@ class Past:
     def without(self, count: int) -> Past:
         """Without the oldest ones."""
         return replace(self, left=self.left[count:])
+
+    def moved(self, M: Array) -> Past:
+        """Moved by a rigid motion of the world (4, 4)."""
+        return Past(tuple(one.moved(M) for one in self.left))
 
     def revised(self, poses: Mapping[int, Array], points: Mapping[int, Array]) -> dict[int, Array]:
         """Poses (4, 4) by frame, given those of the window by frame and landmarks of its prior by serial number.

@@ -10,7 +10,8 @@ from backends.window.motion import LONGEST, velocity_sigmas
 from backends.window.state import State
 from slam.data import IndexArray
 from slam.models import EstimatorModels
-from slam.window.problem import Camera, Motion, Places, Rows, Window
+from slam.window.problem import Motion, Places, Rows, Window
+from slam.window.stereo import RectifiedStereo
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ def motion_between(s: State, models: EstimatorModels) -> Motion:
 
 
 def problem(
-    s: State, camera: Camera, models: EstimatorModels, rows: Rows | None = None, places: Places | None = None,
+    s: State, stereo: RectifiedStereo, models: EstimatorModels, rows: Rows | None = None, places: Places | None = None,
     motion: Motion | None = None,
 ) -> Problem:  # fmt: skip
     """The problem of a state; some of its rows, places and motions if they are given."""
@@ -53,7 +54,7 @@ def problem(
     index = np.empty(len(marks), np.intp)
     index[points] = np.arange(len(points))
     window = Window(
-        camera, s.poses, marks.position[points], replace(rows, point=index[rows.point]),
+        stereo, s.poses, marks.position[points], replace(rows, point=index[rows.point]),
         mean=marks.mean[points], information=marks.information[points],
         places=replace(places, point=index[places.point]) if len(places) else places,
         motion=motion_between(s, models) if motion is None else motion,

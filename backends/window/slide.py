@@ -14,10 +14,10 @@ from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 from slam.window.marginal import Conditional, marginalised
-from slam.window.problem import Camera
+from slam.window.stereo import RectifiedStereo
 
 
-def slid(s: State, camera: Camera, models: EstimatorModels, config: WindowConfig) -> State:
+def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: WindowConfig) -> State:
     """The state with one pose less.
 
     The oldest pose is the one that the prior is relative to, and stays for some frames; the next one leaves. Landmarks
@@ -51,7 +51,7 @@ def slid(s: State, camera: Camera, models: EstimatorModels, config: WindowConfig
     motion = motion_between(s, models)
     motion = motion.select((motion.poses == leaving).any(axis=1))
 
-    part = problem(s, camera, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
+    part = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
     w = part.window
     keeps = (member | joins | ends)[part.points]
     information = np.where(keeps[:, None, None], w.information, 0.0)

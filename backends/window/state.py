@@ -49,11 +49,16 @@ class Landmarks:
 
     def joined(self, other: Landmarks) -> Landmarks:
         """These and others."""
-        return Landmarks(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
+        return Landmarks(*(np.concatenate([mine, its]) for mine, its in zip(self.columns, other.columns)))
 
     def select(self, keep: np.ndarray) -> Landmarks:
         """Some of the rows (a mask)."""
-        return Landmarks(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+        return Landmarks(*(column[keep] for column in self.columns))
+
+    @property
+    def columns(self) -> list[np.ndarray]:
+        """All arrays."""
+        return [getattr(self, name) for name in self.__dataclass_fields__]
 
     @cached_property
     def order(self) -> IndexArray:
@@ -126,3 +131,19 @@ class State:
             none, np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 0)), 0, 0, Rows.none(), Places.none(),
             RelativePrior.none(), 0.0,
         )  # fmt: skip
+
+    def revised_poses(self) -> dict[int, Array]:
+        """Poses (4, 4) by frame, of the window and of its past."""
+        poses = dict(zip(self.frames.tolist(), self.poses))
+        marks, members = self.landmarks, self.prior.points
+        points = dict(zip(marks.serial[members].tolist(), marks.position[members]))
+        return {**self.past.revised(poses, points), **poses}
+
+    def settled(self, lag: int) -> tuple[State, dict[int, Array]]:
+        """With a past of at most `lag` frames, once it is half as long again; and the poses (4, 4) that are final now."""
+        surplus = len(self.past) - lag
+        if surplus <= lag // 2:
+            return self, {}
+        poses = self.revised_poses()
+        final = {one.frame: poses[one.frame] for one in self.past.left[:surplus]}
+        return replace(self, past=self.past.without(surplus)), final

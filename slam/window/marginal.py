@@ -53,7 +53,7 @@ def marginalised(
     Raises:
         numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
     """
-    w, count = _with_joined(w, joining), len(w.prior.points) + len(joining)
+    w = _with_joined(w, joining)
     reference = 1 if pose == 0 else 0
     e = linearised(w, reference)
     H = kernels.symmetric(e.H)
@@ -99,9 +99,9 @@ def _in_world(mean: Array, gain: Array, E: Array, leaving: BoolArray) -> Conditi
     g, s = 3 * gone, 3 * stay
     mean, gain = mean.copy(), gain.copy()
     back = np.linalg.inv(E[~leaving])
-    gain[:, :s] = np.einsum("gni,nij->gnj", gain[:, :s].reshape(-1, stay, 3), back).reshape(-1, s)
+    gain[:, :s] = np.einsum("gni,nij->gnj", gain[:, :s].reshape(len(gain), stay, 3), back).reshape(len(gain), s)
     mean[:g] = (E[leaving] @ mean[:g].reshape(gone, 3, 1)).ravel()
-    gain[:g] = (E[leaving] @ gain[:g].reshape(gone, 3, -1)).reshape(g, -1)
+    gain[:g] = (E[leaving] @ gain[:g].reshape(gone, 3, gain.shape[1])).reshape(g, gain.shape[1])
     return Conditional(mean, gain)
 
 

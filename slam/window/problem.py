@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from slam.geometry.arrays import Array, IndexArray
-from slam.geometry.rig import StereoRig
 from slam.window import kernels
+from slam.window.stereo import RectifiedStereo
 
 KNOWN, ELIMINATED = kernels.KNOWN, kernels.ELIMINATED
 
@@ -20,7 +20,7 @@ class Rows:
 
     Attributes:
         pose, point: indices of the pose and the point (M,).
-        z: rectified pixels (uL, vL, uR) (M, 3); uR is NaN where there is no right pixel.
+        z: as `RectifiedStereo.measure` gives them (M, 3) = (uL, vL, uR); uR is NaN where there is no right pixel.
         weight: 1 / σ (M,) [1/px]; 0 for a row that does not count.
     """
 
@@ -31,6 +31,10 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def joined(self, other: Rows) -> Rows:
+        """These and others."""
+        return Rows(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
 
     @classmethod
     def none(cls) -> Rows:
@@ -60,6 +64,10 @@ class Places:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def joined(self, other: Places) -> Places:
+        """These and others."""
+        return Places(*(np.concatenate([mine, its]) for mine, its in zip(vars(self).values(), vars(other).values())))
 
     @classmethod
     def none(cls) -> Places:
@@ -135,28 +143,8 @@ class RelativePrior:
     @classmethod
     def none(cls) -> RelativePrior:
         """Nothing is known."""
-        zero = np.zeros((0, 0))
-        return cls(
-            np.zeros(0, np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.eye(4), np.zeros((0, 4, 4)), zero, zero[0:0].reshape(0)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """The rectified rig that measures.
-
-    Attributes:
-        parameters: `slam.geometry.rig.StereoRig.rectified_parameters` (7,).
-        R_left: rotation (3, 3) from left-camera to rectified axes.
-    """
-
-    parameters: Array
-    R_left: Array
-
-    @classmethod
-    def of(cls, rig: StereoRig) -> Camera:
-        """That of a rig as calibrated; its pixels have to be rectified."""
-        return cls(rig.rectified.rig.rectified_parameters, np.ascontiguousarray(rig.rectified.R_left))
+        none = np.zeros(0, np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.eye(4), np.zeros((0, 4, 4))
+        return cls(*none, np.zeros((0, 0)), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +152,7 @@ class Window:
     """A few poses, many points, and what is known of them.
 
     Attributes:
-        camera: that measures.
+        stereo: the rectified rig that measures.
         poses: T_world_left (K, 4, 4).
         points: in world coordinates (N, 3) [m].
         rows: measurements.
@@ -177,7 +165,7 @@ class Window:
         prior: what is known of the first poses and of some points together.
     """
 
-    camera: Camera
+    stereo: RectifiedStereo
     poses: Array
     points: Array
     rows: Rows

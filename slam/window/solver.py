@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
+from scipy.linalg.lapack import dpotrf, dpotrs
 
-from slam.geometry.arrays import Array, IndexArray
+from slam.geometry.arrays import Array
 from slam.window import kernels
-from slam.window.problem import RelativePrior, Window
+from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
@@ -80,12 +80,12 @@ def linearised(w: Window, centre: int = 0) -> NormalEquations:
         w: the window.
         centre: the pose from which inverse distances of points outside the prior count.
     """
-    n, rows, c = w.unknowns, w.rows, w.camera
+    n, rows = w.unknowns, w.rows
     H, b = np.zeros((n, n)), np.zeros(n)
     cost = _begin_with_prior(w, H, b)
     E = kernels.charts(w.poses, centre, w.points, w.place, w.prior.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
-        c.parameters, c.R_left, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, H, b
+        w.stereo.intrinsics, w.stereo.R_left, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, H, b
     )
     cost += float(squares.sum())
     if len(w.places):

@@ -14,7 +14,7 @@ from slam.geometry.pnp import find_consensus
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.tracking.gating import chi_square_gate
+from slam.window.gating import chi_square_gate
 
 MODELS = EstimatorModels()
 

@@ -13,13 +13,13 @@ from backends.ekf.objects_body import RIGID, CameraBelief, _learnt, advanced, fo
 from backends.ekf.objects_measurement import BodyMeasurement, BodyPoints, change_between, moved
 from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_window import CameraWindow, Prior, _prior_at, opened, with_frame, with_points
-from backends.smoother.stereo import RectifiedStereo
 from slam.evaluation.metrics import chi_square_band, nees
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from slam.object_data import ObjectObservations
 from slam.object_models import ObjectModels
 from slam.objects.points import Shape, drift, first_frame, points_to_replace, shape_of, with_shape
+from slam.window.stereo import RectifiedStereo
 from tests.backends import scenes
 from tests.backends.objects_scene import HANDHELD, KITTI, SIGMA, box_points, box_scene, car_scene, follow, score
 

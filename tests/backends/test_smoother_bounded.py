@@ -12,14 +12,14 @@ from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker
 from backends.smoother.marginal import MarginalPrior
-from backends.smoother.prediction import residual_noise
-from backends.smoother.stereo import RectifiedStereo
 from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Observations
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
+from slam.window.pose_only import residual_noise
+from slam.window.stereo import RectifiedStereo
 from tests.backends.scenes import RIG, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backends.smoother import SmootherBackend, recovery
-from backends.smoother.pose_only import PoseProblem
-from backends.smoother.stereo import RectifiedStereo
+from backends.smoother import SmootherBackend
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
+from slam.window import recovery
+from slam.window.pose_only import PoseProblem
+from slam.window.stereo import RectifiedStereo
 from tests.backends.scenes import RIG, cloud, observe, path, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)

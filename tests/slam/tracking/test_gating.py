@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from slam.chi_square import chi_square_limits
-from slam.tracking.gating import chi_square_gate, squared_distances, whiteners
+from slam.window.gating import chi_square_gate, squared_distances, whiteners
 
 
 def covariances(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Stereo measurements in the rectified rig: what gtsam's stereo factors understand.
+"""Stereo measurements in the rectified rig, in which estimators work.
 
 A measurement is (uL, vL, uR) in rectified pixels, uR shifted so that both cameras share one u0; uR is NaN where there
 is no right pixel. The body frame is the rig's own left camera, the sensor its rectified rig.
@@ -40,6 +40,11 @@ class RectifiedStereo:
     def intrinsics(self) -> Array:
         """Of the rectified rig (7,), as `StereoRig.rectified_parameters`, where both cameras have one u0."""
         return np.array([self.f, self.f, self.u0, self.v0, self.f, self.u0, -self.baseline])
+
+    @cached_property
+    def R_left(self) -> Array:
+        """Rotation (3, 3) from left-camera to rectified axes."""
+        return np.ascontiguousarray(self.rectified_rig.R_left)
 
     @classmethod
     def of(cls, rig: StereoRig) -> RectifiedStereo:

@@ -1,4 +1,4 @@
-"""Compiled loops of `backends.smoother.pose_only`: residuals of one pose, and Gauss-Newton on them."""
+"""Compiled loops of `slam.window.pose_only`: residuals of one pose, and Gauss-Newton on them."""
 
 from __future__ import annotations
 

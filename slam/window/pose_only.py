@@ -1,22 +1,21 @@
-"""The newest pose alone, by robust Gauss-Newton on reprojection errors: where the smoother starts from.
+"""The newest pose alone, by robust Gauss-Newton on reprojection errors: where the estimators of many poses start from.
 
-ISAM2 takes one Gauss-Newton step for all variables together and has no defence against a poor start; so the new pose
-is brought close first, with the landmarks held where they are.
+They take one Gauss-Newton step or two for all variables together and have no defence against a poor start; so the new
+pose is brought close first, with the landmarks held where they are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
-from backends.smoother import pose_kernels as kernels
-from backends.smoother.stereo import RectifiedStereo
 from slam.data import BoolArray
 from slam.geometry.pnp import STEPS
-from slam.geometry.se3 import Array, inverse
-from slam.tracking.gating import chi_square_gate, whiteners
+from slam.geometry.se3 import Array, inverse, log
+from slam.window import pose_kernels as kernels
+from slam.window.gating import chi_square_gate, whiteners
+from slam.window.stereo import RectifiedStereo
 
 _HUBER = 1.5  # whitened residual from which on a measurement's pull no longer grows
 _ROUNDS = 3  # numerics: of solving and gating
@@ -83,10 +82,32 @@ def _whiteners(noise: Array, z: Array) -> Array:
 def _gauss_newton(problem: PoseProblem, whitener: Array, start: Array, used: BoolArray | None) -> Array:
     """Pose by Gauss-Newton with the prediction as prior; with Huber weights where `used` is None."""
     stereo = problem.stereo
-    prior = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ start))
+    prior = log(inverse(problem.predicted) @ start)
     robust = used is None
     counted = np.ones(len(problem.points), bool) if used is None else used
     return np.asarray(kernels.gauss_newton(
         stereo.intrinsics, stereo.rectified_rig.R_left, problem.points, problem.z, whitener, counted,
         problem.information, prior, start, _HUBER if robust else np.inf, STEPS, _CONVERGED,
     ))  # fmt: skip
+
+
+def seen_from(T: Array, points: Array, own: Array) -> tuple[Array, Array]:
+    """Points (M, 3) and their covariances (M, 3, 3) in the coordinates of a camera at T (4, 4)."""
+    R = T[:3, :3]
+    return (points - T[:3, 3]) @ R, R.T @ own @ R
+
+
+def residual_noise(stereo: RectifiedStereo, sigma: float, local: Array, own: Array, z: Array) -> Array:
+    """Covariances (M, 3, 3) of the residuals of measurements (M, 3) for a known pose [px²].
+
+    The landmarks are at `local` (M, 3) in the camera's coordinates, with covariances `own` (M, 3, 3) where all poses
+    are known. Pixel noise and the landmark's own uncertainty, linearised at the estimated or at the measured position,
+    whichever gives the smaller covariance: close to the camera a small error of depth would explain any pixel.
+    """
+    _, J = stereo.project(local)
+    estimated = J @ own @ np.swapaxes(J, 1, 2)
+    _, J = stereo.project(stereo.triangulate(z))
+    measured = J @ own @ np.swapaxes(J, 1, 2)
+    size, other = (np.trace(C, axis1=1, axis2=2) for C in (estimated, measured))
+    smaller = (other > 0) & (other < size)
+    return np.where(smaller[:, None, None], measured, estimated) + sigma**2 * np.eye(3)

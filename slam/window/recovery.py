@@ -1,4 +1,4 @@
-"""What the smoother tries if most observations contradict its prediction.
+"""What an estimator of many poses tries if most observations contradict its prediction.
 
 Then the prediction is probably wrong, not the observations. There are two cases, tried in turn:
 
@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from scipy.special import bdtrc, comb
 
-from backends.smoother import pose_only
 from slam.chi_square import chi_square_limit
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
-from slam.geometry.se3 import Array, inverse
-from slam.tracking.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
-from slam.tracking.gating import squared_distances
+from slam.geometry.se3 import Array, inverse, log
+from slam.window import pose_only
+from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN, share_by_chance
+from slam.window.gating import squared_distances
 
 _LASTING = 3  # updates in succession that contradict the path: one may be at fault itself
 _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is known of it
@@ -84,7 +83,7 @@ def unknown_turn(P: Array) -> bool:
 
 def _seated(problem: pose_only.PoseProblem, there: Array) -> Agreement | None:
     """The solution from the pose on which landmarks agree; None if most do not agree with it after all."""
-    x = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(problem.predicted) @ there))
+    x = log(inverse(problem.predicted) @ there)
     limit = chi_square_limit(6, problem.probability)
     jump = None
     if x @ problem.information @ x > limit:

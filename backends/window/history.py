@@ -1,0 +1,143 @@
+"""The calls of the last frames, so that they can be gone through again with corrected measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from backends.window.state import State
+from backends.window.steps import Steps
+from slam.errors import MeasurementError
+from slam.geometry.se3 import Array, transform
+from slam.window import kernels
+from slam.window.stereo import RectifiedStereo
+
+_EVERY = 25  # cost: frames between two states from which the calls can be repeated
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A call that changed the state: a method of `Steps`, and its arguments."""
+
+    step: str
+    arguments: tuple[Any, ...]
+
+    def corrected(self, correct: Callable[[Array], Array]) -> Call:
+        """With corrected measurements."""
+        if self.step not in ("updated", "added"):
+            return self
+        ids, z, *rest = self.arguments
+        return Call(self.step, (ids, _corrected(z, correct), *rest))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some successive calls, and the state before them."""
+
+    state: State
+    calls: tuple[Call, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """The calls since a state, in parts.
+
+    Attributes:
+        parts: at least one.
+        anchored: whether landmarks were ever known in the world: then nothing may be moved in it.
+    """
+
+    parts: tuple[Part, ...] = field(default_factory=lambda: (Part(State.empty()),))
+    anchored: bool = False
+
+    @property
+    def start(self) -> State:
+        """The state before the first call."""
+        return self.parts[0].state
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the first frame whose pose is not final at the start."""
+        s = self.start
+        return s.past.left[0].frame if len(s.past) else int(s.frames[0]) if len(s.frames) else 0
+
+    def then(self, call: Call, after: State, lag: int) -> History:
+        """With one more call, after which the state is `after`; without calls that are more than `lag` frames old."""
+        last, parts = self.parts[-1], self.parts[:-1]
+        parts = (*parts, replace(last, calls=(*last.calls, call)))
+        begun = last.state.frames[-1] if len(last.state.frames) else -1
+        if after.frames[-1:] >= begun + _EVERY and call.step == "predicted":
+            parts = (*parts, Part(after))
+            while len(parts) > 2 and after.frames[-1] - parts[1].state.frames[-1] >= lag:
+                parts = parts[1:]
+        return History(parts, self.anchored or call.step == "inserted")
+
+    def corrected(self, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> History:
+        """With corrected measurements; landmarks of the state before them move to where they are seen at from now on.
+
+        Raises:
+            MeasurementError: a corrected measurement is not finite.
+        """
+        parts = [replace(part, calls=tuple(call.corrected(correct) for call in part.calls)) for part in self.parts]
+        return replace(self, parts=(replace(parts[0], state=_state_corrected(self.start, stereo, correct)), *parts[1:]))
+
+    def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[State, list[Array]]:
+        """The state after all calls, and all frames' final poses."""
+        s, final = self.start, list(final)
+        for part in self.parts:
+            for call in part.calls:
+                before, s = s, getattr(steps, call.step)(s, *call.arguments)
+                s = s[0] if isinstance(s, tuple) else s
+                settled: dict[int, Array] = {}
+                if call.step == "predicted":
+                    s, settled = s.settled(steps.config.lag)
+                elif s.begun != before.begun:
+                    settled = before.revised_poses()
+                for frame, T in settled.items():
+                    final[frame] = T
+        return s, final
+
+    def moved(self, M: Array) -> History:
+        """With everything moved by a rigid motion of the world (4, 4)."""
+        return replace(self, parts=tuple(replace(part, state=moved(part.state, M)) for part in self.parts))
+
+
+def moved(s: State, M: Array) -> State:
+    """A state moved by a rigid motion of the world (4, 4)."""
+    R, marks = M[:3, :3], s.landmarks
+    marks = replace(marks, position=transform(M, marks.position), world=R @ marks.world @ R.T)
+    return replace(
+        s, poses=M @ s.poses, landmarks=marks, prior=replace(s.prior, T=M @ s.prior.T), past=s.past.moved(M)
+    )
+
+
+def _corrected(z: Array, correct: Callable[[Array], Array]) -> Array:
+    """Measurements (M, 3) as they are corrected; a missing right pixel stays NaN."""
+    out = np.asarray(correct(z), float)
+    if out.shape != z.shape or not (np.isfinite(out) == np.isfinite(z)).all():
+        raise MeasurementError("window: a corrected measurement is not finite")
+    return out
+
+
+def _state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> State:
+    """A state whose measurements are corrected, and whose landmarks are where the newest camera sees them corrected."""
+    if not len(s.frames):
+        return s
+    T, marks = s.poses[-1], s.landmarks
+    local = (marks.position - T[:3, 3]) @ T[:3, :3]
+    z, _ = stereo.project(local)
+    seen = np.isfinite(z).all(axis=1)
+    there = local.copy()
+    there[seen] = stereo.triangulate(_corrected(z[seen], correct))
+    there = np.where(np.isfinite(there), there, local)
+    position = there @ T[:3, :3].T + T[:3, 3]
+    prior, members = s.prior, s.prior.points
+    if len(members):
+        axes = np.ascontiguousarray(np.broadcast_to(np.eye(3), (len(members), 3, 3)))
+        before, after = (kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position))
+        prior = replace(prior, origin=prior.origin + after - before)
+    rows = replace(s.rows, z=_corrected(s.rows.z, correct))
+    return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior)

@@ -1,0 +1,276 @@
+"""The steps of the window back end: functions from a state to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from backends.window import motion
+from backends.window.config import WindowConfig
+from backends.window.problem import problem
+from backends.window.slide import slid
+from backends.window.state import Landmarks, State
+from slam.chi_square import chi_square_limits
+from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
+from slam.errors import MeasurementError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.models import EstimatorModels
+from slam.window import kernels, pose_only
+from slam.window.agreement import landmarks_pose
+from slam.window.problem import Places, RelativePrior, Rows
+from slam.window.recovery import Agreement, agreement, world_covariance
+from slam.window.solver import Solution, solve
+from slam.window.stereo import RectifiedStereo
+
+_SOLVED_AGAIN = 2  # numerics: how often an update is solved again without observations that disagree with the others
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the steps need besides the state.
+
+    Attributes:
+        rig: the cameras.
+        models: noise, priors, motion and gate.
+        config: limits.
+    """
+
+    rig: StereoRig
+    models: EstimatorModels
+    config: WindowConfig
+
+    @cached_property
+    def stereo(self) -> RectifiedStereo:
+        """The rectified rig that measures."""
+        return RectifiedStereo.of(self.rig)
+
+    @cached_property
+    def sigma(self) -> float:
+        """Noise of rectified pixels [px]."""
+        return self.models.pixel_sigma * self.stereo.scale
+
+    def predicted(self, s: State, stamp: float) -> State:
+        """With a pose at `stamp` [s], by the motion model. Where the window is full, a pose leaves it first."""
+        if not len(s.frames):
+            T = self.models.initial_pose
+            sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
+            P, one = np.diag(sigmas**2), np.array([stamp])
+            prior = RelativePrior.of_pose(T, P)
+            return replace(s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior)
+        if len(s.frames) >= self.config.poses:
+            s = slid(s, self.stereo, self.models, self.config)
+        K, t = len(s.frames), s.stamps
+        dt, first = min(stamp - t[-1], motion.LONGEST), bool(s.frames[-1] == s.begun)
+        J = np.zeros((6, 6 * K))
+        if first:
+            T, J[:, -6:], Jw = motion.predict_from_rest(s.poses[-1], dt)
+        else:
+            before = min(t[-1] - t[-2], motion.LONGEST)
+            T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(s.poses[-2], s.poses[-1], before, dt)
+        noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
+        cross = J @ s.covariance
+        own = cross @ J.T + noise
+        P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
+        return replace(
+            s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp),
+            poses=np.concatenate([s.poses, T[None]]), covariance=P,
+        )  # fmt: skip
+
+    def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
+        """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
+        T, marks, rig = s.poses[-1], s.landmarks, self.rig
+        rows = marks.order
+        rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
+        local, own = seen_from_newest(s, rows)
+        by_pose = points_by_pose(local)
+        C = own + by_pose @ between(s, s.solved) @ np.swapaxes(by_pose, 1, 2)
+        uv, J = rig.left.project_with_jacobian(local)
+        S = J @ C @ np.swapaxes(J, 1, 2)
+        S = 0.5 * (S + np.swapaxes(S, 1, 2)) + self.models.pixel_sigma**2 * np.eye(2)
+        return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
+
+    def updated(self, s: State, ids: IdArray, z: Array, guess: Array | None) -> tuple[State, UpdateReport]:
+        """After measurements z (M, 3) of landmarks."""
+        points = s.landmarks.rows_of(ids)
+        if not len(points):
+            return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        try:
+            found = self._agreement(s, points, z, guess)
+            s = replace(s, contradicted=found.contradicted)
+            if not found.used.any():
+                return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids)
+            s, used, nis = self._solved(s, found, points, z)
+        except np.linalg.LinAlgError as error:
+            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"window: the pose cannot be solved for: {error}")
+        return s, UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
+
+    def added(self, s: State, ids: IdArray, z: Array) -> State:
+        """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
+
+        Raises:
+            MeasurementError: one is in the map already, or has no right pixel or no positive depth.
+        """
+        s.landmarks.require_new(ids)
+        local = self.stereo.triangulate(z)
+        bad = ~np.isfinite(local).all(axis=1)
+        if bad.any():
+            raise MeasurementError(f"window: landmark {ids[bad][0]} has no right pixel or no positive depth")
+        back = np.linalg.inv(self.stereo.project(local)[1])
+        s = _with_new(s, ids, local, self.sigma**2 * back @ np.swapaxes(back, 1, 2))
+        points = np.arange(len(s.landmarks) - len(z), len(s.landmarks))
+        return replace(s, rows=s.rows.joined(self._rows(s, points, z)))
+
+    def removed(self, s: State, ids: IdArray) -> State:
+        """Without landmarks; what their measurements say of the poses stays.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
+        left = s.landmarks.ids.copy()
+        left[s.landmarks.rows_of(ids)] = -1
+        return replace(s, landmarks=replace(s.landmarks, ids=left))
+
+    def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
+        """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
+        R = s.poses[-1][:3, :3] if len(s.poses) else np.eye(3)
+        information = np.linalg.inv(covariances)
+        information = 0.5 * (information + np.swapaxes(information, 1, 2))
+        new = Landmarks(
+            ids, s.serials + np.arange(len(ids)), positions, R.T @ covariances @ R, covariances, np.full(len(ids), -1),
+            positions, information,
+        )  # fmt: skip
+        return _with(s, new)
+
+    def placed(self, s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+        """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
+        s = _with_new(s, ids, local, covariances)
+        points = np.arange(len(s.landmarks) - len(ids), len(s.landmarks))
+        return replace(s, places=s.places.joined(_places(s, points, local, covariances)))
+
+    # --- parts of an update ---
+
+    def _rows(self, s: State, points: IndexArray, z: Array) -> Rows:
+        """Measurements from the newest pose."""
+        return Rows(np.full(len(points), len(s.frames) - 1), points, z, np.full(len(points), 1 / self.sigma))
+
+    def _agreement(self, s: State, points: IndexArray, z: Array, guess: Array | None) -> Agreement:
+        """Initial value of the newest pose, and which measurements agree with it."""
+        T, position = s.poses[-1], s.landmarks.position[points]
+        local, own = seen_from_newest(s, points)
+        noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
+        in_world = (s.landmarks.information[points, 0, 0] > 0).any() or s.solved == len(s.frames) - 1
+        information = np.linalg.inv(s.covariance[-6:, -6:] if in_world else between(s, s.solved))
+        one = pose_only.PoseProblem(
+            self.stereo, position, z, noise, T, information, self.models.gate_probability
+        )
+
+        def search() -> Array | None:
+            rectified = self.stereo.rectified_rig
+            rows = z + np.array([0.0, 0.0, self.stereo.doffs])
+            turned = T @ rectified.T_left_rectified
+            found = landmarks_pose(rectified.rig, position, rows, self.models, turned, int(s.frames[-1]))
+            return None if found is None else found @ inverse(rectified.T_left_rectified)
+
+        return agreement(one, T if guess is None else guess, search, s.contradicted, lost=False)
+
+    def _solved(self, s: State, found: Agreement, points: IndexArray, z: Array) -> tuple[State, BoolArray, float]:
+        """The state after an update, which observations were used, and their NIS."""
+        used, T = found.used.copy(), found.T
+        if found.jump is not None:
+            s = _restarted(s, found.T, points)
+        start = replace(s, poses=np.concatenate([s.poses[:-1], T[None]]))
+        limits = chi_square_limits(2 + np.isfinite(z[:, 2]), self.models.gate_probability)
+        for again in range(_SOLVED_AGAIN + 1):
+            tried = replace(start, rows=s.rows.joined(self._rows(s, points[used], z[used])))
+            p = problem(tried, self.stereo, self.models)
+            solution = solve(p.window)
+            local, world = solution.point_covariances(len(s.frames) - 1)
+            at = np.searchsorted(p.points, points[used])
+            distances = kernels.left_out_distances(
+                self.stereo.intrinsics, self.stereo.R_left, solution.window.poses[-1], solution.window.points[at],
+                z[used], local[at], self.sigma,
+            )  # fmt: skip
+            bad = distances > limits[used]
+            if not bad.any() or again == _SOLVED_AGAIN:
+                break
+            used[np.flatnonzero(used)[bad]] = False
+            if not used.any():
+                raise np.linalg.LinAlgError("no observation agrees with the others")
+        nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
+        return _after(tried, solution, p.points, local, world, points[used]), used, nis
+
+
+def seen_from_newest(s: State, rows: IndexArray) -> tuple[Array, Array]:
+    """Landmarks in the newest camera's coordinates (M, 3), and covariances (M, 3, 3) for a known last solved pose."""
+    T, marks = s.poses[-1], s.landmarks
+    turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
+    return (marks.position[rows] - T[:3, 3]) @ T[:3, :3], turn @ marks.local[rows] @ turn.T
+
+
+def between(s: State, earlier: int) -> Array:
+    """Covariance (6, 6) of the newest pose relative to another one of the window, both perturbed on the right."""
+    if earlier == len(s.frames) - 1:
+        return np.zeros((6, 6))
+    i = 6 * earlier
+    A = adjoint(inverse(s.poses[-1]) @ s.poses[earlier])
+    P, cross = s.covariance, A @ s.covariance[i : i + 6, -6:]
+    return P[-6:, -6:] + A @ P[i : i + 6, i : i + 6] @ A.T - cross - cross.T
+
+
+def _with(s: State, new: Landmarks) -> State:
+    return replace(s, landmarks=s.landmarks.joined(new), serials=s.serials + len(new))
+
+
+def _with_new(s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+    """With new landmarks at `local` (M, 3) in the newest camera."""
+    T, n = s.poses[-1], len(ids)
+    R = T[:3, :3]
+    by_pose = R @ points_by_pose(local)
+    world = R @ covariances @ R.T + by_pose @ s.covariance[-6:, -6:] @ np.swapaxes(by_pose, 1, 2)
+    turn = s.poses[s.solved][:3, :3].T @ R
+    return _with(s, Landmarks(
+        ids, s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
+        0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
+    ))  # fmt: skip
+
+
+def _places(s: State, points: IndexArray, local: Array, covariances: Array) -> Places:
+    """Landmarks `points` at `local` (M, 3) in the newest camera, with covariances (M, 3, 3)."""
+    T = s.poses[-1]
+    world = local @ T[:3, :3].T + T[:3, 3]
+    basis, _ = kernels.relative_charts(T, world)
+    axes = np.ascontiguousarray(np.broadcast_to(T[:3, :3], (len(local), 3, 3)))
+    origin, D, _ = kernels.chart_changes(T, world, basis, axes)
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(D @ covariances @ np.swapaxes(D, 1, 2))), 1, 2)
+    return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))
+
+
+def _restarted(s: State, T: Array, points: IndexArray) -> State:
+    """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
+    P = world_covariance(s.covariance[-6:, -6:])
+    local, own = seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
+    turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
+    one = replace(
+        s, frames=s.frames[-1:], stamps=s.stamps[-1:], poses=T[None], covariance=P, solved=0, begun=int(s.frames[-1]),
+        rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P), cost=0.0, past=s.past.without(len(s.past)),
+        landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
+    )  # fmt: skip
+    return replace(one, places=_places(one, points, local, own))
+
+
+def _after(
+    s: State, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray
+) -> State:
+    """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
+    marks, w = s.landmarks, solution.window
+    there = replace(s, poses=w.poses, covariance=solution.pose_covariance)
+    h, own = seen_from_newest(there, np.arange(len(marks)))
+    by_pose = points_by_pose(h)
+    own += by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
+    position, whole, last = marks.position.copy(), marks.world.copy(), marks.last.copy()
+    position[points], own[points], whole[points], last[seen] = w.points, local, world, s.frames[-1]
+    marks = replace(marks, position=position, local=own, world=whole, last=last)
+    return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)
