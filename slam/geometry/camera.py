@@ -161,28 +161,37 @@ class PinholeCamera:
         """
         if not self.has_distortion:
             return ab, None
-        distort = _distort_equidistant if self.model == "equidistant" else _distort_radtan
-        if np.isfinite(self._radius_limit):
-            with np.errstate(invalid="ignore"):
-                folded = np.hypot(ab[:, 0], ab[:, 1]) > self._radius_limit
-            ab = np.where(folded[:, None], np.nan, ab)
-        return distort(ab, np.asarray(self.distortion), jacobian)
+        if self.model == "equidistant":
+            return _distort_equidistant(ab, np.asarray(self.distortion), jacobian)
+        from slam.geometry import lens_kernels
+
+        distorted, D = lens_kernels.distort(ab, self._coefficients, self._radius_limit, jacobian)
+        return distorted, D if jacobian else None
+
+    @cached_property
+    def _coefficients(self) -> Array:
+        """Of the Brown-Conrady model (8,), those that are not given are zero."""
+        return np.array([*self.distortion, *[0.0] * (8 - len(self.distortion))])
 
     @cached_property
     def _radius_limit(self) -> float:
         """Undistorted radius up to which the radial distortion grows with the radius."""
         if self.model == "equidistant":
             return np.inf
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients
         r = np.linspace(0, 5, 2001)
-        distorted, _ = _distort_radtan(np.stack([r, 0 * r], axis=1), _without_tangential(self.distortion), False)
-        falling = np.diff(distorted[:, 0]) <= 0
+        r2 = r * r
+        distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        falling = np.diff(distorted) <= 0
         return float(r[np.argmax(falling)]) if falling.any() else np.inf
 
     def _undistort(self, target: Array) -> Array:
         """Invert `_distort`; NaN where no ray leads to the pixel."""
         if self.model == "equidistant":
             return _undistort_equidistant(target, np.asarray(self.distortion))
-        return _undistort_radtan(target, np.asarray(self.distortion), self._radius_limit)
+        from slam.geometry import lens_kernels
+
+        return np.asarray(lens_kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
 
 
 def _floats(what: str, values: ArrayLike) -> Array:
@@ -195,32 +204,6 @@ def _floats(what: str, values: ArrayLike) -> Array:
         return np.array(values, float)
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{what}: no numbers") from None
-
-
-def _without_tangential(coefficients: tuple[float, ...]) -> Array:
-    """Brown-Conrady coefficients with p1 = p2 = 0."""
-    out = np.array(coefficients)
-    out[2:4] = 0
-    return out
-
-
-def _undistort_radtan(target: Array, coefficients: Array, radius_limit: float) -> Array:
-    """Newton steps from the distorted coordinates; what does not converge is NaN."""
-    ab = target.copy()
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        for _ in range(_UNDISTORT_ITERATIONS):
-            distorted, D = _distort_radtan(ab, coefficients, True)
-            assert D is not None
-            residual = distorted - target
-            det = D[:, 0, 0] * D[:, 1, 1] - D[:, 0, 1] * D[:, 1, 0]
-            step_a = (D[:, 1, 1] * residual[:, 0] - D[:, 0, 1] * residual[:, 1]) / det
-            step_b = (D[:, 0, 0] * residual[:, 1] - D[:, 1, 0] * residual[:, 0]) / det
-            ab -= np.stack([step_a, step_b], axis=1)
-            largest = np.maximum(np.abs(step_a), np.abs(step_b))
-            if not (largest > _UNDISTORT_TOLERANCE).any():  # NaN rows never converge and need not
-                break
-        good = (largest < 1e-9) & (np.hypot(ab[:, 0], ab[:, 1]) <= radius_limit)
-    return np.where(good[:, None], ab, np.nan)
 
 
 def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
@@ -241,34 +224,6 @@ def _undistort_equidistant(target: Array, coefficients: Array) -> Array:
     theta = np.where(good, theta, np.nan)
     near = theta_d < 1e-8
     return target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, theta_d))[:, None]
-
-
-def _distort_radtan(ab: Array, coefficients: Array, jacobian: bool) -> tuple[Array, Array | None]:
-    """Brown-Conrady distortion with up to three radial, two tangential and three rational coefficients."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
-    a, b = ab[:, 0], ab[:, 1]
-    r2 = a * a + b * b
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = numerator / denominator
-    out = np.stack(
-        [
-            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
-        ],
-        axis=1,
-    )
-    if not jacobian:
-        return out, None
-    d_numerator = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    d_denominator = k4 + r2 * (2 * k5 + r2 * 3 * k6)
-    d_radial = 2 * (d_numerator - radial * d_denominator) / denominator  # d radial / d a = d_radial · a
-    D = np.empty((len(ab), 2, 2))
-    D[:, 0, 0] = radial + a * a * d_radial + 2 * p1 * b + 6 * p2 * a
-    D[:, 0, 1] = a * b * d_radial + 2 * p1 * a + 2 * p2 * b
-    D[:, 1, 0] = D[:, 0, 1]
-    D[:, 1, 1] = radial + b * b * d_radial + 6 * p1 * b + 2 * p2 * a
-    return out, D
 
 
 def _distort_equidistant(ab: Array, coefficients: Array, jacobian: bool) -> tuple[Array, Array | None]:

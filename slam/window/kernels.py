@@ -626,10 +626,58 @@ def chart_changes(T, points, basis, E):
 
 
 @kernel
-def symmetric(H):
-    """A symmetric matrix (n, n) by its lower triangle."""
-    out = np.empty_like(H)
-    for i in range(len(H)):
+def schur_complement(H, b, gone, stay):
+    """Marginalise some unknowns of ``H x = b``.
+
+    Args:
+        H: information (n, n), lower triangle.
+        b: (n,).
+        gone, stay: which unknowns leave (g,), ascending, and which stay (s,), in the order wanted.
+
+    Returns:
+        ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs`` (g, s);
+        NaN where H_gg is not positive definite.
+    """
+    g, s = len(gone), len(stay)
+    L, W, v = np.empty((g, g)), np.empty((g, s)), np.empty(g)
+    for i in range(g):
         for j in range(i + 1):
-            out[i, j] = out[j, i] = H[i, j]
-    return out
+            L[i, j] = H[gone[i], gone[j]]
+        L[i, i] *= 1.0 + 1e-13  # numerics: keeps what nothing measures positive
+        v[i] = b[gone[i]]
+        for j in range(s):
+            W[i, j] = H[gone[i], stay[j]] if gone[i] >= stay[j] else H[stay[j], gone[i]]
+    for i in range(g):  # Cholesky's factor, and L⁻¹ times the rest
+        for j in range(i + 1):
+            total = L[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        for k in range(i):
+            x = L[i, k]
+            v[i] -= x * v[k]
+            for j in range(s):
+                W[i, j] -= x * W[k, j]
+        x = 1.0 / L[i, i]
+        v[i] *= x
+        for j in range(s):
+            W[i, j] *= x
+    information, vector = np.dot(W.T, -W), np.empty(s)
+    for i in range(s):
+        total = b[stay[i]]
+        for k in range(g):
+            total -= W[k, i] * v[k]
+        vector[i] = total
+        for j in range(s):
+            information[i, j] += H[stay[i], stay[j]] if stay[i] >= stay[j] else H[stay[j], stay[i]]
+    for i in range(g - 1, -1, -1):
+        for k in range(i + 1, g):
+            x = L[k, i]
+            v[i] -= x * v[k]
+            for j in range(s):
+                W[i, j] -= x * W[k, j]
+        x = 1.0 / L[i, i]
+        v[i] *= x
+        for j in range(s):
+            W[i, j] *= x
+    return information, vector, v, W

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from slam.geometry.arrays import Array, BoolArray, IndexArray
 from slam.geometry.se3 import adjoint, inverse
 from slam.window import kernels
 from slam.window.problem import RelativePrior, Window
 from slam.window.solver import linearised
-
-#: numerics: Added to the information, as a share of its diagonal, until it is positive definite in double precision.
-_JITTER = (0.0, 1e-13, 1e-11, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +52,12 @@ def marginalised(
     w = _with_joined(w, joining)
     reference = 1 if pose == 0 else 0
     e = linearised(w, reference)
-    H = kernels.symmetric(e.H)
     points = np.concatenate([leaving, np.zeros(len(joining), bool)])
     gone = np.concatenate([np.repeat(points, 3), np.repeat(np.arange(len(w.poses)) == pose, 6)])
-    L = _root(H[np.ix_(gone, gone)])
-    W, v = solve_triangular(L, H[np.ix_(gone, ~gone)], trans="T"), solve_triangular(L, e.b[gone], trans="T")
-    information, vector = H[np.ix_(~gone, ~gone)] - W.T @ W, e.b[~gone] - W.T @ v
-    conditional = _in_world(solve_triangular(L, v), solve_triangular(L, W), e.E[w.prior.points], points)
+    information, vector, mean, gain = kernels.schur_complement(e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone))
+    if not np.isfinite(mean).all():
+        raise np.linalg.LinAlgError("the information of what leaves a window is not positive definite")
+    conditional = _in_world(mean, gain, e.E[w.prior.points], points)
 
     members, poses = w.prior.points[~points], np.delete(w.poses, pose, axis=0)
     D, n = len(members), len(information)
@@ -83,12 +78,10 @@ def marginalised(
     A = np.concatenate([-by.reshape(3 * D, 6), np.eye(6), adjoint(inverse(relative[1:])).reshape(-1, 6)])
     at = slice(3 * D, 3 * D + 6)
     V = information @ A
-    information[:, at], information[at] = V, V.T
-    information[at, at] = A.T @ V
-    vector = vector.copy()
+    information[:, at], information[at], information[at, at] = V, V.T, A.T @ V
     vector[at] = A.T @ vector
     prior = RelativePrior(
-        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, 0.5 * (information + information.T), vector
+        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector
     )
     return prior, conditional, e.cost
 
@@ -120,14 +113,3 @@ def _with_joined(w: Window, joining: IndexArray) -> Window:
     )  # fmt: skip
     return replace(w, prior=prior)
 
-
-def _root(H: Array) -> Array:
-    """Upper triangular R with ``Rᵀ R = H``; where nothing is known of a row, as little as can be is added."""
-    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    S = H / np.outer(scale, scale)
-    for jitter in _JITTER:
-        try:
-            return np.asarray(cholesky(S + jitter * np.eye(len(S)))) * scale
-        except LinAlgError:
-            continue
-    raise np.linalg.LinAlgError("the information of what leaves a window is not positive definite")

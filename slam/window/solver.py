@@ -14,7 +14,7 @@ from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
-_CLOSE = 1e-7  # numerics: decrease of the cost, by a step with the last factor, that makes that step the last
+_CLOSE = 1e-2  # numerics: decrease of the cost, by a step with the last factor, that makes that step the last
 
 
 @dataclass(frozen=True, eq=False)
