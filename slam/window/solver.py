@@ -14,7 +14,8 @@ from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
-_CLOSE = 1e-2  # numerics: decrease of the cost, by a step with the last factor, that makes that step the last
+#: numerics: Decrease of the cost, by a step with the last factor, below which that step is the last. It leaves far less.
+CLOSE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,32 +167,36 @@ class Solution:
         )  # fmt: skip
 
 
-def solve(window: Window, centre: int = 0) -> Solution:
+def solve(window: Window, close: float = CLOSE) -> Solution:
     """The most probable poses and points, by Gauss-Newton with halved steps.
+
+    Args:
+        window: where to begin.
+        close: see `CLOSE`.
 
     Raises:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
-    now = linearised(window, centre)
+    now = linearised(window)
     x, _ = now.step(now.factor)
     for taken in range(1, _STEPS + 1):
-        following = _descended(now, x, centre)
+        following = _descended(now, x)
         if following is None:
             return Solution(now.window, now, now.cost, taken)
         x, rest = following.step(now.factor)
         if not np.isfinite(rest):
             raise np.linalg.LinAlgError("a window's step is not finite")
-        if rest < _CLOSE:  # so near the end the last factor serves once more
+        if rest < close:  # so near the end the last factor serves once more
             return Solution(following.after(x), now, following.cost - rest, taken)
         now = following
         x, _ = now.step(now.factor)
     return Solution(now.window, now, now.cost, _STEPS)
 
 
-def _descended(now: NormalEquations, x: Array, centre: int) -> NormalEquations | None:
+def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:
     """The equations after a step, or after the longest of its halves that does not raise the cost; None for none."""
     for halving in range(_HALVINGS):
-        following = linearised(now.after(0.5**halving * x), centre)
+        following = linearised(now.after(0.5**halving * x))
         if following.cost <= now.cost + 1e-9 * abs(now.cost) + 1e-12:
             return following
     return None

@@ -1,0 +1,223 @@
+"""The window solver against dense least squares, finite differences, and itself with something marginalised."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam.geometry import se3
+from slam.geometry.rig import StereoRig
+from slam.window import kernels, solver
+from slam.window.marginal import marginalised
+from slam.window.problem import Motion, Places, RelativePrior, Rows, Window
+from slam.window.solver import linearised
+from slam.window.stereo import RectifiedStereo
+
+RIG = StereoRig.rectified_pair(400, 319.5, 239.5, 0.12, 640, 480)
+STEREO = RectifiedStereo.of(RIG)
+POSES, POINTS, SIGMA = 5, 40, 0.5
+START = np.diag([1e-10] * 3 + [1e-8] * 3)  # covariance of the first pose
+VELOCITY = np.array([0.01, 0.02, -0.01, 0.05, 0.01, 0.1])
+
+
+def truth(poses=POSES, points=POINTS, seed=0):
+    """Poses (K, 4, 4) and points (N, 3)."""
+    rng = np.random.default_rng(seed)
+    path = np.array([se3.exp(k * VELOCITY) for k in range(poses)])
+    return path, np.stack([rng.uniform(-3, 3, points), rng.uniform(-2, 2, points), rng.uniform(4, 20, points)], axis=1)
+
+
+def window(seed=0, noise=SIGMA, missing=7, off=0.02, **parts):
+    """Every point seen from every pose; every seventh row has no right pixel; poses and points start off the truth."""
+    rng, (path, points) = np.random.default_rng(seed + 100), truth(seed=seed)
+    pose, point = np.repeat(np.arange(POSES), POINTS), np.tile(np.arange(POINTS), POSES)
+    z = np.concatenate([STEREO.project(se3.transform(se3.inverse(T), points))[0] for T in path])
+    z += noise * rng.standard_normal(z.shape)
+    z[::missing, 2] = np.nan
+    start = np.array([T @ se3.exp(off * rng.standard_normal(6)) for T in path])
+    start[0] = path[0]
+    rows = Rows(pose, point, z, np.full(len(z), 1 / SIGMA))
+    parts = {"prior": RelativePrior.of_pose(path[0], START), **parts}
+    return Window(STEREO, start, points * (1 + off * rng.standard_normal((POINTS, 1))), rows, **parts)
+
+
+def solve(w):
+    """To the last digits."""
+    return solver.solve(w, 1e-14)
+
+
+def cost(w):
+    return linearised(w).cost
+
+
+def dense(w):
+    """Information of all poses, then all points in world axes, summed row by row."""
+    K, n = len(w.poses), 6 * len(w.poses) + 3 * len(w.points)
+    H = np.zeros((n, n))
+    for k, m, z, weight in zip(w.rows.pose, w.rows.point, w.rows.z, w.rows.weight):
+        T = w.poses[k]
+        local = se3.transform(se3.inverse(T), w.points[m : m + 1])
+        J = STEREO.project(local)[1][0][np.isfinite(z)] * weight
+        whole = np.zeros((len(J), n))
+        whole[:, 6 * k : 6 * k + 6] = J @ se3.points_by_pose(local)[0]
+        whole[:, 6 * K + 3 * m : 6 * K + 3 * m + 3] = J @ T[:3, :3].T
+        H += whole.T @ whole
+    H[:6, :6] += np.linalg.inv(START)
+    return H
+
+
+def test_noise_free_measurements_give_the_truth():
+    path, points = truth()
+    found = solve(window(noise=0.0))
+    np.testing.assert_allclose(found.window.poses, path, atol=1e-7)
+    np.testing.assert_allclose(found.window.points, points, atol=1e-5)
+    assert abs(found.cost) < 1e-6
+
+
+def test_covariances_are_those_of_dense_least_squares():
+    w = solve(window()).window
+    found = solve(w)
+    P, n = np.linalg.inv(dense(found.equations.window)), 6 * POSES
+    scale = np.sqrt(np.diag(P[:n, :n]))
+    np.testing.assert_allclose(found.pose_covariance / np.outer(scale, scale), P[:n, :n] / np.outer(scale, scale), atol=1e-6)
+    local, world = found.point_covariances(POSES - 1)
+    T = w.poses[-1]
+    by_pose = se3.points_by_pose(se3.transform(se3.inverse(T), w.points))
+    for m in range(POINTS):
+        own = slice(n + 3 * m, n + 3 * m + 3)
+        np.testing.assert_allclose(world[m], P[own, own], rtol=1e-3, atol=1e-3 * np.trace(P[own, own]))
+        J = np.zeros((3, len(P)))
+        J[:, n - 6 : n], J[:, own] = by_pose[m], T[:3, :3].T
+        np.testing.assert_allclose(local[m], J @ P @ J.T, rtol=1e-3, atol=1e-3 * np.trace(J @ P @ J.T))
+
+
+def test_nees_of_poses_is_in_its_band():
+    squares = []
+    for seed in range(40):
+        found = solve(window(seed))
+        off = se3.log(se3.inverse(found.window.poses[1:]) @ truth(seed=seed)[0][1:]).ravel()
+        squares.append(off @ np.linalg.solve(found.pose_covariance[6:, 6:], off))
+    mean = np.mean(squares) / (6 * (POSES - 1))
+    assert 0.9 < mean < 1.1  # standard deviation of the mean: sqrt(2 / (24 · 40)) = 0.046
+
+
+def with_everything():
+    """A window with each kind of knowledge."""
+    path, points = truth()
+    basis, origin = kernels.relative_charts(path[1], points[:3] * 1.01)
+    root = np.tile(np.diag([50.0, 50.0, 80.0]), (3, 1, 1))
+    information = np.zeros((POINTS, 3, 3))
+    information[5:8] = np.diag([9.0, 4.0, 1.0])
+    sigma = np.full((POSES - 1, 6), 0.3)
+    triples = np.array([(-1, 0, 1), *((k - 2, k - 1, k) for k in range(2, POSES))])
+    return window(
+        places=Places(np.full(3, 1), np.arange(3), basis, origin, root), mean=points + 0.05, information=information,
+        motion=Motion(triples, np.full((POSES - 1, 2), 0.1), 1 / sigma),
+    )  # fmt: skip
+
+
+def test_gradient_is_the_costs_derivative():
+    """Of a window with each kind of knowledge, whose points are at their best for its poses."""
+    w = with_everything()
+    prior = marginalised(replace(w, rows=w.rows.select(w.rows.pose == 0), motion=Motion.none(), places=Places.none()), 0,
+                         np.zeros(0, bool), np.arange(10, 20))[0]  # fmt: skip
+    rest = w.rows.select(w.rows.pose > 0)
+    w = replace(w, poses=w.poses[1:], rows=replace(rest, pose=rest.pose - 1), prior=prior, motion=Motion(
+        np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.full((2, 6), 3.0)))  # fmt: skip
+    for _ in range(12):  # only the points move: what is left is the gradient of the poses
+        e = linearised(w)
+        x = np.zeros(w.unknowns)
+        w = replace(e.after(x), poses=w.poses)
+    e = linearised(w)
+    numeric = np.empty(w.unknowns)
+    for i in range(w.unknowns):
+        x = np.zeros(w.unknowns)
+        x[i] = 1e-6
+        numeric[i] = -(cost(e.after(x)) - cost(e.after(-x))) / 2e-6 / 2
+    np.testing.assert_allclose(numeric, e.b, rtol=1e-3, atol=1e-3 * np.abs(e.b).max())
+
+
+def test_a_solution_with_each_kind_of_knowledge_is_a_minimum():
+    found, rng = solve(with_everything()), np.random.default_rng(1)
+    e = linearised(found.window)
+    for _ in range(20):
+        x = 1e-3 * rng.standard_normal(found.window.unknowns)
+        assert cost(e.after(x)) > found.cost - 1e-6
+
+
+def test_one_pose_from_known_points():
+    """PnP."""
+    w, (path, points) = window(missing=10**6), truth()
+    rows = w.rows.select(w.rows.pose == 3)
+    rows = replace(rows, pose=np.zeros(len(rows), np.intp))
+    known = np.ones(POINTS, bool)
+    alone = Window(STEREO, path[3:4] @ se3.exp(np.full(6, 0.05)), points, rows, known=known)
+    found = solve(alone)
+    off = se3.log(se3.inverse(found.window.poses[0]) @ path[3])
+    assert off @ np.linalg.solve(found.pose_covariance, off) < 30
+    np.testing.assert_array_equal(found.window.points, points)
+
+
+def test_a_fixed_pose_stays():
+    w = window(prior=RelativePrior.none(), free=np.arange(POSES) > 0)
+    found = solve(w)
+    np.testing.assert_array_equal(found.window.poses[0], w.poses[0])
+    free = solve(window())
+    np.testing.assert_allclose(found.window.poses, free.window.poses, atol=1e-5)
+
+
+@pytest.mark.parametrize("leaves", [0, 1])
+def test_a_pose_that_leaves_changes_nothing(leaves):
+    """The rest is solved as before, with the same covariance: here everything is linear next to the solution."""
+    found = solve(window())
+    w, rows = found.window, found.window.rows
+    part = replace(w, rows=rows.select(rows.pose == leaves))
+    prior, conditional, _ = marginalised(part, leaves, np.zeros(0, bool), np.arange(POINTS))
+    rest = rows.select(rows.pose != leaves)
+    rest = replace(rest, pose=rest.pose - (rest.pose > leaves))
+    others = np.arange(POSES) != leaves
+    after = solve(Window(STEREO, w.poses[others], w.points, rest, prior=prior))
+    np.testing.assert_allclose(after.window.poses, w.poses[others], atol=1e-6)
+    keep = np.repeat(others, 6)
+    before = solve(w).pose_covariance[np.ix_(keep, keep)]
+    np.testing.assert_allclose(after.pose_covariance, before, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(conditional.mean, 0, atol=1e-6)
+
+
+def test_what_left_follows_what_stayed():
+    """The conditional is that of the joint covariance: moving the rest as one moves what left along."""
+    w = solve(window()).window
+    rows = w.rows
+    prior, conditional, _ = marginalised(
+        replace(w, rows=rows.select(rows.pose == 1)), 1, np.zeros(0, bool), np.arange(POINTS)
+    )
+    M = se3.exp(1e-4 * np.array([1.0, -2, 0.5, 3, 1, -2]))
+    others = np.arange(POSES) != 1
+    y = [(se3.transform(M, w.points[prior.points]) - w.points[prior.points]).ravel()]
+    y += [se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]]
+    x = conditional.mean - conditional.gain @ np.concatenate(y)
+    np.testing.assert_allclose(w.poses[1] @ se3.exp(x), M @ w.poses[1], atol=1e-6)
+
+
+def test_the_prior_does_not_mind_where_all_stands():
+    """Moved as one, only what is known of the first pose in the world resists."""
+    w = solve(window()).window
+    prior = marginalised(replace(w, rows=w.rows.select(w.rows.pose == 0)), 0, np.zeros(0, bool), np.arange(POINTS))[0]
+    far = se3.exp(np.array([0.3, -1.0, 0.4, 30, -20, 10]))
+    there = replace(prior, T=far @ prior.T)
+    moved = Window(STEREO, far @ w.poses[1:], se3.transform(far, w.points), Rows.none(), prior=there)
+    here = Window(STEREO, w.poses[1:], w.points, Rows.none(), prior=prior)
+    assert cost(moved) == pytest.approx(cost(here), abs=1e-6)
+
+
+def test_what_nothing_determines_is_refused():
+    w = window(prior=RelativePrior.none())
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(replace(w, rows=w.rows.select(w.rows.pose != 2)))
+
+
+def test_triangular_inverse():
+    rng = np.random.default_rng(0)
+    for n in (1, 5, 31, 32, 33, 64, 130):
+        L = np.tril(rng.standard_normal((n, n))) + 5 * np.eye(n)
+        np.testing.assert_allclose(kernels.lower_inverse(L) @ L, np.eye(n), atol=1e-12)
