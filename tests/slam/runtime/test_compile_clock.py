@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 
 import pytest
@@ -58,3 +59,12 @@ def test_after_warming_up_nothing_is_left_to_compile():
 
     warm_up()
     assert warm_up() == 0.0
+    kernels = {
+        value
+        for name, module in list(sys.modules.items())
+        if name.startswith(("slam.", "frontends.", "backends."))
+        for value in vars(module).values()
+        if getattr(getattr(value, "stats", None), "cache_path", None)
+    }
+    twice = [f"{one.py_func.__module__}.{one.__name__}" for one in kernels if len(one.signatures) > 1]
+    assert len(kernels) > 50 and not twice, "compiled for several types or layouts of arrays"
