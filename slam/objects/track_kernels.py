@@ -42,16 +42,6 @@ def _multiply(A, B, out):
 
 
 @kernel
-def measurements(dof, rows):
-    """In how many slots (M,) tracks were measured."""
-    out = np.zeros(len(rows), np.int64)
-    for m in range(len(rows)):
-        for w in range(dof.shape[1]):
-            out[m] += dof[rows[m], w] > 0
-    return out
-
-
-@kernel
 def places_known(position, covariance, rows, T_world_left, farthest):
     """Tracks whose depth is known well, and where they are seen.
 
