@@ -46,14 +46,10 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
         converged: step [rad], [m] after which a pose is good.
     """
     normal, step, local = np.empty((6, 6)), np.empty(6), np.empty(3)
-    unturned, error, J = np.eye(3), np.empty(3), np.empty((3, 3))
-    change, before = np.empty((3, 4)), np.empty((4, 4))
+    unturned, error, J, change = np.eye(3), np.empty(3), np.empty((3, 3)), np.empty((3, 4))
     for h in range(len(poses)):
         for _ in range(most):
-            for i in range(6):  # slices take seconds to compile
-                step[i] = 0.0
-                for j in range(6):
-                    normal[i, j] = 0.0
+            step[:], normal[:] = 0.0, 0.0
             for k in range(rows.shape[1]):
                 m = rows[h, k]
                 transform(poses[h], points[m], local)
@@ -62,10 +58,7 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
                         _add_row(local, J[i], error[i], normal, step)
             _damp_and_solve(normal, step)
             exp(step, change)
-            for i in range(4):
-                for j in range(4):
-                    before[i, j] = poses[h, i, j]
-            compose(change, before, poses[h])
+            compose(change, poses[h].copy(), poses[h])
             largest = 0.0
             for i in range(6):
                 largest = max(largest, abs(step[i]))

@@ -120,6 +120,14 @@ def column_times(M, i, v):
 
 
 @helper
+def multiply(A, B, out):
+    """``A B`` of matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@helper
 def square(M, v):
     """``vᵀ M v`` for v (3,)."""
     total = 0.0

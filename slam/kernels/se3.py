@@ -74,12 +74,9 @@ def exp(step, out):
 @helper
 def move(T, step):
     """``T ← T exp ξ`` by a tangent vector (6,)."""
-    change, before = np.empty((3, 4)), np.empty((3, 4))
+    change = np.empty((3, 4))
     exp(step, change)
-    for i in range(3):
-        for j in range(4):
-            before[i, j] = T[i, j]
-    compose(before, change, T)
+    compose(T.copy(), change, T)
 
 
 @helper
