@@ -21,7 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 #: Where constants that shape an estimate are; worlds, readers, reports and commands have none.
-ROOMS = ("slam/geometry", "slam/tracking", "slam/mapping", "slam/calibration", "slam/objects", "backends", "frontends")
+ROOMS = (
+    "slam/kernels", "slam/geometry", "slam/tracking", "slam/mapping", "slam/calibration", "slam/objects", "backends",
+    "frontends",
+)  # fmt: skip
 
 INTRODUCTION = """# Parameters
 

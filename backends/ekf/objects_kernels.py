@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.stereo import by_pose
 from slam.runtime.compilation import kernel
 
 
@@ -32,9 +33,6 @@ def point_geometry(T_body_anchor, coordinates):
             by_position[m, 0, i] = w * T[i, 0] - w * a * T[i, 2]
             by_position[m, 1, i] = w * T[i, 1] - w * b * T[i, 2]
             by_position[m, 2, i] = -w * w * T[i, 2]
-        x, y, z = positions[m, 0], positions[m, 1], positions[m, 2]
         for i in range(3):
-            u, v, t = by_position[m, i, 0], by_position[m, i, 1], by_position[m, i, 2]
-            by_frame[m, i, 0], by_frame[m, i, 1], by_frame[m, i, 2] = v * z - t * y, t * x - u * z, u * y - v * x
-            by_frame[m, i, 3], by_frame[m, i, 4], by_frame[m, i, 5] = -u, -v, -t
+            by_pose(by_position[m, i], positions[m], by_frame[m, i])
     return positions, D, by_position, by_frame

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.kernels.linear import multiply
 from slam.kernels.se3 import transform_back
 from slam.kernels.stereo import by_point, residual
 from slam.runtime.compilation import kernel
@@ -91,11 +92,7 @@ def carried_by(known, poses, frames, points, rows, information, older, covarianc
                     for k in range(most):
                         if places[k] == w:
                             share[i, j] += information[m, k, i, j]
-            for i in range(3):
-                for j in range(3):
-                    C[i, j] = 0.0
-                    for h in range(3):
-                        C[i, j] += covariance[m, i, h] * share[h, j]
+            multiply(covariance[m], share, C)
             for i in range(3):  # C times the negative cross product matrix of d
                 D[i, 0] = C[i, 2] * d[1] - C[i, 1] * d[2]
                 D[i, 1] = C[i, 0] * d[2] - C[i, 2] * d[0]

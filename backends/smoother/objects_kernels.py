@@ -179,22 +179,19 @@ def relinearised(H, g, T0, X0, points0, T, X, points):
     # A turn of the frame moves a point by the cross product with where it is: only that has changed.
     for j in range(len(points)):
         at = first + 3 * j
-        x, y, z = points[j, 0] - points0[j, 0], points[j, 1] - points0[j, 1], points[j, 2] - points0[j, 2]
+        away = points[j, 0] - points0[j, 0], points[j, 1] - points0[j, 1], points[j, 2] - points0[j, 2]
         for i in range(len(out)):
-            a, b, c = out[i, at], out[i, at + 1], out[i, at + 2]
-            out[i, 0] -= b * z - c * y
-            out[i, 1] -= c * x - a * z
-            out[i, 2] -= a * y - b * x
-        a, b, c = vector[at], vector[at + 1], vector[at + 2]
-        vector[0] -= b * z - c * y
-        vector[1] -= c * x - a * z
-        vector[2] -= a * y - b * x
-    for j in range(len(points)):
-        at = first + 3 * j
-        x, y, z = points[j, 0] - points0[j, 0], points[j, 1] - points0[j, 1], points[j, 2] - points0[j, 2]
+            _turn_with(out[i], at, away)
         for i in range(len(out)):
-            a, b, c = out[at, i], out[at + 1, i], out[at + 2, i]
-            out[0, i] -= b * z - c * y
-            out[1, i] -= c * x - a * z
-            out[2, i] -= a * y - b * x
+            _turn_with(out[:, i], at, away)
+        _turn_with(vector, at, away)
     return out, vector
+
+
+@helper
+def _turn_with(line, at, away):
+    """Take what a point's three entries at `at` say into those of the frame's turn, the first three."""
+    (a, b, c), (x, y, z) = (line[at], line[at + 1], line[at + 2]), away
+    line[0] -= b * z - c * y
+    line[1] -= c * x - a * z
+    line[2] -= a * y - b * x

@@ -297,7 +297,8 @@ class Solver:
             step = dpotrs(L, system.vector, lower=1)[0]
             frames = step[: FRAME * n].reshape(n, 2, 6)
             c = c + frames[:, 1].reshape(-1)
-            now = replace(now, T=moved(now.T, frames[:, 0]), points=now.points + step[FRAME * n :].reshape(-1, 3))
+            points = now.points + step[FRAME * n :].reshape(-1, 3)
+            now = replace(now, T=moved(now.T, frames[:, 0].copy()), points=points)
             if np.abs(frames[:, 0, :3]).max() < _LINEAR:
                 break
         lower = dpotri(L, lower=1)[0]

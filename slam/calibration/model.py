@@ -49,7 +49,7 @@ class RigModel:
     def __init__(self, rig: StereoRig) -> None:
         self.rig = rig
         rectified_rig = rig.rectified.rig
-        self.focal = rectified_rig.left.fu
+        self.focal = float(rectified_rig.left.fu)
         self.origin = np.array([rectified_rig.left.u0, rectified_rig.left.v0])
         self.right_u0 = rectified_rig.right.u0
         half = 0.5 * np.array([rig.width - 1, rig.height - 1])

@@ -97,19 +97,20 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         focal: focal length [px].
         noise: covariance of a point (3, 3) [px²]; only its form matters.
     """
-    from slam.calibration.motion_kernels import move_points, normal_equations
+    from slam.calibration.motion_kernels import move_points
 
     first, second = (np.ascontiguousarray(a, float) for a in (first, second))
     points, at = first, Linear.empty(len(first))
-    normal, right = np.empty((6, 6)), np.empty(6)
     for _ in range(_ITERATIONS):
         _linearise(first, second, points, R, t, focal, noise, at)
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
             return None
         weights = student_weights(distance, 3, _LEAST_NOISE)
-        normal_equations(at.motion, at.residual, weights, normal, right)
-        step = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(6), right)
+        J = at.motion.reshape(-1, 6)
+        weighted = np.repeat(weights, 3) * J.T
+        normal = weighted @ J
+        step = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(6), weighted @ at.residual.reshape(-1))
         if not np.isfinite(step).all():
             return None
         R, t = so3_exp(step[:3]) @ R, t + step[3:]

@@ -61,28 +61,6 @@ def linearise(first, second, points, R, t, focal, noise, moved, J_point, J_motio
 
 
 @kernel
-def normal_equations(motion, residual, weights, normal, right):
-    """``Jᵀ W J`` into `normal` (6, 6) and ``Jᵀ W r`` into `right` (6,).
-
-    J (N, 3, 6) and r (N, 3) are whitened; W are the points' weights (N,).
-    """
-    for j in range(6):
-        right[j] = 0.0
-        for k in range(6):
-            normal[j, k] = 0.0
-    for n in range(len(motion)):
-        for i in range(3):
-            for j in range(6):
-                a = weights[n] * motion[n, i, j]
-                right[j] += a * residual[n, i]
-                for k in range(j + 1):
-                    normal[j, k] += a * motion[n, i, k]
-    for j in range(6):
-        for k in range(j):
-            normal[k, j] = normal[j, k]
-
-
-@kernel
 def move_points(first, J_point, J_motion, motion, white, residual, noise, step, points):
     """The first view's points after a step (6,) of the motion, into `points` (N, 3); returns how far they move [px].
 

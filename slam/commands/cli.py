@@ -347,9 +347,11 @@ def list_command() -> None:
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
 def warm_up_command(quiet: QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
-    from slam.run.warm_up import warm_up
+    from slam.commands.background_compilation import compiled_in_background
+    from slam.run.warm_up import BACKENDS, warm_up
 
-    seconds = warm_up()
+    with compiled_in_background(BACKENDS[-1]):
+        seconds = warm_up()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import squared_distance, trace
+from slam.kernels.linear import squared_distance, trace, whitener
 from slam.runtime.compilation import kernel
 
 
@@ -12,11 +12,20 @@ from slam.runtime.compilation import kernel
 def squared_distances(gaps, covariances):
     """``gᵀ C⁻¹ g`` (N,) of gaps (N, 3) with covariances (N, 3, 3), by Cholesky; NaN where one is not positive definite.
 
-    Only the lower triangle is read.
+    Only the lower triangle is read. Where the third entry of a gap is NaN, the first two count alone.
     """
     out = np.empty(len(gaps))
     for i in range(len(gaps)):
         out[i] = squared_distance(gaps[i], covariances[i])
+    return out
+
+
+@kernel
+def whiteners(covariances):
+    """Inverses (N, 3, 3) of the Cholesky factors of covariances (N, 3, 3); NaN where one is not positive definite."""
+    out = np.empty(covariances.shape)
+    for i in range(len(covariances)):
+        whitener(covariances[i], out[i])
     return out
 
 

@@ -6,19 +6,19 @@ import numpy as np
 
 from slam.kernels.linear import factorise, solve_factorised
 from slam.kernels.se3 import compose, exp, transform
-from slam.kernels.stereo import offsets
+from slam.kernels.stereo import offsets, residual
 from slam.runtime.compilation import helper, kernel
 
 
 @kernel
-def gauss_newton_steps(local, residual, J_point):
+def gauss_newton_steps(local, error, J_point):
     """Steps (H, 6) that reduce reprojection errors, perturbing poses on the left of T_left_world.
 
     Lightly damped, so that a degenerate set yields a bad pose and no error.
 
     Args:
         local: points in camera coordinates (H, K, 3), a set for each pose.
-        residual: measured less predicted (H, K, 3); entries that are not finite are left out.
+        error: measured less predicted (H, K, 3); entries that are not finite are left out.
         J_point: derivatives (H, K, 3, 3) of the predictions by the points.
     """
     steps = np.zeros((len(local), 6))
@@ -27,9 +27,7 @@ def gauss_newton_steps(local, residual, J_point):
         normal[:] = 0.0
         for k in range(local.shape[1]):
             for i in range(3):
-                if np.isfinite(residual[h, k, i]):
-                    J = J_point[h, k, i]
-                    _add_row(local[h, k], J[0], J[1], J[2], residual[h, k, i], normal, steps[h])
+                _add_row(local[h, k], J_point[h, k, i], error[h, k, i], normal, steps[h])
         _damp_and_solve(normal, steps[h])
     return steps
 
@@ -48,34 +46,19 @@ def refine_rectified(cameras, points, measured, rows, poses, most, converged):
         converged: step [rad], [m] after which a pose is good.
     """
     normal, step, local = np.empty((6, 6)), np.empty(6), np.empty(3)
-    change, before = np.empty((3, 4)), np.empty((4, 4))
+    unturned, error, J, change = np.eye(3), np.empty(3), np.empty((3, 3)), np.empty((3, 4))
     for h in range(len(poses)):
         for _ in range(most):
-            for i in range(6):  # slices take seconds to compile
-                step[i] = 0.0
-                for j in range(6):
-                    normal[i, j] = 0.0
+            step[:], normal[:] = 0.0, 0.0
             for k in range(rows.shape[1]):
                 m = rows[h, k]
                 transform(poses[h], points[m], local)
-                offset = offsets(cameras, local[0], local[1], local[2])
-                inverse = offset[3]
-                if np.isnan(inverse):
-                    continue
-                for i in range(3):
-                    f, centre = (cameras[0], cameras[2]) if i == 0 else (cameras[1], cameras[3])
-                    if i == 2:
-                        f, centre = cameras[4], cameras[5]
-                    error = measured[m, i] - (offset[i] + centre)
-                    if np.isfinite(error):
-                        across, down = (0.0, f * inverse) if i == 1 else (f * inverse, 0.0)
-                        _add_row(local, across, down, -offset[i] * inverse, error, normal, step)
+                if residual(cameras, unturned, local, measured[m], error, J):
+                    for i in range(3):
+                        _add_row(local, J[i], error[i], normal, step)
             _damp_and_solve(normal, step)
             exp(step, change)
-            for i in range(4):
-                for j in range(4):
-                    before[i, j] = poses[h, i, j]
-            compose(change, before, poses[h])
+            compose(change, poses[h].copy(), poses[h])
             largest = 0.0
             for i in range(6):
                 largest = max(largest, abs(step[i]))
@@ -107,9 +90,11 @@ def errors_rectified(cameras, points, measured, poses):
 
 
 @helper
-def _add_row(local, a, b, c, error, normal, right):
-    """Take one number into the normal equations (lower triangle); (a, b, c) is its derivative by the point."""
-    x, y, z = local[0], local[1], local[2]
+def _add_row(local, J, error, normal, right):
+    """Take one number into the normal equations (lower triangle), unless it is missing; J (3,) is by the point."""
+    if not np.isfinite(error):
+        return
+    (x, y, z), (a, b, c) = local, J
     g = (y * c - z * b, z * a - x * c, x * b - y * a, a, b, c)  # local × the derivative
     for m in range(6):
         right[m] += g[m] * error

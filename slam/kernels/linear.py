@@ -71,7 +71,10 @@ def invert_symmetric(M, ridge, out):
 
 @helper
 def squared_distance(g, C):
-    """``gᵀ C⁻¹ g`` of a vector (3,) by the Cholesky factor of C (3, 3); NaN where C is not positive definite."""
+    """``gᵀ C⁻¹ g`` of a vector (3,) by the Cholesky factor of C (3, 3); NaN where C is not positive definite.
+
+    Where the third entry of g is NaN, the first two count alone.
+    """
     a = np.sqrt(C[0, 0])
     b, c = C[1, 0] / a, C[2, 0] / a
     d = np.sqrt(C[1, 1] - b * b)
@@ -80,6 +83,8 @@ def squared_distance(g, C):
     x = g[0] / a
     y = (g[1] - b * x) / d
     z = (g[2] - c * x - e * y) / f
+    if np.isnan(g[2]):
+        return x * x + y * y
     return x * x + y * y + z * z if f > 0.0 else np.nan
 
 
@@ -112,6 +117,14 @@ def row_times(M, i, v):
 def column_times(M, i, v):
     """Entry i of ``Mᵀ v`` for v (3,)."""
     return M[0, i] * v[0] + M[1, i] * v[1] + M[2, i] * v[2]
+
+
+@helper
+def multiply(A, B, out):
+    """``A B`` of matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
 @helper

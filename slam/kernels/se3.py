@@ -12,6 +12,7 @@ from slam.runtime.compilation import helper
 
 _SMALL = 1e-5  # numerics: below this angle [rad] series are exact to double precision
 _SMALL_CUBIC = 1e-2  # numerics: the same where a difference of third order is taken
+_SMALL_SINE = 1e-6  # numerics: sine of an angle below which the logarithm's series are exact
 
 
 @helper
@@ -73,12 +74,9 @@ def exp(step, out):
 @helper
 def move(T, step):
     """``T ← T exp ξ`` by a tangent vector (6,)."""
-    change, before = np.empty((3, 4)), np.empty((3, 4))
+    change = np.empty((3, 4))
     exp(step, change)
-    for i in range(3):
-        for j in range(4):
-            before[i, j] = T[i, j]
-    compose(before, change, T)
+    compose(T.copy(), change, T)
 
 
 @helper
@@ -92,7 +90,7 @@ def rotation_vector(R, w, inverse_J):
     sine = np.sqrt(a * a + b * b + c * c)
     angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1))
     scale, bend = 1.0, 1 / 12
-    if not sine < 1e-6:  # numerics: below it series are exact
+    if not sine < _SMALL_SINE:
         scale, half = angle / sine, 0.5 * angle
         bend = (1 - half / np.tan(half)) / (4 * half * half)
     x, y, z = scale * a, scale * b, scale * c

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import factorise, invert, invert_symmetric, solve_factorised, square
+from slam.kernels.linear import factorise, invert, invert_symmetric, row_times, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import helper, kernel
 
@@ -41,9 +41,8 @@ def agreed_correction(y, information, seen, J, axes, shift, P, known, sigma, lea
     noise, spread, own, B, DP = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 6))
     for k in range(count):
         for i in range(3):
-            gaps[k, i] = shift[i] - y[k, i]
+            gaps[k, i] = shift[i] - y[k, i] + row_times(axes, i, seen[k])
             for j in range(3):
-                gaps[k, i] += axes[i, j] * seen[k, j]
                 own[i, j] = information[k, i, j] + (least if i == j else 0.0)
         point_by_motion(y[k], 1.0, D[k])
         invert_symmetric(own, 0.0, noise)

@@ -119,7 +119,7 @@ def drift(points: Array, first: Array, now: Array, turned: Array, density: float
     Returns:
         the angles with this sight (p,), and symmetric roots (p, 3, 3) of the covariances to be added [m].
     """
-    angles, roots = drift_roots(points, first, now, turned, density)
+    angles, roots = drift_roots(points, np.ascontiguousarray(first), now, turned, density)
     return angles, roots
 
 

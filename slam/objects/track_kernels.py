@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.kernels.linear import column_times, invert_symmetric, row_times, square, trace, turn, turn_back
-from slam.kernels.se3 import point_by_motion, transform
+from slam.kernels.linear import column_times, invert_symmetric, multiply, row_times, square, trace, turn, turn_back
+from slam.kernels.se3 import point_by_motion, transform, transform_back
 from slam.runtime.compilation import helper, kernel
 
 _RIDGE = 1e-9  # numerics: share of the trace, for information over a whole window, and
@@ -31,24 +31,7 @@ def _add_times(total, M, v, factor):
         total[i] += factor * row_times(M, i, v)
 
 
-@helper
-def _multiply(A, B, out):
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
 # ---------------------------------------------------------------------------------------------- windows of tracks
-
-
-@kernel
-def measurements(dof, rows):
-    """In how many slots (M,) tracks were measured."""
-    out = np.zeros(len(rows), np.int64)
-    for m in range(len(rows)):
-        for w in range(dof.shape[1]):
-            out[m] += dof[rows[m], w] > 0
-    return out
 
 
 @kernel
@@ -68,14 +51,10 @@ def places_known(position, covariance, rows, T_world_left, farthest):
     known, place, away, count = np.empty(len(rows), np.intp), np.empty((len(rows), 3)), np.empty(3), 0
     for m in range(len(rows)):
         n = rows[m]
-        for i in range(3):
-            away[i] = position[n, i] - T_world_left[i, 3]
-        depth = column_times(T_world_left, 2, away)
-        if depth > farthest * np.sqrt(trace(covariance[n])):
+        transform_back(T_world_left, position[n], away)
+        if away[2] > farthest * np.sqrt(trace(covariance[n])):
             known[count] = n
-            for i in range(2):
-                place[count, i] = column_times(T_world_left, i, away) / depth
-            place[count, 2] = np.log(depth)
+            place[count, 0], place[count, 1], place[count, 2] = away[0] / away[2], away[1] / away[2], np.log(away[2])
             count += 1
     return known[:count], place[:count]
 
@@ -143,7 +122,7 @@ def constant_velocities(A, p, rows, times, prior):
             _add_times(b0, Aw, pw, 1.0)
             _add_times(b1, Aw, pw, t)
         invert_symmetric(M0, _RIDGE * trace(M0) + _LEAST, P0)
-        _multiply(P0, M1, G)
+        multiply(P0, M1, G)
         for i in range(3):
             told[i] = b1[i] - column_times(G, i, b0)
             for j in range(3):
@@ -328,16 +307,14 @@ def squares_from_box(position, covariance, rows, T, lower, upper, reach):
     Infinite for those farther than `reach` from the origin of the body, whose pose is T (4, 4).
     """
     squares = np.full(len(rows), np.inf)
-    offset, inside, away, P = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    inside, away, P = np.empty(3), np.empty(3), np.empty((3, 3))
     for m in range(len(rows)):
         n = rows[m]
-        for i in range(3):
-            offset[i] = position[n, i] - T[i, 3]
-        if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 >= reach**2:
+        transform_back(T, position[n], inside)
+        if inside[0] ** 2 + inside[1] ** 2 + inside[2] ** 2 >= reach**2:
             continue
         for i in range(3):
-            y = column_times(T, i, offset)
-            inside[i] = y - min(max(y, lower[i]), upper[i])
+            inside[i] -= min(max(inside[i], lower[i]), upper[i])
         for i in range(3):
             away[i] = row_times(T, i, inside)
         invert_symmetric(covariance[n], _RIDGE * trace(covariance[n]) + _LEAST, P)

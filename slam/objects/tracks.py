@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.se3 import Array
-from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window, measurements
+from slam.objects.track_kernels import constant_velocities, fit_fixed_points, leave_window
 
 _MEMORY = 0.98  # share of what has left the window that is remembered from frame to frame
 LEAST_INFORMATION = 1e-6  #: numerics: on a member's point that has none yet [1/m²]
@@ -104,7 +104,7 @@ class Tracks:
 
     def count(self, rows: NDArray[np.intp]) -> IdArray:
         """Number of measurements of tracks in the window (M,)."""
-        return np.asarray(measurements(self.dof, rows))
+        return np.asarray(np.count_nonzero(self.dof[rows], axis=1))
 
     def begin(self, ids: IdArray, features: StereoFeatures, rows: NDArray[np.intp], points: Array) -> NDArray[np.intp]:
         """Begin tracks at features whose points in world coordinates are `points` (M, 3); returns their rows (M,)."""

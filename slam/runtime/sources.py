@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-_NUMBERS = (int, float, str, tuple, np.generic)
+_VALUES = (int, float, str, tuple, np.generic, np.ndarray)
 
 
 def stamp(*functions: Callable[..., Any]) -> str:
@@ -30,10 +30,9 @@ def stamp(*functions: Callable[..., Any]) -> str:
             if called is not None and called not in known:
                 known.add(called)
                 waiting.append(called)
-            elif isinstance(value, _NUMBERS):
-                parts.add((f"{part.__module__}.{name}", repr(value)))
-            elif isinstance(value, np.ndarray):
-                parts.add((f"{part.__module__}.{name}", f"{value.dtype}{value.shape}{value.tolist()}"))
+            elif isinstance(value, _VALUES):
+                exact = f"{value.dtype}{value.tolist()}" if isinstance(value, np.ndarray) else repr(value)
+                parts.add((f"{part.__module__}.{name}", exact))
     return hashlib.sha256(repr(sorted(parts)).encode()).hexdigest()
 
 
@@ -48,5 +47,4 @@ def _names(code: CodeType) -> Iterator[str]:
 @cache
 def _digest(file: str, module: str) -> str:
     """Of a file's text, which may lie in an archive; read once in a process."""
-    text = "".join(linecache.getlines(file, vars(sys.modules[module])))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256("".join(linecache.getlines(file, vars(sys.modules[module]))).encode()).hexdigest()

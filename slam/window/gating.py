@@ -18,26 +18,10 @@ def squared_distances(residuals: Array, covariances: Array) -> Array:
 
     A row that cannot be tested (left residual not finite, S not finite or not positive definite) has distance ∞.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):  # NaN if S is not positive definite
-        l00, l10, l11, l20, l21, l22 = _cholesky(covariances)
-        y0 = residuals[:, 0] / l00
-        y1 = (residuals[:, 1] - l10 * y0) / l11
-        y2 = (residuals[:, 2] - l20 * y0 - l21 * y1) / l22
-        left = y0 * y0 + y1 * y1
-        distance = np.where(np.isnan(residuals[:, 2]), left, left + y2 * y2)
+    from slam.geometry import gauss_kernels as kernels
+
+    distance = kernels.squared_distances(np.ascontiguousarray(residuals), np.ascontiguousarray(covariances))
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf))
-
-
-def _cholesky(S: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The entries (M,) of L in ``S = L Lᵀ``, row by row; NaN where S (M, 3, 3) is not positive definite.
-
-    Written out: for thousands of 3x3 matrices this is many times faster than LAPACK.
-    """
-    l00 = np.sqrt(S[:, 0, 0])
-    l10, l20 = S[:, 1, 0] / l00, S[:, 2, 0] / l00
-    l11 = np.sqrt(S[:, 1, 1] - l10 * l10)
-    l21 = (S[:, 2, 1] - l20 * l10) / l11
-    return l00, l10, l11, l20, l21, np.sqrt(S[:, 2, 2] - l20 * l20 - l21 * l21)
 
 
 def whiteners(covariances: Array) -> Array:
@@ -46,13 +30,9 @@ def whiteners(covariances: Array) -> Array:
     Raises:
         numpy.linalg.LinAlgError: a covariance is not positive definite.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        l00, l10, l11, l20, l21, l22 = _cholesky(covariances)
-        W = np.zeros_like(covariances)
-        W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1 / l00, 1 / l11, 1 / l22
-        W[:, 1, 0] = -l10 * W[:, 0, 0] / l11
-        W[:, 2, 0] = -(l20 * W[:, 0, 0] + l21 * W[:, 1, 0]) / l22
-        W[:, 2, 1] = -l21 * W[:, 1, 1] / l22
+    from slam.geometry import gauss_kernels as kernels
+
+    W = np.asarray(kernels.whiteners(np.ascontiguousarray(covariances)))
     if not np.isfinite(W).all():
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return W

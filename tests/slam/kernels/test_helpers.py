@@ -63,6 +63,8 @@ def test_whitening(rng):
     np.testing.assert_allclose(W, np.linalg.inv(np.linalg.cholesky(C)), rtol=1e-12, atol=1e-14)
     assert call(linear.squared_distance, g, C) == pytest.approx(g @ np.linalg.solve(C, g), rel=1e-12)
     assert np.isnan(call(linear.squared_distance, g, -C))
+    left = np.array([*g[:2], np.nan])
+    assert call(linear.squared_distance, left, C) == pytest.approx(g[:2] @ np.linalg.solve(C[:2, :2], g[:2]), rel=1e-12)
     assert np.isnan(filled(linear.whitener, np.diag([1.0, -1.0, 1.0]), shape=(3, 3))[1, 1])
 
 
@@ -71,6 +73,7 @@ def test_products(rng):
     A = rng.normal(size=(3, 3))
     assert call(linear.row_times, A, 1, v) == pytest.approx((A @ v)[1], rel=1e-14)
     assert call(linear.column_times, A, 1, v) == pytest.approx((A.T @ v)[1], rel=1e-14)
+    np.testing.assert_allclose(filled(linear.multiply, A, M, shape=(3, 3)), A @ M, rtol=1e-13, atol=1e-15)
     assert call(linear.square, A, v) == pytest.approx(v @ A @ v, rel=1e-13)
     assert call(linear.trace, A) == pytest.approx(np.trace(A))
     np.testing.assert_allclose(filled(linear.turn, R, M, shape=(3, 3)), R @ M @ R.T, rtol=1e-13)
