@@ -158,9 +158,7 @@ class WindowBackend:
         s, final = history.repeated(self._steps, self._final)
         if not history.anchored:
             M = before @ inverse(s.poses[-1])
-            first = history.first_frame
-            s, history = moved(s, M), history.moved(M)
-            final = [*final[:first], *(M @ T for T in final[first:])]
+            s, history, final = moved(s, M), history.moved(M), [M @ T for T in final]
         self._state, self._history, self._final = s, history, final
 
     # --- parts ---

@@ -58,12 +58,6 @@ class History:
         """The state before the first call."""
         return self.parts[0].state
 
-    @property
-    def first_frame(self) -> int:
-        """Number of the first frame whose pose is not final at the start."""
-        s = self.start
-        return s.past.left[0].frame if len(s.past) else int(s.frames[0]) if len(s.frames) else 0
-
     def then(self, call: Call, after: State, lag: int) -> History:
         """With one more call, after which the state is `after`; without calls that are more than `lag` frames old."""
         last, parts = self.parts[-1], self.parts[:-1]
@@ -140,4 +134,5 @@ def _state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array
         before, after = (kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position))
         prior = replace(prior, origin=prior.origin + after - before)
     rows = replace(s.rows, z=_corrected(s.rows.z, correct))
-    return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior)
+    past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past
+    return replace(s, rows=rows, landmarks=replace(marks, position=position), prior=prior, past=past)

@@ -68,6 +68,18 @@ class Past:
         """Moved by a rigid motion of the world (4, 4)."""
         return Past(tuple(one.moved(M) for one in self.left))
 
+    def displaced(self, serials: IdArray, displacement: Array) -> Past:
+        """With landmarks by serial number (S,), ascending, displaced (S, 3), as if they had stood there before."""
+
+        def of(own: IdArray) -> Array:
+            at = np.searchsorted(serials, own).clip(0, len(serials) - 1)
+            return np.where((serials[at] == own)[:, None], displacement[at], 0.0)
+
+        return Past(tuple(
+            replace(one, points=one.points + of(one.serials), positions=one.positions + of(one.stayed))
+            for one in self.left
+        ))  # fmt: skip
+
     def revised(self, poses: Mapping[int, Array], points: Mapping[int, Array]) -> dict[int, Array]:
         """Poses (4, 4) by frame, given those of the window by frame and landmarks of its prior by serial number.
 
