@@ -18,7 +18,7 @@ from slam.geometry.se3 import Array
 from slam.object_models import ObjectModels
 
 
-@dataclass
+@dataclass(eq=False)
 class System:
     """Normal equations ``information · step = vector``; changed in place while they are put together."""
 
@@ -72,7 +72,7 @@ def add_measurements(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VelocityPrior:
     """What is known beforehand of a body's first [ω, v] in world axes [rad/s], [m/s].
 
