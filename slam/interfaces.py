@@ -139,7 +139,8 @@ class Backend(Protocol):
 class ObjectBackend(Protocol):
     """Additional methods of a back end that estimates moving objects; back ends without them are given none.
 
-    Called in every step after `Backend.update`, at the same stamp.
+    Called in every step after `Backend.update`, at the same stamp. A further call at that stamp starts new bodies;
+    those that are known stay as they are, and count as not observed.
     """
 
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
