@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -21,6 +22,7 @@ from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
+from slam.testing import hostile
 from tests.backends.scenes import RIG, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
@@ -226,3 +228,7 @@ def test_a_held_pose_gets_back_its_covariance_from_the_solver_that_holds_it():
     np.testing.assert_allclose(found.covariance, truth, rtol=1e-6, atol=1e-6 * np.abs(truth).max())
     assert np.trace(found.covariance) < 0.9 * np.trace(held.covariance)
     assert held.with_covariance_from(np.linalg.inv(1e4 * known - np.eye(6))) is held  # digits that are lost
+
+
+def test_queries_are_pure_with_a_short_lag():
+    hostile.queries_are_pure(partial(SmootherBackend, lag=4, window=3, track=3, explicit=5))
