@@ -117,7 +117,7 @@ class BatchBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         rough = self._smoother.estimate(landmarks)
-        if not (landmarks or self.online or self._solution is not None):
+        if not (landmarks or self.online):
             return rough
         solution = self._solved()
         marks = self._smoother.measurement_log.landmarks
@@ -130,7 +130,7 @@ class BatchBackend:
         path = self._smoother.measurement_log.path
         if not path.count or path.stamps[-1] < rough.stamp:  # predicted only: its measurements are still to come
             return Estimate(rough.stamp, rough.T_world_left, rough.covariance, rough.ids, positions, covariances)
-        P = solution.covariance(pose_key(len(solution.poses) - 1), rough.covariance)
+        P = solution.covariance(pose_key(path.count - 1), rough.covariance)
         return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -158,7 +158,7 @@ class _Solution:
 
     Attributes:
         values: all variables.
-        poses: (F, 4, 4).
+        poses: (F, 4, 4); those before a restart of the smoother are its own.
         landmarks: serial numbers of the landmarks that are variables.
     """
 
@@ -185,8 +185,9 @@ class _Solution:
             self.landmarks.add(serial)
         self._factors = change.factors
         self.values = optimise(change, _ITERATIONS)
-        poses = [self.values.atPose3(pose_key(i)).matrix() for i in range(measurement_log.path.count)]
-        self.poses = np.array(poses).reshape(-1, 4, 4)
+        self.poses, first = measurement_log.path.poses.copy(), measurement_log.history.first
+        for i in range(first, len(self.poses)):
+            self.poses[i] = self.values.atPose3(pose_key(i)).matrix()
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:

@@ -10,6 +10,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from slam.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from slam.calibration.saved import SavedCalibration as SavedCalibration
     from slam.calibration.saved import load_calibration as load_calibration
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from slam.sequences.rigs import load_rig as load_rig
     from slam.system import StereoSlam as StereoSlam
 
-__version__ = "0.1.0"
 
 _PUBLIC = {
     "EstimatorModels": "slam.models",

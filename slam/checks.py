@@ -8,7 +8,7 @@ from slam.errors import MeasurementError
 from slam.geometry.arrays import Array
 
 #: Limits of a measurement: farthest pixel from the origin [px], latest stamp from zero [s].
-FARTHEST_PIXEL, LATEST_STAMP = 1e6, 1e12
+FARTHEST_PIXEL, LATEST_STAMP = 1e5, 1e12
 
 #: Largest coordinate of a position [m]: beyond it, a double has too few digits for what a camera sees.
 FARTHEST_POSITION = 1e8
@@ -33,6 +33,20 @@ def require_stamp(owner: str, stamp: float, last: float | None) -> None:
         raise MeasurementError(
             f"{owner}: stamp {stamp}{after}: time must be finite, increase, and lie within {LATEST_STAMP:g} s"
         )
+
+
+def require_not_measured(owner: str, measured: bool) -> None:
+    """Check that an update comes in its turn.
+
+    Args:
+        owner: the back end's name, for the message.
+        measured: whether the present stamp has had its update, or something was added at its pose.
+
+    Raises:
+        MeasurementError: it has.
+    """
+    if measured:
+        raise MeasurementError(f"{owner}: a stamp has one update, right after its predict")
 
 
 def require_guess(owner: str, guess: Array | None) -> None:

@@ -26,7 +26,7 @@ from slam.rig_error import CommonError, Revision
 from slam.showing import count, of_shapes, point
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoFrame:
     """One pair of images, taken at the same time.
 
@@ -47,7 +47,7 @@ class StereoFrame:
         return f"StereoFrame({self.index}, {self.stamp:.3f} s, {width}x{height} {self.left.dtype}{right})"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImagePair:
     """Rectified grey images of one stereo frame.
 
@@ -59,7 +59,7 @@ class ImagePair:
     right: NDArray[np.float32] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Patches:
     """Image patches around pixels, one row each; made and used by a front end.
 
@@ -96,7 +96,7 @@ class Patches:
         return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoFeatures:
     """Features of one stereo frame, a row each.
 
@@ -157,7 +157,7 @@ class StereoFeatures:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observations:
     """Landmarks seen in one frame, a row each.
 
@@ -213,7 +213,7 @@ class Observations:
         return cls(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """What a back end expects to see, before the measurement.
 
@@ -252,7 +252,7 @@ class UpdateStatus(StrEnum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UpdateReport:
     """What an update did with its observations.
 
@@ -284,7 +284,7 @@ class UpdateReport:
         return cls(status, reason, none, none if rejected is None else rejected, float("nan"), 0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The back end's estimate of pose and landmarks at one time.
 
@@ -343,7 +343,7 @@ class FrameStatus(StrEnum):
         return self in (FrameStatus.STARTED, FrameStatus.TRACKED)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameResult:
     """What one step of the system did.
 

@@ -66,7 +66,7 @@ class Extractor:
         """
         if frontend is None:
             raise ConfigurationError("this system has no front end: use process_features")
-        if not hasattr(frame, "index"):
+        if not isinstance(frame, StereoFrame):
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):

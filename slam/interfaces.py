@@ -62,15 +62,18 @@ class AligningFrontend(Protocol):
 class Backend(Protocol):
     """Estimates the camera's path and the landmarks' positions. Created as ``Backend(rig, **options)``.
 
-    The order of calls in a step is predict, update, then add and remove as needed; `estimate` and `trajectory` may be
-    asked at any time after the first `predict`. The world frame is the left camera's frame at the first `predict`
-    unless the options give an initial pose.
+    The order of calls in a step is predict, at most one update, then add and remove as needed. The world frame is the
+    left camera's frame at the first `predict` unless the options give an initial pose.
+
+    `estimate`, `positions` and `trajectory` may be asked at any time after the first `predict`. They are pure: asking
+    never changes a later answer. A call that raises an exception changes nothing either.
     """
 
     def predict(self, stamp: float) -> Prediction:
         """Advance the belief to `stamp` [s] by the motion model; no measurement yet.
 
-        Returns the predicted pose and the landmarks in the angle of view. The first call sets the start.
+        Returns the predicted pose and the landmarks in the angle of view. The first call sets the start. After a gap of
+        any length the prediction is finite, and its covariances are positive definite.
 
         Raises:
             MeasurementError: `stamp` is not finite or not later than the last one.
@@ -78,15 +81,18 @@ class Backend(Protocol):
         ...
 
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
-        """Correct the belief with landmarks seen at the predicted time. Zero rows are legal.
+        """Correct the belief with landmarks seen at the predicted time. Zero rows are legal: the report is EMPTY.
 
         `guess` is the pose T_world_left (4, 4) on which the observations agree, if the caller knows it. It is no
         measurement, only the first linearisation point, for steps in which the prediction is far off.
 
-        A step that cannot be solved returns a status with a reason, and raises no exception.
+        A row that no point in front of the camera explains, such as one of negative disparity, is rejected as wrong. A
+        step that cannot be solved returns a status with a reason, and raises no exception.
 
         Raises:
-            MeasurementError: an id is not in the map.
+            MeasurementError: before the first `predict`; an id is not in the map; or the time of the last `predict` has
+                had its update, or landmarks were added, bodies updated or measurements revised at it: these rest on the
+                pose as it was.
         """
         ...
 
@@ -94,7 +100,8 @@ class Backend(Protocol):
         """Add new landmarks at their first sight; depth comes from the stereo pair (paper A, Eqs. 8 and 10).
 
         Raises:
-            MeasurementError: an id is in the map already, or a row has no right pixel or no positive depth.
+            MeasurementError: before the first `predict`; an id is in the map already, or a row has no right pixel or no
+                positive depth.
         """
         ...
 
@@ -110,6 +117,8 @@ class Backend(Protocol):
         """The belief after the last call: pose, landmarks, covariances.
 
         With ``landmarks=False`` the landmark rows stay empty: the pose and its covariance alone, cheap in every frame.
+        A smoother may solve further for the whole estimate and for `trajectory`; the pose alone is then the online one,
+        which differs by little of its standard deviation.
         """
         ...
 
@@ -130,7 +139,8 @@ class Backend(Protocol):
 class ObjectBackend(Protocol):
     """Additional methods of a back end that estimates moving objects; back ends without them are given none.
 
-    Called in every step after `Backend.update`, at the same stamp.
+    Called in every step after `Backend.update`, at the same stamp. A further call at that stamp starts new bodies;
+    those that are known stay as they are, and count as not observed.
     """
 
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
@@ -203,7 +213,7 @@ class MapBackend(Protocol):
         `covariances` is the uncertainty of that position. They become correlated with the camera's present pose.
 
         Raises:
-            MeasurementError: before the first `predict`; an id is in the map already, or a covariance is not symmetric
-                and positive definite.
+            MeasurementError: before the first `predict`; an id is in the map already, a landmark is not in front of
+                the camera, or a covariance is not symmetric and positive definite.
         """
         ...

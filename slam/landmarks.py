@@ -13,7 +13,7 @@ from slam.geometry.se3 import Array, transform
 from slam.showing import count
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LandmarkTable:
     """Landmarks in the map, a row each, ids ascending.
 

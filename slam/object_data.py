@@ -17,7 +17,7 @@ from slam.geometry.arrays import Array, BoolArray, IdArray
 from slam.showing import count, of_shapes, point
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectObservations:
     """Points of one rigid body seen in the current frame, a row each.
 
@@ -64,7 +64,7 @@ class ObjectObservations:
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sight:
     """A back end's use of a body's observations in one frame.
 
@@ -79,7 +79,7 @@ class Sight:
     rejected: IdArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectEstimate:
     """A back end's belief about one body at one time.
 
@@ -110,7 +110,7 @@ class ObjectEstimate:
     __repr__ = of_shapes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MovingObject:
     """A moving rigid body as the system reports it with every frame.
 
@@ -145,7 +145,7 @@ class MovingObject:
         return f"MovingObject({self.id}, {where}, {speed:.2f} m/s, {count(len(self.features), 'feature')})"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionLabels:
     """Motion labels of a frame's features.
 

@@ -10,7 +10,7 @@ import numpy as np
 from slam.geometry.arrays import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CommonError:
     """Error of poses due to the rig's error: ``jacobian @ root @ c``, with the same c for all poses.
 

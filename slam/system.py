@@ -40,6 +40,7 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.patch_alignment import Aligner, PatchAnchors
 from slam.tracking.protocol_check import require_estimate, require_positions, require_prediction, require_report
 from slam.tracking.state import TrackingState
+from slam.version import __version__
 
 
 def _require_types(
@@ -376,8 +377,6 @@ class StereoSlam:
         Raises:
             SlamError: there is no map yet.
         """
-        from slam import __version__
-
         with self._stepping, self._named("the map"):
             if self._relocalizer.search is not None:
                 return self._relocalizer.search.known

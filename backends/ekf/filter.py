@@ -17,21 +17,21 @@ from backends.ekf.motion import motion_noise
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import FilterState
-from slam.checks import require_guess, require_stamp
+from slam.checks import require_guess, require_not_measured, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_known
+from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION, landmarks_pose
+from slam.window.gating import with_noise
 
-_PIXELS = 1e5  # guard: no pixel of an image is further from its origin; such a measurement is rejected in any case
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
 _VAGUE = 1e3  # cost: deviation of an innovation, in those of a pixel, above which all of P is brought up to date
 
@@ -62,17 +62,20 @@ class EkfBackend:
         self.config = from_options(EkfConfig, "ekf", options)
         self._stamps: list[float] = []
         self._poses: list[Array] = []
+        self._measured = True  # whether the newest pose may not be updated any more
         self._state = FilterState(rig, models, self.config)
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
 
     def saved(self) -> Callable[[], None]:
         """A function that puts everything back as it is now."""
         state, count, last = self._state.saved(), len(self._stamps), self._poses[-1:]
+        measured = self._measured
 
         def restore() -> None:
             state()
             del self._stamps[count:], self._poses[count:]
             self._poses[count - len(last) :] = last
+            self._measured = measured
 
         return restore
 
@@ -87,6 +90,7 @@ class EkfBackend:
             self._state.advance(stamp - self._stamps[-1])
         self._stamps.append(float(stamp))
         self._poses.append(self._state.pose())
+        self._measured = False
         return self._prediction()
 
     @one_blas_thread
@@ -94,8 +98,10 @@ class EkfBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
+        require_not_measured("ekf", self._measured)
         require_guess("ekf", guess)
         slots = self._state.landmarks.slots(observations.ids)
+        self._measured = True
         if not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         self._state.make_local(slots)
@@ -129,12 +135,10 @@ class EkfBackend:
         if not len(observations):
             return
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
-        bad = ~(np.isfinite(h).all(axis=1) & (np.abs(observations.uv_left) < _PIXELS).all(axis=1))
+        bad = ~np.isfinite(h).all(axis=1)
         if bad.any():
-            raise MeasurementError(
-                f"ekf: landmark {observations.ids[bad][0]} has no right pixel, no positive depth or no pixel that a "
-                "camera has"
-            )
+            raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
+        self._measured = True
         h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         self._state.place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
 
@@ -183,8 +187,10 @@ class EkfBackend:
         """See `slam.interfaces.MapBackend.place`."""
         self._require_started("place")
         require_known("ekf", ids, local, covariances)
+        require_in_front("ekf", ids, local)
         self._state.landmarks.require_new(ids)
         if len(ids):
+            self._measured = True
             self._state.place(ids, local, covariances)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
@@ -197,6 +203,7 @@ class EkfBackend:
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
         """
+        self._measured = True
         marks, rectified_rig = self._state.landmarks, self.rig.rectified
         if not len(marks) or not self._poses:
             return
@@ -221,6 +228,7 @@ class EkfBackend:
     def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
         """See `slam.interfaces.ObjectBackend.update_objects`."""
         self._require_started("update_objects")
+        self._measured = True
         return self._state.objects.update(observations, self._stamps[-1], self._state.camera_belief)
 
     @all_or_nothing
@@ -241,14 +249,12 @@ class EkfBackend:
         right = z[:, [2, 1]] if self.rig.is_rectified else self.rig.project(h)[1]
         line = chained(z[:, :2], J[:, :2], h, R, self._state.camera[3:6], marks.jacobian(slots))
         blocks, cross = covariance.of_landmarks(slots)
-        S = innovation_covariances(line, covariance.pose, cross, blocks, self.models.pixel_sigma)
+        S = with_noise(innovation_covariances(line, covariance.pose, cross, blocks), self.models.pixel_sigma)
         return Prediction(self._stamps[-1], T, self._state.pose_covariance(), marks.ids[slots], line.z, right, S)
 
     def _problem(self, observations: Observations, slots: IndexArray, guess: Array | None) -> Problem:
         """The update in the coordinates [r, φ, measured landmarks]."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
-        if not (np.abs(z) < _PIXELS).all():
-            z = np.clip(np.where(np.isfinite(z), z, np.nan), -_PIXELS, _PIXELS)
         if self.config.measurement == "left":
             z[:, 2] = np.nan
         state, marks = self._state, self._state.landmarks

@@ -11,7 +11,7 @@ from slam.data import BoolArray
 from slam.geometry.se3 import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Displacement:
     """What an update does not measure: a displacement ξ (6,) of camera and landmarks together.
 
@@ -24,7 +24,7 @@ class Displacement:
     share: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Jacobian:
     """H (3M, 6 + 3M), as products with it; ``H − H U L`` where it is taken without a displacement of the world.
 

@@ -19,7 +19,7 @@ _HAT = hat(np.eye(3))
 _BY_POSE = np.array([-1.0, -1, -1, 1, 1, 1])  # the camera's position counts with opposite sign
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Linearisation:
     """Predicted measurements and their derivatives, K pixel components a landmark.
 
@@ -61,7 +61,7 @@ class Measurement(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoMeasurement:
     """(uL, vL, uR) of landmarks, as a function of ``x = [r, φ, coordinates of each landmark]`` (6 + 3M,).
 
@@ -110,18 +110,16 @@ def chained(z: Array, J: Array, h: Array, R: Array, phi: Array, D: Array) -> Lin
     return Linearisation(z, out, out[..., :3] @ D)
 
 
-def innovation_covariances(line: Linearisation, pose: Array, cross: Array, blocks: Array, sigma: float) -> Array:
-    """Covariances (M, K, K) [px²] of each landmark's innovation by itself, measurement noise included.
+def innovation_covariances(line: Linearisation, pose: Array, cross: Array, blocks: Array) -> Array:
+    """Covariances (M, K, K) [px²] of each landmark's innovation by itself, without the measurement's noise.
 
     Args:
         line: derivatives of the measurements.
         pose: covariance (6, 6) of [r, φ].
         cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
         blocks: covariances (M, 3, 3) of these coordinates.
-        sigma: pixel noise [px].
     """
     A, B = line.by_pose, line.own
     At = A.transpose(0, 2, 1)
     S = (A @ pose + 2 * (B @ cross)) @ At
-    S = 0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1)
-    return np.asarray(S + sigma**2 * np.eye(S.shape[1]))
+    return np.asarray(0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1))

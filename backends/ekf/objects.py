@@ -71,7 +71,8 @@ class ObjectFilter:
         """See `slam.interfaces.ObjectBackend.update_objects`; the camera's belief is asked for if need be."""
         seen = {o.id: o for o in observations}
         self._require_usable(observations)
-        dt, self._stamp, self._now = stamp - self._stamp, stamp, self._now + 1
+        dt = stamp - self._stamp
+        self._stamp, self._now = stamp, self._now + (dt != 0)
         if not (self._bodies or seen):
             return []
         camera, out = belief(), []
@@ -79,8 +80,8 @@ class ObjectFilter:
             body, sight = self._bodies.get(number), Sight()
             if body is None:
                 body, sight = self._start(seen[number], camera)
-            else:
-                body = advanced(body, dt, self._models.objects) if dt > 0 else body
+            elif dt > 0:
+                body = advanced(body, dt, self._models.objects)
                 if number in seen:
                     body, sight = self._measure(body, seen[number], camera, dt)
             self._bodies[number] = body

@@ -25,7 +25,7 @@ from slam.objects.points import drift
 RIGID = 12  #: fixed: size of [θ, τ, δω, δv]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraBelief:
     """The camera's pose as the filter has it.
 
@@ -50,7 +50,7 @@ class CameraBelief:
         return np.ascontiguousarray(self.by_state @ self.columns.T)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body's belief.
 
@@ -195,7 +195,7 @@ def without(body: Body, gone: BoolArray) -> Body:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gathered:
     """Covariances with ``g = [r, φ, observed points]`` of `BodyMeasurement`, camera error included.
 

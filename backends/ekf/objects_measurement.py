@@ -19,7 +19,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, hat, pose, so3_exp, so3_left_jacobian, so3_log
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BodyPoints:
     """Points of a body, each in inverse-depth coordinates of the camera that saw it first.
 

@@ -27,7 +27,7 @@ from slam.window.agreement import MIN_CONSENSUS, MIN_OBSERVATIONS, ONE_AGREES_IN
 Search = Callable[[], "Array | None"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Agreement:
     """A solution, the problem that it solves, and the noise (12, 12) that joined the camera's covariance for it."""
 

@@ -46,7 +46,7 @@ class UnsolvableError(ArithmeticError):
     """The update has no usable solution; the message says why. It never leaves the back end."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """One update, in the coordinates g = [r, φ, measured landmarks].
 
@@ -100,7 +100,7 @@ class Problem:
         return Jacobian.of(line, rows, self.displacement if change.any() else None)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The maximum of the posterior (or one step towards it).
 
@@ -140,7 +140,7 @@ class Solution:
         return 1 / (sigma * float(self.inverse.diagonal().min()))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Iterate:
     """A correction, the change of the mean that it makes, what is predicted there, and the cost.
 
@@ -153,7 +153,7 @@ class _Iterate:
     cost: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _System:
     """The linear update at an iterate: Jacobian H, innovation ν taken back to the prior, its covariance S.
 
@@ -192,7 +192,7 @@ class _System:
         return _System(rows, self.H.only(rows), nu, S, cross, self.prior)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gated:
     """Which landmarks (M,) each lie within the gate of their own innovation covariance, linearised at `start`.
 

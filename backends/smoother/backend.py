@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -19,20 +19,22 @@ from backends.smoother.objects import ObjectSmoother
 from backends.smoother.pose_set import PredictedPose
 from backends.smoother.prediction import normalised_innovation
 from backends.smoother.rollback import snapshot
-from slam.checks import require_guess, require_stamp
+from backends.smoother.solver import SolverError
+from slam.checks import require_guess, require_not_measured, require_stamp
 from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
 from slam.errors import CopyError, MeasurementError
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_known
+from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
 from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window import pose_only
 from slam.window.agreement import landmarks_pose
+from slam.window.gating import with_noise
 from slam.window.pose_only import residual_noise, seen_from
 from slam.window.recovery import Agreement, agreement, world_covariance
 from slam.window.stereo import RectifiedStereo
@@ -62,6 +64,8 @@ class SmootherBackend:
         self._graph = FactorGraph(self._make, self.config)
         self._belief = Belief(self._graph, models)
         self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
+        self._answer: tuple[MeasurementLog, Belief] | None = None  # what `estimate` and `trajectory` last gave
+        self._measured = False  # whether the predicted pose has had its update
         self._contradicted = 0  # updates in succession that disagreed with the path
 
     @property
@@ -89,18 +93,14 @@ class SmootherBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
+        path = self.measurement_log.path
+        last = path.predicted.stamp if path.predicted is not None else float(path.stamps[-1]) if path.count else None
+        require_stamp("smoother", stamp, last)
         self._graph.repair()
         self._commit()
-        stamps = self.measurement_log.path.stamps
-        require_stamp("smoother", stamp, float(stamps[-1]) if len(stamps) else None)
-        if not len(stamps) and not len(self.measurement_log.landmarks):
-            T, none = self.models.initial_pose, np.zeros((0, 2))
-            with self._whole():
-                self._graph.append_pose(stamp, T)
-                P = self._belief.window().covariance.copy()
-                return Prediction(stamp, T, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))
         predicted = self._belief.predicted(stamp)
         in_view = self._in_view(predicted)
+        self._answer, self._measured = None, False
         self.measurement_log.path.predicted = predicted  # last: an interrupted call has predicted nothing
         return in_view
 
@@ -108,10 +108,20 @@ class SmootherBackend:
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")
+        predicted = self.measurement_log.path.predicted
+        require_not_measured("smoother", predicted is None or self._measured)
         require_guess("smoother", guess)
         slots = self.measurement_log.landmarks.slots(observations.ids)
-        predicted = self.measurement_log.path.predicted
-        if predicted is None or not len(slots):
+        assert predicted is not None
+        report = self._corrected(predicted, slots, observations, guess)
+        self._measured = True
+        return report
+
+    def _corrected(
+        self, predicted: PredictedPose, slots: IndexArray, observations: Observations, guess: Array | None
+    ) -> UpdateReport:
+        """The update by observations of landmarks `slots`."""
+        if not len(slots):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         z, P = self._stereo.measure(observations), predicted.covariance
         try:
@@ -169,12 +179,11 @@ class SmootherBackend:
         """See `slam.interfaces.Backend.estimate`."""
         self._require_started("estimate")
         self._graph.repair()
-        if landmarks and self.measurement_log.path.predicted is None:
-            self._graph.converge()
-        stamp, T, P = self._belief.newest()
-        marks = self.measurement_log.landmarks
+        log, belief = self._converged() if landmarks else (self.measurement_log, self._belief)
+        stamp, T, P = belief.newest()
+        marks = log.landmarks
         slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
-        covariances = self._belief.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
+        covariances = belief.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
         return Estimate(stamp, T, P, marks.ids[slots], marks.position[slots], covariances)
 
     def positions(self, ids: IdArray) -> Array:
@@ -186,11 +195,10 @@ class SmootherBackend:
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
         self._graph.repair()
-        path = self.measurement_log.path
+        path = self._converged()[0].path
         ahead = path.predicted
         if ahead is not None:  # not in the graph yet: its measurements are still to come
             return Trajectory(np.append(path.stamps, ahead.stamp), np.concatenate([path.poses, ahead.T[None]]))
-        self._graph.converge()
         return Trajectory(path.stamps.copy(), path.poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
@@ -208,7 +216,10 @@ class SmootherBackend:
         """See `slam.interfaces.MapBackend.place`."""
         self._require_started("place")
         require_known("smoother", ids, local, covariances)
+        require_in_front("smoother", ids, local)
         self._require_new(ids)
+        if not len(ids):
+            return
         self._commit()
         with self._whole():
             self._graph.add_known(ids, local, covariances, self.measurement_log.path.count - 1)
@@ -218,8 +229,8 @@ class SmootherBackend:
     @property
     def revises_path(self) -> bool:
         """See `slam.interfaces.RevisingBackend`: True while all poses and measurements are still in the problem."""
-        self._commit()  # poses may leave with it
-        return self.measurement_log.history.first == self.measurement_log.history.restarted == 0
+        history = self.measurement_log.history
+        return history.first == history.restarted == 0 and not self._graph.poses_leave()
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
@@ -260,14 +271,27 @@ class SmootherBackend:
     @contextmanager
     def _whole(self) -> Iterator[None]:
         """Make a block atomic: if it is interrupted, the measurement log is restored."""
+        self._answer = None
         self._graph.repair()
         restore = snapshot(self.measurement_log)
         try:
             yield
+            self._belief.window()  # here, as it may have to repair the solver, which a query must not do
         except BaseException:
             self._graph.interrupted()
             restore()
             raise
+
+    def _converged(self) -> tuple[MeasurementLog, Belief]:
+        """Everything as the converged problem has it, without changing the state; as it stands if that fails."""
+        if self._answer is None:
+            log, belief = self.measurement_log, self._belief
+            with suppress(SolverError):
+                if log.path.count:
+                    graph = self._graph.converged()
+                    log, belief = graph.log, Belief(graph, self.models)
+            self._answer = log, belief
+        return self._answer
 
     def _commit(self) -> None:
         """Put a predicted pose without measurements into the graph."""
@@ -284,7 +308,7 @@ class SmootherBackend:
         points = self._belief.points(predicted, slots)
         uv, J = rig.left.project_with_jacobian(points.local)
         right = rig.right.project((points.local + rig.b) @ rig.R.T)
-        S = points.covariance(J) + self.models.pixel_sigma**2 * np.eye(2)
+        S = with_noise(points.covariance(J), self.models.pixel_sigma)
         return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
 
     def _solve_pose(

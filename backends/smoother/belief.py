@@ -139,7 +139,6 @@ class Belief:
                 variables, pose_key(path.count - 1), self._log.history.reference
             )
         except SolverError:
-            self._graph.recover()
             return P
         for row, key in enumerate(variables):
             if key in exact:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 
 import numpy as np
 
@@ -76,7 +77,6 @@ class FactorGraph:
         self.rebuilds = 0
         self._rebuilt = -_EVERY  # number of frames when the solver was last rebuilt
         self._broken = False  # whether a call was interrupted since
-        self._solved = True  # whether all is solved to the last
         self._moved = 0.0  # how far the window's oldest pose has been revised since all poses were read back
         self._converged = 0  # number of frames then
         self.solutions = 0
@@ -174,7 +174,7 @@ class FactorGraph:
         log.path.append(stamp, T_world_left)
         log.restart(reference_prior(pose_key(frame), T_world_left, covariance), covariances)
         self._out_of_date()
-        self._solved, self._broken = False, True
+        self._broken = True
         rows = log.measurements.append(z, frame, log.landmarks.serial[slots])
         self._factor_builder.grow(Change(), slots, rows, z)
         try:
@@ -254,19 +254,24 @@ class FactorGraph:
         P = held.released(P, P[:, :6], P[:6, :6])
         return P if len(others) < len(keys) else P[6:, 6:]
 
-    def converge(self) -> None:
-        """Solve to convergence: relinearise all variables until none moves any more."""
-        if self._solved:
-            return
-        try:
-            change = Change()
-            self._factor_builder.eliminate_late(change)
-            self.solver.converge(change, self._last, _ROUNDS)
-            self._read_all()
-        except SolverError:
-            self.recover()
-        self._solved = True
-        self.solutions += 1
+    def converged(self) -> FactorGraph:
+        """The same problem, solved until no variable moves any more, in a graph of its own; this one stays as it is.
+
+        Takes time in proportion to the run.
+
+        Raises:
+            SolverError: it cannot be solved.
+        """
+        other = copy(self)
+        other.log = self.log.copied()
+        other._factor_builder = FactorBuilder(self._make, self.config, other.log)
+        other._rebuild(solved=False)
+        change = Change()
+        other._factor_builder.eliminate_late(change)
+        other.solver.converge(change, self._last, _ROUNDS)
+        other._read_all()
+        other.solutions += 1
+        return other
 
     def _read_all(self, before: Array | None = None) -> None:
         """Write all poses and landmarks from the solver to the log; `before` are the poses as they were."""
@@ -302,7 +307,6 @@ class FactorGraph:
             self._factor_builder.eliminate_late(change)
         change.values.insert(pose_key(i), to_pose3(path.poses[i]))
         change.factors.add(pose_factor(self._make, path, i))
-        self._solved = False
         self.solutions += 1
         thorough = path.count % _EVERY == 0 and self._overdue() is None  # a new solver relinearises all
         return self.solver.update(change, self._seldom if thorough else self._often)
@@ -311,7 +315,11 @@ class FactorGraph:
 
     def _overdue(self) -> int | None:
         """Frame of the oldest pose to keep, if poses are to be marginalised in this frame; else None."""
-        return None if self.config.lag is None else overdue(self.log, self.config.lag)
+        return overdue(self.log, self.config.lag)
+
+    def poses_leave(self) -> bool:
+        """Whether poses are marginalised before anything else is done, as one that is predicted joins them."""
+        return self.log.path.predicted is not None and overdue(self.log, self.config.lag, coming=1) is not None
 
     def _advance(self) -> None:
         """Marginalise what is older than the lag, and go on with a new solver; after a failure the next frame tries."""

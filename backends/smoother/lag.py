@@ -20,7 +20,7 @@ from backends.smoother.variables import pose_key, put, size_of
 _SHARE = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Marginalised:
     """The problem after marginalisation.
 
@@ -43,9 +43,11 @@ class Marginalised:
     slots: dict[int, int]
 
 
-def overdue(log: MeasurementLog, lag: int) -> int | None:
-    """Frame of the oldest pose to keep, if it is time to marginalise others; else None."""
-    first = log.path.count - lag
+def overdue(log: MeasurementLog, lag: int | None, coming: int = 0) -> int | None:
+    """Frame of the oldest pose to keep, if it is time to marginalise others, or is when `coming` more are there."""
+    if lag is None:
+        return None
+    first = log.path.count + coming - lag
     return first if first >= log.history.first + max(1, lag // _SHARE) else None
 
 

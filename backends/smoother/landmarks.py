@@ -67,7 +67,7 @@ class Track:
         return Track(self.limit)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Known:
     """What was known of a landmark before it was measured.
 

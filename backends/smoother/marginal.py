@@ -30,7 +30,7 @@ _JITTER = (1e-13, 1e-11, 1e-9)
 _NOTHING = 1e-12  # numerics: information [1/m², 1/rad²] that is none
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MarginalPrior:
     """A Gaussian on poses and landmarks relative to the first of the poses, and on that pose in the world.
 

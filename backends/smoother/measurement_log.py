@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backends.smoother.landmarks import Known, Landmarks, Track
+from backends.smoother.marginal import MarginalPrior
 from backends.smoother.path import Path, grown
+from backends.smoother.reference_pose import ReferencePose
 from slam.data import IndexArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
-
-if TYPE_CHECKING:
-    from backends.smoother.marginal import MarginalPrior, ReferencePose
 
 _SINGULAR = 1e-12  # numerics: smallest eigenvalue of a covariance, as a share of its trace
 
@@ -106,6 +105,14 @@ class MeasurementLog:
         self.measurements = Measurements()
         self.landmarks = Landmarks()
         self.history = History()
+
+    def copied(self) -> MeasurementLog:
+        """A copy; what is only ever replaced in the parts, such as tracks, belongs to both."""
+        other = MeasurementLog()
+        for name, part in vars(self).items():
+            mutable = {k: v.copy() for k, v in vars(part).items() if isinstance(v, (np.ndarray, list, dict))}
+            vars(getattr(other, name)).update({**vars(part), **mutable})
+        return other
 
     def window(self, most: int) -> IndexArray:
         """Frames of the poses whose joint covariance is worked out, at most so many: see `Path.newest`."""

@@ -237,7 +237,7 @@ class ObjectSmoother:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Measured:
     """Observations of a body in the rectified rig.
 

@@ -18,7 +18,7 @@ from slam.object_models import ObjectModels
 from slam.window.stereo import RectifiedStereo
 
 
-@dataclass
+@dataclass(eq=False)
 class System:
     """Normal equations ``information · step = vector``; changed in place while they are put together."""
 
@@ -72,7 +72,7 @@ def add_measurements(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VelocityPrior:
     """What is known beforehand of a body's first [ω, v] in world axes [rad/s], [m/s].
 

@@ -19,7 +19,7 @@ from slam.window.agreement import INFLATION
 from slam.window.stereo import RectifiedStereo
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictedBody:
     """A body's pose in a new frame, before it is measured.
 
@@ -75,7 +75,7 @@ def predicted(window: Window, camera: CameraWindow, stamp: float, models: Object
     return PredictedBody(T, X, own, (by_velocity * sigmas**2) @ by_velocity.T)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Agreement:
     """Where a body seems to be, and which observations (M,) say so.
 

@@ -30,7 +30,7 @@ _TURN = 0.01  # a point is seen from elsewhere by no less [rad]; what is less ad
 _LINEAR = 0.01  # cost: a turn by less [rad] changes no derivative by much; the next frame relinearises in any case
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraWindow:
     """The camera's poses in the frames of a window.
 
@@ -60,7 +60,7 @@ class CameraWindow:
         return conditional
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """What is known of a window's unknowns besides its measurements: a quadratic about fixed values.
 
@@ -75,7 +75,7 @@ class Prior:
     points: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Window:
     """One body in the last n frames.
 

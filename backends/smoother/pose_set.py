@@ -13,7 +13,7 @@ _ROUNDING = 1e-7  # numerics: of correlations
 _TINY = 1e-150  # numerics: standard deviation that keeps a division possible
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseSet:
     """Poses with their joint covariance.
 
@@ -31,7 +31,7 @@ class PoseSet:
         return len(self.poses)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictedPose:
     """The newest pose before its measurements.
 

@@ -61,7 +61,7 @@ def propagated_covariance(models: EstimatorModels, path: Path, known: PoseSet | 
     return known.covariance[np.ix_(rows, rows)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictedPoints:
     """Landmarks in the predicted camera's coordinates.
 

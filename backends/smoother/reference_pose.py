@@ -13,7 +13,7 @@ _FIRMER = 1e4  # numerics: information with which a pose is held, as a multiple 
 _STRAIN = 0.25  # squared standard deviations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReferencePose:
     """A pose held by a prior much stronger than what is known of it, so that the whole problem does not drift.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,16 +12,17 @@ from backends.window.config import WindowConfig
 from backends.window.history import Call, History, moved
 from backends.window.state import State
 from backends.window.steps import Steps
-from slam.checks import require_guess, require_stamp
+from slam.checks import require_guess, require_not_measured, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.known_landmarks import require_known
+from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
+
 
 class WindowBackend:
     """A sliding-window filter with a relative marginal prior: a few poses, and the landmarks that they see.
@@ -75,6 +77,7 @@ class WindowBackend:
         """See `slam.interfaces.Backend.update`."""
         s = self._started("update")
         require_guess("window", guess)
+        require_not_measured("window", s.measured)
         ids, z = observations.ids.copy(), self._steps.stereo.measure(observations)
         after, report = self._steps.updated(s, ids, z, guess)
         if after.begun != s.begun:  # a restart: what was before is final
@@ -112,7 +115,7 @@ class WindowBackend:
         return marks.position[marks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, older ones are final."""
+        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final."""
         poses = np.array(self._final).reshape(-1, 4, 4)
         for frame, T in self._state.revised_poses().items():
             poses[frame] = T
@@ -134,6 +137,7 @@ class WindowBackend:
         """See `slam.interfaces.MapBackend.place`."""
         s = self._started("place")
         require_known("window", ids, local, covariances)
+        require_in_front("window", ids, local)
         s.landmarks.require_new(ids)
         arguments = np.array(ids, np.int64), np.array(local, float), np.array(covariances, float)
         if len(ids):
@@ -159,7 +163,7 @@ class WindowBackend:
         if not history.anchored:
             M = before @ inverse(s.poses[-1])
             s, history, final = moved(s, M), history.moved(M), [M @ T for T in final]
-        self._state, self._history, self._final = s, history, final
+        self._state, self._history, self._final = replace(s, measured=True), history, final
 
     # --- parts ---
 

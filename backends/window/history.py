@@ -63,7 +63,7 @@ class History:
         last, parts = self.parts[-1], self.parts[:-1]
         parts = (*parts, replace(last, calls=(*last.calls, call)))
         begun = last.state.frames[-1] if len(last.state.frames) else -1
-        if after.frames[-1:] >= begun + _EVERY and call.step == "predicted":
+        if call.step == "predicted" and after.frames[-1] >= begun + _EVERY:
             parts = (*parts, Part(after))
             while len(parts) > 2 and after.frames[-1] - parts[1].state.frames[-1] >= lag:
                 parts = parts[1:]
@@ -103,9 +103,7 @@ def moved(s: State, M: Array) -> State:
     """A state moved by a rigid motion of the world (4, 4)."""
     R, marks = M[:3, :3], s.landmarks
     marks = replace(marks, position=transform(M, marks.position), world=R @ marks.world @ R.T)
-    return replace(
-        s, poses=M @ s.poses, landmarks=marks, prior=replace(s.prior, T=M @ s.prior.T), past=s.past.moved(M)
-    )
+    return replace(s, poses=M @ s.poses, landmarks=marks, prior=replace(s.prior, T=M @ s.prior.T), past=s.past.moved(M))
 
 
 def _corrected(z: Array, correct: Callable[[Array], Array]) -> Array:
@@ -131,7 +129,9 @@ def _state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array
     prior, members = s.prior, s.prior.points
     if len(members):
         axes = np.ascontiguousarray(np.broadcast_to(np.eye(3), (len(members), 3, 3)))
-        before, after = (kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position))
+        before, after = (
+            kernels.chart_changes(s.poses[0], p[members], prior.basis, axes)[0] for p in (marks.position, position)
+        )
         prior = replace(prior, origin=prior.origin + after - before)
     rows = replace(s.rows, z=_corrected(s.rows.z, correct))
     past = s.past.displaced(marks.serial, position - marks.position) if len(marks) else s.past

@@ -105,6 +105,7 @@ class State:
         landmarks: the map.
         past: poses that have left the window and are still revised.
         serials: number of landmarks so far.
+        measured: whether the newest pose may not be updated any more.
         contradicted: updates in succession in which most observations agreed on another pose than was expected.
     """
 
@@ -121,6 +122,7 @@ class State:
     landmarks: Landmarks = field(default_factory=Landmarks.none)
     past: Past = field(default_factory=Past)
     serials: int = 0
+    measured: bool = False
     contradicted: int = 0
 
     @classmethod
@@ -140,7 +142,7 @@ class State:
         return {**self.past.revised(poses, points), **poses}
 
     def settled(self, lag: int) -> tuple[State, dict[int, Array]]:
-        """With a past of at most `lag` frames, once it is half as long again; and the poses (4, 4) that are final now."""
+        """With a past of `lag` frames, once it is half as long again; and the poses (4, 4) that are final now."""
         surplus = len(self.past) - lag
         if surplus <= lag // 2:
             return self, {}

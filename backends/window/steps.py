@@ -9,6 +9,7 @@ import numpy as np
 
 from backends.window import motion
 from backends.window.config import WindowConfig
+from backends.window.past import Past
 from backends.window.problem import problem
 from backends.window.slide import slid
 from backends.window.state import Landmarks, State
@@ -20,6 +21,7 @@ from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.models import EstimatorModels
 from slam.window import kernels, pose_only
 from slam.window.agreement import landmarks_pose
+from slam.window.gating import with_noise
 from slam.window.problem import Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, world_covariance
 from slam.window.solver import Solution, solve
@@ -76,7 +78,7 @@ class Steps:
         P = np.block([[s.covariance, cross.T], [cross, 0.5 * (own + own.T)]])
         return replace(
             s, frames=np.append(s.frames, s.frames[-1] + 1), stamps=np.append(t, stamp),
-            poses=np.concatenate([s.poses, T[None]]), covariance=P,
+            poses=np.concatenate([s.poses, T[None]]), covariance=P, measured=False,
         )  # fmt: skip
 
     def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
@@ -88,13 +90,12 @@ class Steps:
         by_pose = points_by_pose(local)
         C = own + by_pose @ between(s, s.solved) @ np.swapaxes(by_pose, 1, 2)
         uv, J = rig.left.project_with_jacobian(local)
-        S = J @ C @ np.swapaxes(J, 1, 2)
-        S = 0.5 * (S + np.swapaxes(S, 1, 2)) + self.models.pixel_sigma**2 * np.eye(2)
+        S = with_noise(J @ C @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
         return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
 
     def updated(self, s: State, ids: IdArray, z: Array, guess: Array | None) -> tuple[State, UpdateReport]:
         """After measurements z (M, 3) of landmarks."""
-        points = s.landmarks.rows_of(ids)
+        points, s = s.landmarks.rows_of(ids), replace(s, measured=True)
         if not len(points):
             return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
         try:
@@ -163,9 +164,7 @@ class Steps:
         noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
         in_world = (s.landmarks.information[points, 0, 0] > 0).any() or s.solved == len(s.frames) - 1
         information = np.linalg.inv(s.covariance[-6:, -6:] if in_world else between(s, s.solved))
-        one = pose_only.PoseProblem(
-            self.stereo, position, z, noise, T, information, self.models.gate_probability
-        )
+        one = pose_only.PoseProblem(self.stereo, position, z, noise, T, information, self.models.gate_probability)
 
         def search() -> Array | None:
             rectified = self.stereo.rectified_rig
@@ -231,7 +230,7 @@ def _with_new(s: State, ids: IdArray, local: Array, covariances: Array) -> State
     by_pose = R @ points_by_pose(local)
     world = R @ covariances @ R.T + by_pose @ s.covariance[-6:, -6:] @ np.swapaxes(by_pose, 1, 2)
     turn = s.poses[s.solved][:3, :3].T @ R
-    return _with(s, Landmarks(
+    return _with(replace(s, measured=True), Landmarks(
         ids, s.serials + np.arange(n), local @ R.T + T[:3, 3], turn @ covariances @ turn.T,
         0.5 * (world + np.swapaxes(world, 1, 2)), np.full(n, int(s.frames[-1])), np.zeros((n, 3)), np.zeros((n, 3, 3)),
     ))  # fmt: skip
@@ -255,15 +254,13 @@ def _restarted(s: State, T: Array, points: IndexArray) -> State:
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     one = replace(
         s, frames=s.frames[-1:], stamps=s.stamps[-1:], poses=T[None], covariance=P, solved=0, begun=int(s.frames[-1]),
-        rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P), cost=0.0, past=s.past.without(len(s.past)),
+        rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P), cost=0.0, past=Past(),
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
     return replace(one, places=_places(one, points, local, own))
 
 
-def _after(
-    s: State, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray
-) -> State:
+def _after(s: State, solution: Solution, points: IndexArray, local: Array, world: Array, seen: IndexArray) -> State:
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w = s.landmarks, solution.window
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance)

@@ -16,7 +16,7 @@ _LANES = 16  # cost: columns are searched in whole vector registers
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HalfImage:
     """An image at half resolution, ready for correlation.
 

@@ -20,7 +20,7 @@ UPRIGHT_ANGLE = 1.5 * np.pi
 _NO_ANGLE = -1.0  # fixed: of a cv2.KeyPoint [degrees]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Keypoints:
     """Detected features, a row each, by falling response.
 

@@ -13,7 +13,7 @@ from slam.geometry.se3 import Array
 _ROUNDS = 4  # numerics: fixed-point iterations that undo a correction; each reduces the error some 30 times
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigCorrection:
     """Maps measured pixels to those of an ideal rig.
 
@@ -50,7 +50,7 @@ class RigCorrection:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Revision:
     """A change of the correction during a run, for measurements that have the earlier correction.
 

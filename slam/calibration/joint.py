@@ -48,7 +48,7 @@ def joint_calibration(model: RigModel, evidence: Sequence[RecordingEvidence], sy
     return SavedCalibration(posterior, RigNumbers.of(model.rig), solution.residual)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Agreement:
     """Differences between recordings, each by its own evidence.
 

@@ -25,7 +25,7 @@ _EXACT = 1e-3  # numerics: least noise of pixels and disparities [px]
 _LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """The same still points in two views.
 
@@ -66,7 +66,7 @@ class Linear(NamedTuple):
         return cls(np.empty((n, 3)), np.empty((n, 3, 3)), J_motion, motion, np.empty((n, 3, 3)), np.empty((n, 3)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """The motion that takes one view's points to the other's, and the linear problem about it.
 

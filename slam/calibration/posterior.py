@@ -14,7 +14,7 @@ from slam.errors import CalibrationError
 from slam.geometry.se3 import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigPosterior:
     """Gaussian belief about the parameters of `slam.calibration.model`.
 
@@ -79,7 +79,7 @@ class RigPosterior:
         return cls(names, units, mean, covariance)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Posterior of the parameters.
 

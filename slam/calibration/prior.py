@@ -55,7 +55,7 @@ _FOCALS = (0.1, 1.0)  # the same of a common error of the focal lengths
 _NEAR = 0.05  # disparity [focal lengths] of points that are near
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """Prior of the parameters: a mixture of Gaussians with one mean and several covariances.
 

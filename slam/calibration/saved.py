@@ -77,7 +77,7 @@ class RigNumbers:
         return ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SavedCalibration:
     """The errors of a rig's calibration as self-calibration has estimated them, with covariance.
 

@@ -23,7 +23,7 @@ from slam.geometry.se3 import adjoint, inverse, points_by_pose, transform
 _ROUNDING = 1e-12  # numerics: of the trace of a covariance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InactiveLandmarks:
     """Landmarks outside the filter's state, as they were when they left it; one row each, ids ascending.
 
@@ -56,7 +56,7 @@ class InactiveLandmarks:
         return both.select(np.argsort(both.ids, kind="stable"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SensitivityState:
     """The filter's state: the pose (six rows) and F recently measured landmarks (three rows each).
 

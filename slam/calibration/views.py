@@ -30,7 +30,7 @@ Rows = tuple[NDArray[np.intp], NDArray[np.intp]]
 NO_MATCHES: Rows = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """The stereo features of one frame, as measured.
 

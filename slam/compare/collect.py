@@ -41,7 +41,7 @@ SERIES_COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measured:
     """A finished run in numbers.
 
@@ -190,7 +190,7 @@ class Lifetimes:
         return {"lifetime_frames": float(np.median(lived)), "lifetime_mean_frames": float(np.mean(lived))}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Frame:
     """What is kept of one frame."""
 

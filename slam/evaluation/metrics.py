@@ -53,7 +53,7 @@ class Statistics:
         return cls(rmse, mean, median, std, float(np.min(errors)), float(np.max(errors)), len(errors))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PathErrors:
     """Errors of poses, or of relative motions, row by row.
 
@@ -78,7 +78,7 @@ class PathErrors:
         return Statistics.of(self.rotation)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SegmentErrors:
     """Errors over stretches of the path, a row each.
 

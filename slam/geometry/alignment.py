@@ -15,7 +15,7 @@ _STILL = 1e-12  # numerics: [m²] product of the two spreads: less than a microm
 _COLLINEAR = 1e-12  # numerics: second singular value by the first, below which positions lie on a line
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """A similarity ``target ≈ scale R source + t``.
 

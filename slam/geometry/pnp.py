@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import BoolArray
-from slam.geometry.arrays import median
+from slam.geometry.arrays import BoolArray, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse
 
@@ -28,7 +27,7 @@ _ENOUGH = 100  # cost: matches that fix a pose far better than is needed to tell
 _CONVERGED = 1e-4  # numerics: step [rad], [m] after which the pose has converged, to far less than that
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseConsensus:
     """A pose and the matches that agree with it.
 

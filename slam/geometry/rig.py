@@ -27,7 +27,7 @@ class RectificationMaps(NamedTuple):
     y: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoRig:
     """Two pinhole cameras and how they stand to each other (paper A, Eqs. 6 and 7).
 
@@ -262,7 +262,7 @@ class StereoRig:
         return rectify(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RectifiedRig:
     """The rectified rig that sees the same, and the ways between its pixels and the original's.
 

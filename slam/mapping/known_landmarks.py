@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from slam.checks import FARTHEST_POSITION
-from slam.data import IdArray
+from slam.data import BoolArray, IdArray
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
 
+_NEAREST = 1e-3  # guard: least depth [m] of a landmark that a camera sees
 _LARGEST = 1e18  # guard: variance [m²], far above that of any landmark worth having
 _SYMMETRIC = 1e-6  # guard: largest share by which a covariance may differ from its transpose
 
@@ -43,6 +44,22 @@ def require_known(backend: str, ids: IdArray, positions: Array, covariances: Arr
         raise MeasurementError(
             f"{backend}: the covariance of landmark {ids[bad][0]} is not symmetric and positive definite"
         )
+
+
+def in_front(local: Array) -> BoolArray:
+    """Which points (N, 3) [m] in a camera's coordinates lie in front of it (N,)."""
+    return np.asarray(local[:, 2] >= _NEAREST)
+
+
+def require_in_front(backend: str, ids: IdArray, local: Array) -> None:
+    """Check that landmarks at `local` (N, 3) [m] in the camera's coordinates lie in front of it.
+
+    Raises:
+        MeasurementError: one does not.
+    """
+    bad = ~in_front(local)
+    if bad.any():
+        raise MeasurementError(f"{backend}: landmark {ids[bad][0]} does not lie in front of the camera")
 
 
 def _positive_definite(covariances: Array) -> np.ndarray:

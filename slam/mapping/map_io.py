@@ -56,7 +56,7 @@ _TYPES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SavedMap:
     """A map, independent of any run: one row per landmark, ids ascending.
 

@@ -17,6 +17,7 @@ from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
+from slam.mapping.known_landmarks import in_front
 from slam.mapping.monocular import MonocularDepth, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
@@ -24,7 +25,7 @@ from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.visibility import MapView, expected_landmarks
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapChange:
     """What a frame did to the map.
 
@@ -41,7 +42,7 @@ class MapChange:
     returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Returned:
     """Features of an old keyframe that the present frame shows again.
 
@@ -58,7 +59,7 @@ class Returned:
     covariances: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KnownPlace:
     """Landmarks of a place whose pose is known.
 
@@ -128,7 +129,7 @@ class Mapper:
         if not isinstance(backend, MapBackend):
             return change
         taken = np.concatenate([step.matches.rows, change.added.rows, step.withheld_rows, step.labels.moving])
-        free = np.flatnonzero(~np.isin(returned.rows, taken))
+        free = np.flatnonzero(~np.isin(returned.rows, taken) & in_front(returned.local))
         if not len(free):
             return change
         ids = returned.ids[free]

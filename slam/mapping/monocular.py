@@ -38,7 +38,7 @@ _VIEWS = 400  # cost: views kept at most
 _CLAIM = 12.0  # a landmark claims features within this distance of its predicted pixel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Depths:
     """Points triangulated from two views, in the camera's coordinates at the second one (N rows).
 
@@ -155,7 +155,7 @@ def unclaimed(view: MapView, landmarks: LandmarkTable, features: StereoFeatures,
     return np.asarray(rows[~claimed])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Views:
     """First views of the features being tracked, one row each."""
 
@@ -188,7 +188,7 @@ class _Views:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NewPoints:
     """Features whose depth has become known.
 

@@ -17,7 +17,7 @@ from slam.tracking.patch_alignment import Aligned, PatchAnchors
 from slam.tracking.state import TrackingState
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AssociatedFrame:
     """A frame whose features are matched with landmarks.
 
@@ -45,7 +45,7 @@ class AssociatedFrame:
         return self.prediction.T_world_left if self.matches.T_world_left is None else self.matches.T_world_left
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Step:
     """A frame's result before the map is changed.
 
@@ -80,7 +80,7 @@ class Step:
     correction: Correction | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Completed:
     """State carried from completed steps to the next one, besides the map.
 

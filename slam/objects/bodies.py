@@ -23,7 +23,7 @@ _REACH = 1.8  # farthest point of a body from its origin, in what it measured ac
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body.
 

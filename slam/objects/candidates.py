@@ -39,7 +39,7 @@ def region_radius(depth: Any, size: float) -> Any:
     return np.maximum(0.5 * size, _RADIUS * depth)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MovingTracks:
     """Tracks of a frame with their constant velocities, a row each.
 
@@ -109,7 +109,7 @@ class MovingTracks:
         return places, velocities, at, towards
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A region that may move.
 
@@ -204,7 +204,7 @@ def follow_candidates(
     return [candidate for candidate in followed if candidate is not None] + _new_candidates(tracks, free)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Regions:
     """Candidates whose states (C, 6) with covariances (C, 6, 6), and ways (C, 3), are others now."""
 

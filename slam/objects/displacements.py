@@ -16,7 +16,7 @@ LAG = 4  #: frames between the older and the recent measurements, about
 _FARTHEST = 4.0  # a track's depth must be so many times its deviation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Displacements:
     """How tracks moved from the older to the recent frames, a row each.
 

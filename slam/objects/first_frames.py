@@ -28,7 +28,7 @@ _LEAST_NOISE = 0.05  # [px] of a pixel from frame to frame: correlation finds it
 _RIDGE = 1e-6  # numerics: share of the trace
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FirstSights:
     """Landmarks as they were when they were first seen.
 

@@ -85,7 +85,7 @@ def _advance(tracks: Tracks, bodies: Mapping[int, Body], alive: NDArray[np.intp]
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Search:
     """The search for tracks in a frame, in windows about expected places.
 

@@ -56,7 +56,7 @@ def measured(features: StereoFeatures, rows: NDArray[np.intp]) -> Array:
     return np.concatenate([features.uv_left[rows], features.uv_right[rows, :1]], axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MembershipTest:
     """How well tracks fit a body, a row each.
 

@@ -17,7 +17,7 @@ _SINGULAR = 1e-9  # numerics: smallest eigenvalue of a matrix of correlations th
 _OUTLINE = 0.25  # a feature sees as far as this, as a share of its size
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseErrors:
     """Rotation [deg] and translation [m] of errors, a row each."""
 
@@ -99,7 +99,7 @@ def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
     return np.asarray((w * np.linalg.solve(correlations[regular], w[:, :, None])[:, :, 0]).sum(axis=1), np.float64)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Life:
     """What was reported of one object."""
 

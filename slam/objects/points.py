@@ -48,7 +48,7 @@ def first_frame(T_world_left: Array, h: Array) -> tuple[Array, BoolArray]:
     return T, near
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape:
     """Where the points of a body lie: a Gaussian with mean (3,) and covariance (3, 3) in some frame."""
 

@@ -36,7 +36,7 @@ _STEP = 1e-5  # numerics: of the finite differences [m]
 _CANDIDATES = 12  # cost: features with the largest determinants among which a triple is looked for
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectDatabase:
     """What is known of an object beforehand: its features in the initial scene.
 
@@ -111,7 +111,7 @@ class ObjectDatabase:
         return database
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectMotion:
     """The object's motion from the initial to the current scene, or why there is none.
 

@@ -43,7 +43,7 @@ _AROUND = 1.0  # how far beyond its window a group's tracks are looked for, in w
 _MOST = 20  # cost: windows looked into for the next group
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Group:
     """Tracks that moved alike, and otherwise than the rest.
 
@@ -62,7 +62,7 @@ class Group:
         return bool(self.away > away and self.test > limit(test, len(self.members)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """What the displacements say.
 
@@ -141,7 +141,7 @@ def _next_group(
     return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Problem:
     """Displacements as a linear problem in a common motion ξ = [θ, ρ] (6,): each track's normal equations.
 
@@ -176,7 +176,7 @@ class _Problem:
         return float(np.linalg.norm(mean))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Windows:
     """Windows of directions and depths with enough tracks.
 

@@ -24,7 +24,7 @@ EXPLAINED = 0.2  #: share of the χ² of "still" that a motion, itself uncertain
 _ROOM = 1000  # cost: rows that a table begins with
 
 
-@dataclass
+@dataclass(eq=False)
 class Tracks:
     """A table of tracks; the one mutable thing of the detector. Rows of tracks that were given up are used again.
 
@@ -167,7 +167,7 @@ def fit_positions(tracks: Tracks, rows: NDArray[np.intp]) -> None:
     t.velocity[rows] = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConstantVelocity:
     """Points with an even velocity, a row each.
 

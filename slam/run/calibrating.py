@@ -71,7 +71,7 @@ class Targets:
             raise ConfigurationError(f"{files[-1]}: two files cannot have one name")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Found:
     """What one recording says.
 
@@ -90,7 +90,7 @@ class Found:
     evidence: RecordingEvidence | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibrated:
     """What all recordings say.
 

@@ -28,7 +28,7 @@ _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RunData:
     """What a run's folder says.
 

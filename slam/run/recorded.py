@@ -20,7 +20,7 @@ from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordedFrame:
     """What a back end was given in one frame.
 
@@ -54,7 +54,7 @@ class RecordedFrame:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordedRows:
     """Observations of many frames, a row each.
 
@@ -90,7 +90,7 @@ class RecordedRows:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """All that a back end was given in a run, and what it takes to give it to another one.
 

@@ -25,7 +25,7 @@ from slam.third_party import named_failures
 from slam.tracking.protocol_check import require_estimate
 
 
-@dataclass
+@dataclass(eq=False)
 class RunRecord:
     """What a run has gathered so far: the online path, frame by frame, but for frames that have no pose at all."""
 
@@ -75,7 +75,7 @@ class RunRecord:
         return Trajectory(np.array(self.stamps), np.array(self.poses).reshape(-1, 4, 4))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Replayed:
     """A back end that is given a recording, as the summary sees a system."""
 

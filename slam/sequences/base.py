@@ -87,7 +87,7 @@ class FrameSource(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordedSequence:
     """A sequence on disk. It keeps the `Sequence` protocol; properties are described there.
 

@@ -26,7 +26,7 @@ _MODELS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImuCamera:
     """A camera and its pose ``T_body_camera`` (4, 4) on a body."""
 

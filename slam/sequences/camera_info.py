@@ -24,7 +24,7 @@ _MODELS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraInfo:
     """A CameraInfo message of ROS 1 or 2.
 

@@ -95,7 +95,7 @@ class Messages:
         return int(self.recorded[row]), int(np.searchsorted(self.recorded, self.recorded[row]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RosPairs:
     """A frame source: two topics of a recording, already paired.
 

@@ -30,7 +30,7 @@ class Recording(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topics:
     """The topics of a stereo rig.
 

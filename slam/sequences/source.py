@@ -46,7 +46,7 @@ class Listing:
         return Listing(self.folder, self.keys[index], [self.names[i] for i in index])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImagePairs:
     """A frame source: two folders of image files, already paired.
 

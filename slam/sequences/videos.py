@@ -28,7 +28,7 @@ SLOWEST, FASTEST = 1e-3, 1e5
 _MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VideoPairs:
     """A frame source: two videos.
 

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 from slam.errors import ConfigurationError, text_of
 from slam.naming import unknown
-from slam.testing import estimation, protocol, running
+from slam.testing import estimation, hostile, protocol, running
 from slam.testing.scene import GENERAL_RIG, MODELS, RIG, SIGMA, Factory
 
 __all__ = [
@@ -79,12 +79,18 @@ RIGHT: Sequence[Check] = (
     protocol.results_are_the_callers_own,
     protocol.same_input_same_bytes,
     protocol.removed_landmarks_are_gone,
+    hostile.queries_are_pure,
+    hostile.a_stamp_has_one_update,
+    hostile.rows_that_no_point_explains_are_rejected,
+    hostile.landmarks_are_placed_in_front,
+    hostile.hostile_calls_have_one_meaning,
 )
 
 #: It estimates well.
 GOOD: Sequence[Check] = (
     estimation.follows_the_camera,
     estimation.follows_with_a_general_rig,
+    estimation.landmarks_are_corrected,
     estimation.velocity_is_learnt,
     estimation.innovations_are_as_predicted,
     estimation.left_pixels_alone_are_measured,

@@ -29,6 +29,8 @@ from slam.testing.scene import (
     tracked,
 )
 
+_OFTEN = 15  # measurements of a landmark
+
 
 def new_landmarks_are_triangulated(factory: Factory) -> None:
     """A landmark's first position and covariance are the stereo pair's."""
@@ -82,6 +84,21 @@ def _is_in_order(report: UpdateReport, seen: Observations) -> None:
     require(own, "a landmark is both used and rejected, or was not observed")
     require(2 * used <= dof <= 4 * used, f"{dof} degrees of freedom of {used} landmarks: 2 to 4 each are expected")
     require(report.nis >= 0, f"NIS is {report.nis:.3g}: it must be a number of at least 0")
+
+
+def landmarks_are_corrected(factory: Factory) -> None:
+    """Landmarks seen many times are known better than at their first sight, and the covariances say so."""
+    scene = make_scene(25)
+    found = tracked(factory, scene)[0].backend.estimate()
+    ids, times = np.unique(np.concatenate([seen.ids for seen in scene.frames]), return_counts=True)
+    often = np.intersect1d(scene.frames[0].ids, ids[times >= _OFTEN])  # first seen from the origin: no error of a pose
+    rows = np.searchsorted(found.ids, often)
+    first = RIG.triangulation_covariance(scene.points[often], SIGMA)
+    off = (found.positions[rows] - scene.points[often])[:, :, None]
+    left = float((np.swapaxes(off, 1, 2) @ np.linalg.solve(first, off)).mean()) / 3
+    require(left < 0.4, f"squared errors of landmarks seen {_OFTEN} times are {left:.3g} of those at their first sight")
+    share = float(np.median(np.trace(found.covariances[rows], axis1=1, axis2=2) / np.trace(first, axis1=1, axis2=2)))
+    require(share < 0.5, f"variances of landmarks seen {_OFTEN} times are {share:.3g} of those at their first sight")
 
 
 def velocity_is_learnt(factory: Factory) -> None:

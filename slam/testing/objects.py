@@ -114,6 +114,21 @@ def bodies_come_in_order_and_go(factory: Factory) -> None:
     require_same(again, [_BODY], "a removed body that comes back under its id")
 
 
+def a_body_is_measured_once_a_stamp(factory: Factory) -> None:
+    """A further call at one stamp starts new bodies and leaves the known ones as they are."""
+    backend, objects = _create(factory)
+    rng = np.random.default_rng(0)
+    for k in range(4):
+        backend.predict(k * _DT)
+        seen = _observations(k, rng)
+        (first,) = objects.update_objects([seen])
+    other = replace(seen, id=1, points=seen.points + 50)
+    new, again = objects.update_objects([other, seen])
+    require(new.measured and not again.measured, "a second call at one stamp measures a body that it has measured")
+    for name in ("T_world_object", "covariance", "velocity", "velocity_covariance"):
+        require_same(getattr(again, name), getattr(first, name), f"{name} of a body after a second call at one stamp")
+
+
 def misuse_of_bodies_is_refused(factory: Factory) -> None:
     """New bodies without depth, and unknown ids, are errors."""
     backend, objects = _create(factory)
@@ -150,6 +165,7 @@ OBJECT_CHECKS: tuple[Callable[[Factory], None], ...] = (
     unseen_body_is_predicted,
     wrong_point_is_rejected,
     bodies_come_in_order_and_go,
+    a_body_is_measured_once_a_stamp,
     misuse_of_bodies_is_refused,
     camera_is_not_moved_by_bodies,
 )

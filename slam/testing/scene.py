@@ -36,7 +36,7 @@ _POSITION, _ROTATION = 0.05, 0.01  # largest pose errors on the scene [m], [rad]
 NONE = np.zeros(0, np.int64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A camera that flies slowly through points, with noisy observations of all of them that are in view."""
 
@@ -73,9 +73,13 @@ class Run:
         self.backend: Backend = factory(rig, models=models)
         self.known: set[int] = set()
 
-    def step(self, k: int, seen: Observations) -> tuple[Prediction, UpdateReport]:
-        """Frame k: predict, update with what the map has, add the rest."""
+    def step(
+        self, k: int, seen: Observations, between: Callable[[Backend], None] | None = None
+    ) -> tuple[Prediction, UpdateReport]:
+        """Frame k: predict, update with what the map has, add the rest; `between` is called before the update."""
         prediction = self.backend.predict(DT * k)
+        if between is not None:
+            between(self.backend)
         old = self.in_map(seen)
         report = self.backend.update(seen.select(old))
         self.backend.add(seen.select(~old))

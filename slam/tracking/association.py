@@ -123,7 +123,7 @@ class AssociationConfig:
             raise ConfigurationError("association: kidnapped_after must be at least 1")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Matches:
     """Pairs of a landmark and a feature.
 
@@ -222,7 +222,7 @@ def match_in_boxes(
     return Matches(pairs.rows[best], pairs.columns[best])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SearchWindows:
     """Nested search windows around the predicted pixels of landmarks (M).
 
@@ -307,7 +307,7 @@ def _distances(
     return np.asarray(np.sqrt(np.maximum(2 - 2 * product, 0)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Pairs:
     """Pairs of a landmark and a feature that may belong together, by ascending landmark.
 

@@ -13,7 +13,7 @@ from slam.models import EstimatorModels
 _SLACK = 0.05  # error of two poses found independently [m], [rad]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseHypotheses:
     """Poses far from the predictions, on which landmarks agreed in successive frames.
 

@@ -25,7 +25,7 @@ from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LandmarkMatches:
     """Landmarks found in a frame.
 

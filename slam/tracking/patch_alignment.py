@@ -26,7 +26,7 @@ _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that ano
 _FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PatchAnchors:
     """Landmarks' image patches and the poses from which they were taken: one row per landmark, ids ascending.
 
@@ -71,7 +71,7 @@ class PatchAnchors:
         return self.select(keep)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Aligned:
     """A frame whose features were aligned.
 

@@ -16,7 +16,7 @@ from slam.tracking.association import pairs_in_boxes
 _NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapView:
     """The map and the frame's features as seen from one pose.
 

@@ -1,8 +1,14 @@
 """Compiled loops of the window: normal equations with landmarks eliminated, steps back to poses and points.
 
-Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a chart
-of inverse distance: with c the chart's centre, ``p = c + B (α, β, 1) / ρ``, so that what a camera near c measures is
-almost linear in (α, β, ρ), however far the point. Unknowns stand in the order: points of the prior, then free poses.
+Poses are ``T_world_left`` with perturbations on the right, [rotation, translation]. A point's perturbation is in a
+chart of inverse distance: with c the chart's centre, ``p = c + B (α, β, 1) / ρ``, so that what a camera near c measures
+is almost linear in (α, β, ρ), however far the point. Unknowns stand in the order: points of the prior, free poses.
+
+Arrays that many loops take: `poses` (K, 4, 4) and `column`, their first unknowns (K,), −1 for a fixed one; `points`
+(N, 3) and `place`, what each is to the solver (N,), see `KNOWN`; `E`, their derivatives by their charts' coordinates
+(N, 3, 3); `pose` and `point`, what each row is of (M,); `first` and `order`, rows by point, see `by_point`; `H` (n, n),
+lower triangle, and `b` (n,), which are added to; `information` (N, 3, 3) and `gradient` (N, 3) of each point by its
+rows; `cross`, what each row tells of pose and point together (M, 6, 3).
 """
 
 from __future__ import annotations
@@ -57,9 +63,9 @@ def charts(poses, centre, points, place, basis, reference):
 
 @helper
 def _chart(T, point, basis, origin, q, s, D):
-    """Coordinates s = (α, β, ρ) less `origin` (3,) of a point from a pose T, and D (3, 3), their derivatives by q = Rᵀ (p − t).
+    """Coordinates s = (α, β, ρ) less `origin` (3,) of a point from a pose T; D (3, 3) are derivatives by Rᵀ (p − t).
 
-    Whether the point is in the half space that the chart covers.
+    Returns whether the point is in the half space that the chart covers.
     """
     transform_back(T, point, q)
     x = basis[0, 0] * q[0] + basis[1, 0] * q[1] + basis[2, 0] * q[2]
@@ -100,7 +106,7 @@ def _basis(n, e):
 
 @kernel
 def relative_charts(T, points):
-    """Charts of points (N, 3) about their directions from a pose T: bases (N, 3, 3) in its axes, and coordinates (N, 3)."""
+    """Charts about the directions of points from a pose T: bases (N, 3, 3) in its axes, and coordinates (N, 3)."""
     B, s, q = np.empty((len(points), 3, 3)), np.zeros((len(points), 3)), np.empty(3)
     for m in range(len(points)):
         transform_back(T, points[m], q)
@@ -114,21 +120,10 @@ def relative_charts(T, points):
 
 @kernel
 def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, weight, H, b):
-    """Add the rows' normal equations to H (n, n), lower triangle, and b (n,); eliminate points that are not the prior's.
+    """Add the rows' normal equations: their squared whitened residuals (M,), information, gradient and cross.
 
-    Args:
-        camera: f, u0, v0, baseline (4,) of the rectified rig.
-        R_left: rotation (3, 3) from left-camera to rectified coordinates.
-        poses, column: poses (K, 4, 4) and their first unknowns (K,), −1 for a fixed one.
-        points, place: points (N, 3), and what they are (N,), see `KNOWN`.
-        E: their charts (N, 3, 3).
-        pose, point, z, weight: of each row the pose and point it is of (M,), (uL, vL, uR) (M, 3), NaN where missing, and
-            1 / σ (M,), zero for a row that does not count.
-        H, b: are added to.
-
-    Returns:
-        squared whitened residual of each row (M,); information (N, 3, 3) and gradient (N, 3) of each point by its rows;
-        each row's cross information (M, 6, 3) of pose and point.
+    `camera` (7,) and `R_left` (3, 3) are as in `slam.kernels.stereo`; `z` is (uL, vL, uR) (M, 3), NaN where missing,
+    and `weight` 1 / σ (M,), zero for a row that does not count.
     """
     count, rows = len(points), len(pose)
     information, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
@@ -156,19 +151,19 @@ def linearise(camera, R_left, poses, column, points, place, E, pose, point, z, w
 
 
 @helper
-def _add_row(poses, column, place, E, k, l, q, r, D, J, Jp, H, b, information, gradient, cross):
+def _add_row(poses, column, place, E, k, p, q, r, D, J, Jp, H, b, information, gradient, cross):
     """Add one row: residual r (3,), predicted numbers that change by D (3, 3) with the point q in the camera."""
     T = poses[k]
-    free = place[l] != KNOWN
+    free = place[p] != KNOWN
     if free:
         for i in range(3):
             x, y, z = row_times(T, 0, D[i]), row_times(T, 1, D[i]), row_times(T, 2, D[i])
             for j in range(3):
-                Jp[i, j] = x * E[l, 0, j] + y * E[l, 1, j] + z * E[l, 2, j]
+                Jp[i, j] = x * E[p, 0, j] + y * E[p, 1, j] + z * E[p, 2, j]
         for a in range(3):
-            gradient[l, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
+            gradient[p, a] += Jp[0, a] * r[0] + Jp[1, a] * r[1] + Jp[2, a] * r[2]
             for c in range(3):
-                information[l, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
+                information[p, a, c] += Jp[0, a] * Jp[0, c] + Jp[1, a] * Jp[1, c] + Jp[2, a] * Jp[2, c]
     at = column[k]
     if at < 0:
         return
@@ -187,13 +182,8 @@ def _add_row(poses, column, place, E, k, l, q, r, D, J, Jp, H, b, information, g
 def place_rows(poses, column, points, place, E, pose, point, basis, origin, root, H, b, information, gradient):
     """Add points known relative to a pose: ``root ((α, β, ρ) − origin)`` of each is unit noise. See `linearise`.
 
-    Args:
-        pose, point: of each row (Q,).
-        basis, origin: its chart in the pose's axes (Q, 3, 3), and where it stood in it (Q, 3).
-        root: square root of its information (Q, 3, 3).
-
-    Returns:
-        sum of squares, and each row's cross information (Q, 6, 3).
+    `basis` (Q, 3, 3) is each row's chart in the pose's axes, `origin` (Q, 3) where the point stood in it, and `root`
+    (Q, 3, 3) the square root of its information. Returns the sum of squares, and cross (Q, 6, 3).
     """
     cross, cost = np.zeros((len(pose), 6, 3)), 0.0
     q, s, D, W = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -215,20 +205,20 @@ def place_rows(poses, column, points, place, E, pose, point, basis, origin, root
 def own_priors(points, place, E, mean, own, information, gradient):
     """Add independent priors of points in world coordinates: mean (N, 3), information (N, 3, 3). Returns their cost."""
     cost, d, v = 0.0, np.empty(3), np.empty(3)
-    for l in range(len(points)):
-        if own[l, 0, 0] == 0.0 or place[l] == KNOWN:
+    for p in range(len(points)):
+        if own[p, 0, 0] == 0.0 or place[p] == KNOWN:
             continue
         for i in range(3):
-            d[i] = mean[l, i] - points[l, i]
+            d[i] = mean[p, i] - points[p, i]
         for i in range(3):
-            v[i] = own[l, i, 0] * d[0] + own[l, i, 1] * d[1] + own[l, i, 2] * d[2]
+            v[i] = own[p, i, 0] * d[0] + own[p, i, 1] * d[1] + own[p, i, 2] * d[2]
             cost += v[i] * d[i]
         for a in range(3):
-            gradient[l, a] += E[l, 0, a] * v[0] + E[l, 1, a] * v[1] + E[l, 2, a] * v[2]
+            gradient[p, a] += E[p, 0, a] * v[0] + E[p, 1, a] * v[1] + E[p, 2, a] * v[2]
             for c in range(3):
                 for i in range(3):
                     for j in range(3):
-                        information[l, a, c] += E[l, i, a] * own[l, i, j] * E[l, j, c]
+                        information[p, a, c] += E[p, i, a] * own[p, i, j] * E[p, j, c]
     return cost
 
 
@@ -236,21 +226,17 @@ def own_priors(points, place, E, mean, own, information, gradient):
 def eliminate(column, place, pose, cross, first, order, information, gradient, H, b):
     """Take points into H and b: those of the prior as unknowns, the others eliminated.
 
-    Args:
-        first, order: rows by point: those of point l are ``order[first[l]:first[l + 1]]``.
-
-    Returns:
-        inverses (N, 3, 3) of the information of points that are eliminated.
+    Returns inverses (N, 3, 3) of the information of points that are eliminated.
     """
     inverse, W, v = np.zeros_like(information), np.empty((6, 3)), np.empty(3)
-    for l in range(len(place)):
-        d = place[l]
+    for p in range(len(place)):
+        d = place[p]
         if d >= 0:
             for i in range(3):
-                b[3 * d + i] += gradient[l, i]
+                b[3 * d + i] += gradient[p, i]
                 for j in range(i + 1):
-                    H[3 * d + i, 3 * d + j] += information[l, i, j]
-            for o in range(first[l], first[l + 1]):
+                    H[3 * d + i, 3 * d + j] += information[p, i, j]
+            for o in range(first[p], first[p + 1]):
                 m = order[o]
                 at = column[pose[m]]
                 if at >= 0:
@@ -259,16 +245,16 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, H
                             H[at + i, 3 * d + j] += cross[m, i, j]
         elif d == ELIMINATED:
             # what nothing measures along some direction (depth, of one left pixel) gets next to no information there
-            trace = information[l, 0, 0] + information[l, 1, 1] + information[l, 2, 2]
+            trace = information[p, 0, 0] + information[p, 1, 1] + information[p, 2, 2]
             if trace == 0.0:
                 continue
             for i in range(3):
-                information[l, i, i] += 1e-12 * trace + 1e-9
-            invert_symmetric(information[l], 0.0, inverse[l])
-            S = inverse[l]
+                information[p, i, i] += 1e-12 * trace + 1e-9
+            invert_symmetric(information[p], 0.0, inverse[p])
+            S = inverse[p]
             for i in range(3):
-                v[i] = S[i, 0] * gradient[l, 0] + S[i, 1] * gradient[l, 1] + S[i, 2] * gradient[l, 2]
-            for o in range(first[l], first[l + 1]):
+                v[i] = S[i, 0] * gradient[p, 0] + S[i, 1] * gradient[p, 1] + S[i, 2] * gradient[p, 2]
+            for o in range(first[p], first[p + 1]):
                 m = order[o]
                 at = column[pose[m]]
                 if at < 0:
@@ -277,7 +263,7 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, H
                     b[at + i] -= cross[m, i, 0] * v[0] + cross[m, i, 1] * v[1] + cross[m, i, 2] * v[2]
                     for j in range(3):
                         W[i, j] = cross[m, i, 0] * S[0, j] + cross[m, i, 1] * S[1, j] + cross[m, i, 2] * S[2, j]
-                for o2 in range(first[l], first[l + 1]):
+                for o2 in range(first[p], first[p + 1]):
                     m2 = order[o2]
                     to = column[pose[m2]]
                     if to < 0 or to > at:
@@ -292,12 +278,12 @@ def eliminate(column, place, pose, cross, first, order, information, gradient, H
 
 @kernel
 def by_point(point, count):
-    """Rows by point: `first` (count + 1,) and `order` (M,), see `eliminate`."""
+    """Rows by point: those of point p are ``order[first[p]:first[p + 1]]``."""
     first, order = np.zeros(count + 1, np.int64), np.empty(len(point), np.int64)
     for m in range(len(point)):
         first[point[m] + 1] += 1
-    for l in range(count):
-        first[l + 1] += first[l]
+    for p in range(count):
+        first[p + 1] += first[p]
     at = first.copy()
     for m in range(len(point)):
         order[at[point[m]]] = m
@@ -309,17 +295,10 @@ def by_point(point, count):
 def prior_rows(poses, points, members, T, relative, basis, origin, pose_of, delta, A):
     """Where unknowns stand relative to the prior's: δ (n,), and its derivative A (n, 6) by the reference pose.
 
-    Args:
-        poses, points: all of them.
-        members: points of the prior (D,).
-        T: where the reference pose stood (4, 4).
-        relative: where the prior's poses stood before it (P, 4, 4), the first is the identity.
-        basis, origin: charts of the points in its axes (D, 3, 3), and where they stood in them (D, 3).
-        pose_of: indices of the prior's poses (P,); the first is the reference.
-        delta, A: are overwritten; points first.
-
-    Returns:
-        False where a point has left the half space of its chart.
+    Both are overwritten, points first. `members` are the prior's points (D,), `basis` (D, 3, 3) and `origin` (D, 3)
+    their charts in the reference pose's axes and where they stood in them; `T` (4, 4) is where that pose stood,
+    `relative` (P, 4, 4) where the poses `pose_of` (P,) stood before it, itself the first. Returns False where a point
+    has left the half space of its chart.
     """
     q, s, D, J = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     M, N, Ad = np.empty((3, 4)), np.empty((3, 4)), np.empty((6, 6))
@@ -350,10 +329,8 @@ def prior_rows(poses, points, members, T, relative, basis, origin, pose_of, delt
 def motion_rows(poses, column, triple, interval, weight, H, b):
     """Add constant velocity, disturbed: successive velocities differ by noise. Returns the sum of squares.
 
-    Args:
-        triple: three successive poses (V, 3); −1 first where the first velocity itself is noise.
-        interval: times between them (V, 2) [s].
-        weight: 1 / σ of the change [ω, v] (V, 6).
+    `triple` (V, 3) are three successive poses, −1 first where the first velocity itself is noise; `interval` (V, 2) the
+    times between them [s], `weight` (V, 6) 1 / σ of the change of [ω, v].
     """
     cost = 0.0
     J, r = np.empty((6, 18)), np.empty(6)
@@ -417,14 +394,14 @@ def step(poses, column, points, place, E, pose, cross, first, order, inverse, gr
         if column[k] >= 0:
             move(new[k], x[column[k] : column[k] + 6])
     d, v = np.empty(3), np.empty(3)
-    for l in range(len(points)):
-        if place[l] >= 0:
+    for p in range(len(points)):
+        if place[p] >= 0:
             for i in range(3):
-                d[i] = x[3 * place[l] + i]
-        elif place[l] == ELIMINATED and inverse[l, 0, 0] > 0.0:
+                d[i] = x[3 * place[p] + i]
+        elif place[p] == ELIMINATED and inverse[p, 0, 0] > 0.0:
             for i in range(3):
-                v[i] = gradient[l, i]
-            for o in range(first[l], first[l + 1]):
+                v[i] = gradient[p, i]
+            for o in range(first[p], first[p + 1]):
                 m = order[o]
                 at = column[pose[m]]
                 if at >= 0:
@@ -432,10 +409,10 @@ def step(poses, column, points, place, E, pose, cross, first, order, inverse, gr
                         for j in range(6):
                             v[i] -= cross[m, j, i] * x[at + j]
             for i in range(3):
-                d[i] = inverse[l, i, 0] * v[0] + inverse[l, i, 1] * v[1] + inverse[l, i, 2] * v[2]
+                d[i] = inverse[p, i, 0] * v[0] + inverse[p, i, 1] * v[1] + inverse[p, i, 2] * v[2]
         else:
             continue
-        _displace(points[l], E[l], d, to[l])
+        _displace(points[p], E[p], d, to[p])
     return new, to
 
 
@@ -453,12 +430,10 @@ def _displace(p, E, d, out):
 
 @kernel
 def point_relations(T, points, place, E, pose, cross, first, order, column, inverse, X, P_poses, newest, prior):
-    """Covariances (N, 3, 3) of points in the newest camera's coordinates, and in the world.
+    """Covariances (N, 3, 3) of points in the coordinates of a pose T (4, 4), and in the world.
 
-    Args:
-        T: the newest pose (4, 4); its unknowns begin at `newest`.
-        X: ``L⁻¹`` (n, n) of the normal equations' Cholesky factor.
-        P_poses: joint covariance (6 F, 6 F) of the free poses; their unknowns begin at `prior` = 3 D.
+    T's unknowns begin at `newest`; `X` (n, n) is ``L⁻¹`` of the normal equations' Cholesky factor, `P_poses` (6 F, 6 F)
+    the joint covariance of the free poses, whose unknowns begin at `prior`, and `inverse` is by `eliminate`.
     """
     count, n = len(points), len(X)
     camera, world = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
@@ -466,8 +441,8 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
     A, AP = np.zeros((3, len(P_poses))), np.zeros((3, len(P_poses)))
     q, D, G, tmp = np.empty(3), np.empty((3, 3)), np.zeros((3, 6)), np.empty((3, 3))
     at = newest - prior
-    for l in range(count):
-        d = place[l]
+    for p in range(count):
+        d = place[p]
         if d >= 0:
             for i in range(3):
                 for j in range(i + 1):
@@ -480,11 +455,11 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                     for row in range(newest + j, n):
                         total += X[row, 3 * d + i] * X[row, newest + j]
                     by[i, j] = total
-        elif d == ELIMINATED and inverse[l, 0, 0] > 0.0:
+        elif d == ELIMINATED and inverse[p, 0, 0] > 0.0:
             for i in range(3):
                 for j in range(len(P_poses)):
                     A[i, j] = 0.0
-            for o in range(first[l], first[l + 1]):
+            for o in range(first[p], first[p + 1]):
                 m = order[o]
                 to = column[pose[m]] - prior
                 if column[pose[m]] < 0:
@@ -492,7 +467,7 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                 for i in range(3):
                     for j in range(6):
                         for a in range(3):
-                            A[i, to + j] -= inverse[l, i, a] * cross[m, j, a]
+                            A[i, to + j] -= inverse[p, i, a] * cross[m, j, a]
             for i in range(3):
                 for j in range(len(P_poses)):
                     AP[i, j] = 0.0
@@ -503,7 +478,7 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                             AP[i, j] += A[i, a] * P_poses[a, j]
             for i in range(3):
                 for j in range(3):
-                    total = inverse[l, i, j]
+                    total = inverse[p, i, j]
                     for a in range(len(P_poses)):
                         total += AP[i, a] * A[j, a]
                     own[i, j] = total
@@ -511,18 +486,18 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                     by[i, j] = AP[i, at + j]
         else:
             continue
-        _congruent(E[l], own, tmp, world[l])
+        _congruent(E[p], own, tmp, world[p])
         # q = Rᵀ (p − t): δq = Rᵀ E d + hat(q) ω − v
         for i in range(3):
             q[i] = 0.0
             for k in range(3):
-                q[i] += T[k, i] * (points[l, k] - T[k, 3])
+                q[i] += T[k, i] * (points[p, k] - T[k, 3])
             for j in range(3):
-                D[i, j] = T[0, i] * E[l, 0, j] + T[1, i] * E[l, 1, j] + T[2, i] * E[l, 2, j]
+                D[i, j] = T[0, i] * E[p, 0, j] + T[1, i] * E[p, 1, j] + T[2, i] * E[p, 2, j]
         G[0, 1], G[0, 2], G[1, 2] = -q[2], q[1], -q[0]
         G[1, 0], G[2, 0], G[2, 1] = q[2], -q[1], q[0]
         G[0, 3] = G[1, 4] = G[2, 5] = -1.0
-        _congruent(D, own, tmp, camera[l])
+        _congruent(D, own, tmp, camera[p])
         for i in range(3):
             for j in range(3):
                 total = 0.0
@@ -531,7 +506,7 @@ def point_relations(T, points, place, E, pose, cross, first, order, column, inve
                         total += D[i, c] * by[c, a] * G[j, a] + G[i, a] * by[c, a] * D[j, c]
                     for c in range(6):
                         total += G[i, a] * P_poses[at + a, at + c] * G[j, c]
-                camera[l, i, j] += total
+                camera[p, i, j] += total
     return camera, world
 
 
@@ -603,14 +578,10 @@ def lower_inverse(L):
 
 @kernel
 def chart_changes(T, points, basis, E):
-    """How chart coordinates from a pose T (4, 4) change, by those of other charts, and by the pose.
+    """How coordinates in charts `basis` (D, 3, 3) from a pose T (4, 4) change with those of other charts, and with T.
 
-    Args:
-        points: (D, 3) in the world, with derivatives E (D, 3, 3) by the other charts' coordinates.
-        basis: charts from T (D, 3, 3).
-
-    Returns:
-        present coordinates (D, 3), and their derivatives (D, 3, 3) and (D, 3, 6).
+    Returns present coordinates (D, 3), derivatives (D, 3, 3) by the coordinates of which E are the points' derivatives,
+    and (D, 3, 6) by the pose.
     """
     origin, change, by = np.empty((len(points), 3)), np.empty((len(points), 3, 3)), np.empty((len(points), 3, 6))
     q, D, zero, row = np.empty(3), np.empty((3, 3)), np.zeros(3), np.empty(3)
@@ -627,16 +598,10 @@ def chart_changes(T, points, basis, E):
 
 @kernel
 def schur_complement(H, b, gone, stay):
-    """Marginalise some unknowns of ``H x = b``.
+    """Marginalise the unknowns `gone` (g,), ascending, out of ``H x = b``; the others are `stay` (s,), in any order.
 
-    Args:
-        H: information (n, n), lower triangle.
-        b: (n,).
-        gone, stay: which unknowns leave (g,), ascending, and which stay (s,), in the order wanted.
-
-    Returns:
-        ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs`` (g, s);
-        NaN where H_gg is not positive definite.
+    Returns ``H_ss − H_sg H_gg⁻¹ H_gs`` (s, s), ``b_s − H_sg H_gg⁻¹ b_g`` (s,), ``H_gg⁻¹ b_g`` (g,) and ``H_gg⁻¹ H_gs``
+    (g, s), all symmetric parts whole; NaN where H_gg is not positive definite.
     """
     g, s = len(gone), len(stay)
     L, W, v = np.empty((g, g)), np.empty((g, s)), np.empty(g)

@@ -43,8 +43,9 @@ def marginalised(
         joining: other points of the window that join the prior (J,).
 
     Returns:
-        the prior on the other poses and the points that stay, in their order, then those that joined (points as indices
-        of this window), and where the pose, then the points of the prior that left, are given the others; and what all that cost at the present values.
+        the prior on the other poses and the points that stay, in their order, then those that joined (points as
+        indices of this window); where the points that left, then the pose, are given the others; and what all that
+        cost at the present values.
 
     Raises:
         numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
@@ -70,7 +71,9 @@ def marginalised(
         back = np.linalg.inv(change)
         rows = (np.swapaxes(back, 1, 2) @ information[: 3 * D].reshape(D, 3, n)).reshape(3 * D, n)
         information = np.concatenate([rows, information[3 * D :]])
-        columns = (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
+        columns = (
+            (information[:, : 3 * D].reshape(n, D, 3).transpose(1, 0, 2) @ back).transpose(1, 0, 2).reshape(n, 3 * D)
+        )
         information = np.concatenate([columns, information[:, 3 * D :]], axis=1)
         vector = np.concatenate([(np.swapaxes(back, 1, 2) @ vector[: 3 * D].reshape(D, 3, 1)).ravel(), vector[3 * D :]])
     # x = δ − A δ₀ of all but the reference
@@ -80,9 +83,7 @@ def marginalised(
     V = information @ A
     information[:, at], information[at], information[at, at] = V, V.T, A.T @ V
     vector[at] = A.T @ vector
-    prior = RelativePrior(
-        members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector
-    )
+    prior = RelativePrior(members, np.ascontiguousarray(basis), origin, poses[0].copy(), relative, information, vector)
     return prior, conditional, e.cost
 
 
@@ -112,4 +113,3 @@ def _with_joined(w: Window, joining: IndexArray) -> Window:
         origin=np.concatenate([p.origin, origin]), information=information, vector=vector,
     )  # fmt: skip
     return replace(w, prior=prior)
-

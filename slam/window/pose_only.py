@@ -22,7 +22,7 @@ _ROUNDS = 3  # numerics: of solving and gating
 _CONVERGED = 1e-5  # numerics: [rad, m]; the steps shrink quadratically, so what is left is far smaller
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseProblem:
     """Landmarks, what was measured of them, and what was predicted.
 

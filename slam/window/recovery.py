@@ -28,7 +28,7 @@ _RADIAN = 1.0  # variance of a turn [rad²] beyond which next to nothing is know
 _ANY_TURN = np.pi**2 / 3  # variance of a turn by any angle [rad²]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Agreement:
     """A solution.
 

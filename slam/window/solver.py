@@ -14,7 +14,7 @@ from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
 _HALVINGS = 8  # numerics: of a step that does not lessen the cost
-#: numerics: Decrease of the cost, by a step with the last factor, below which that step is the last. It leaves far less.
+#: numerics: Decrease of the cost by a step with the last factor below which that step is the last; it leaves far less.
 CLOSE = 1e-2
 
 
@@ -86,7 +86,19 @@ def linearised(w: Window, centre: int = 0) -> NormalEquations:
     cost = _begin_with_prior(w, H, b)
     E = kernels.charts(w.poses, centre, w.points, w.place, w.prior.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
-        w.stereo.intrinsics, w.stereo.R_left, w.poses, w.column, w.points, w.place, E, rows.pose, rows.point, rows.z, rows.weight, H, b
+        w.stereo.intrinsics,
+        w.stereo.R_left,
+        w.poses,
+        w.column,
+        w.points,
+        w.place,
+        E,
+        rows.pose,
+        rows.point,
+        rows.z,
+        rows.weight,
+        H,
+        b,
     )
     cost += float(squares.sum())
     if len(w.places):
@@ -101,9 +113,7 @@ def linearised(w: Window, centre: int = 0) -> NormalEquations:
     if len(w.motion.poses):
         m = w.motion
         cost += kernels.motion_rows(w.poses, w.column, m.poses, m.interval, m.weight, H, b)
-    inverse = kernels.eliminate(
-        w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, H, b
-    )
+    inverse = kernels.eliminate(w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, H, b)
     return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
 
 
@@ -159,7 +169,7 @@ class Solution:
         return np.asarray(X.T @ X)
 
     def point_covariances(self, pose: int) -> tuple[Array, Array]:
-        """Covariances (N, 3, 3) of all points in the coordinates of a pose, and in the world. Those of known ones are 0."""
+        """Covariances (N, 3, 3) of points in the coordinates of a pose, and in the world; zero for known ones."""
         w, e = self.window, self.equations
         return kernels.point_relations(
             w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,

@@ -17,7 +17,7 @@ from slam.geometry.rig_kernels import project_rectified, triangulate_rectified
 from slam.geometry.se3 import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RectifiedStereo:
     """Projection by a rectified rig, and the way from the original rig's pixels to its.
 

@@ -54,7 +54,7 @@ class ObservationModel:
         return cls(**{name: values[name] for name in cls.__dataclass_fields__})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Appearance:
     """What tells landmarks apart.
 

@@ -112,7 +112,7 @@ def level(path: Trajectory) -> Array:
     return np.stack([right, np.cross(up, right), up])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Road:
     """The roads that a path runs along, sampled along the path; what is driven again counts once.
 

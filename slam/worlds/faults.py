@@ -18,7 +18,7 @@ from slam.worlds.observe import SimulatedFeatures
 _CHOSEN = ("drop", "dropright", "black", "bright", "blur", "burst", "hand")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Faults:
     """Faults of every frame of the undisturbed recording.
 

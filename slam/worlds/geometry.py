@@ -38,7 +38,7 @@ class Texture(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rectangle:
     """A textured rectangle, seen from its front only.
 
@@ -126,7 +126,7 @@ def cuboid(
     return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RectangleArrays:
     """Many rectangles as arrays, a row each, in one frame.
 
@@ -226,7 +226,7 @@ def _between(centre: Array, rays: Array, occluders: RectangleArrays) -> np.ndarr
     return np.flatnonzero(facing & near & ((angle < widest) | (distance < occluders.radius)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Landmarks:
     """The landmarks of a world, a row each; the row is the id.
 

@@ -20,7 +20,7 @@ class View(NamedTuple):
     height: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lens:
     """How one camera's pixels come from an undistorted view.
 

@@ -23,7 +23,7 @@ _USUAL = 2000  # landmarks of a world that is small enough for that
 _FALSE = -1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedFeatures:
     """Features with their truth, a row each.
 
@@ -50,7 +50,7 @@ class SimulatedFeatures:
         return SimulatedFeatures(features, self.ids[keep], self.objects[keep], self.false_stereo[keep])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VisibleLandmarks:
     """Landmarks that can be seen in one frame, a row each.
 

@@ -11,7 +11,7 @@ from slam.data import BoolArray, IdArray
 from slam.geometry.se3 import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Places:
     """Things in a tree by their places.
 

@@ -14,7 +14,7 @@ NEAR = 0.02  #: what is nearer than this is not drawn [m]
 _OVERLAP = 1e-4  # rectangles reach over their edges by this share, so that no sample falls between two that meet
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Placed:
     """Rectangles in a view, nearest first, a row each.
 

@@ -90,7 +90,7 @@ def _pass_over(old: np.ndarray, new: np.ndarray, axis: int) -> None:
     new[:] = cv2.blendLinear(new, old, share, 1 - share)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Blocks:
     """Blocks of the view: a grid of them for each rectangle that is shown, row by row.
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from slam.worlds.recorder import Recorder
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectPoses:
     """Poses of the moving objects in one frame.
 

@@ -14,7 +14,7 @@ from slam.geometry.pnp import find_consensus
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
-from slam.window.gating import chi_square_gate
+from slam.window.gating import chi_square_gate, with_noise
 
 MODELS = EstimatorModels()
 
@@ -28,6 +28,7 @@ class FixedMapBackend:
         self.rig, self.models = rig, models
         self.stamps: list[float] = []
         self.poses: list[np.ndarray] = []
+        self.measured = True  # whether the newest pose may not be updated any more
         self.covariance = np.diag(np.repeat([models.initial_rotation_sigma**2, models.initial_position_sigma**2], 3))
         self.landmarks: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # position (3,), covariance (3, 3)
 
@@ -37,23 +38,28 @@ class FixedMapBackend:
         T = self.models.initial_pose
         if self.stamps:
             T = self._extrapolate(stamp)
-            dt = stamp - self.stamps[-1]
+            dt = min(stamp - self.stamps[-1], 1000.0)
             linear, angular = self.models.motion.velocity_variance(dt)
             # a pose extrapolated from two: 2² + 1² times the noise of one
             self.covariance = 5 * self.covariance + dt**2 * np.diag(np.repeat([angular, linear], 3))
+            self.covariance *= min(1.0, 1e6 / np.trace(self.covariance))
         self.stamps.append(float(stamp))
         self.poses.append(T)
+        self.measured = False
         ids, points, covariances = self._rows(sorted(self.landmarks))
         seen = self.rig.left.in_view(self._local(points))
         h = self._local(points[seen])
         left, right = self.rig.project(h)
-        S = self._innovation(h, covariances[seen])[:, :2, :2]
+        S = with_noise(self._spread(h, covariances[seen])[:, :2, :2], self.models.pixel_sigma)
         return Prediction(float(stamp), T.copy(), self.covariance.copy(), ids[seen], left, right, S)
 
     def update(self, observations, guess=None):
         if not self.stamps:
             raise MeasurementError("update before the first predict")
+        if self.measured:
+            raise MeasurementError("a stamp has one update, right after its predict")
         _, points, covariances = self._rows(observations.ids)
+        self.measured = True
         if not len(points):
             return UpdateReport.nothing(UpdateStatus.EMPTY, "nothing was observed")
         measured = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
@@ -62,7 +68,7 @@ class FixedMapBackend:
         self.poses[-1] = consensus.T_world_left
         h = self._local(points)
         z, J = self.rig.project_stereo(h)
-        S = self._innovation(h, covariances, pose=False)
+        S = self._spread(h, covariances, pose=False) + self.models.pixel_sigma**2 * np.eye(3)
         used = consensus.inliers & chi_square_gate(measured - z, S, self.models.gate_probability)
         if used.sum() < 3:
             return UpdateReport.nothing(UpdateStatus.FAILED, "too few observations agree", observations.ids[~used])
@@ -72,7 +78,8 @@ class FixedMapBackend:
         for k, nu, A, V in zip(kept, (measured - z)[used], by_pose[used], S[used]):
             information += A[k].T @ np.linalg.solve(V[np.ix_(k, k)], A[k])
             nis += nu[k] @ np.linalg.solve(V[np.ix_(k, k)], nu[k])
-        self.covariance = np.linalg.inv(information)
+        P = np.linalg.inv(information + np.linalg.inv(self.covariance))
+        self.covariance = 0.5 * (P + P.T)
         ids = observations.ids
         return UpdateReport(UpdateStatus.OK, "", ids[used], ids[~used], float(nis), int(kept.sum()))
 
@@ -82,6 +89,7 @@ class FixedMapBackend:
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)
         if not np.isfinite(h).all() or any(i in self.landmarks for i in observations.ids.tolist()):
             raise MeasurementError("a landmark has no depth or is in the map already")
+        self.measured = self.measured or len(observations) > 0
         R, t = self.poses[-1][:3, :3], self.poses[-1][:3, 3]
         noise = self.rig.triangulation_covariance(h, self.models.pixel_sigma)
         by_pose = np.concatenate([-se3.hat(h), np.tile(np.eye(3), (len(h), 1, 1))], axis=2)
@@ -113,14 +121,14 @@ class FixedMapBackend:
     def _local(self, points):
         return se3.transform(se3.inverse(self.poses[-1]), points)
 
-    def _innovation(self, h, covariances, pose=True):
+    def _spread(self, h, covariances, pose=True):
         _, J = self.rig.project_stereo(h)
         R = self.poses[-1][:3, :3]
         P = R.T @ covariances @ R
         if pose:
             by_pose = np.concatenate([se3.hat(h), np.tile(-np.eye(3), (len(h), 1, 1))], axis=2)
             P = P + by_pose @ self.covariance @ np.swapaxes(by_pose, 1, 2)
-        return J @ P @ np.swapaxes(J, 1, 2) + self.models.pixel_sigma**2 * np.eye(3)
+        return J @ P @ np.swapaxes(J, 1, 2)
 
     def _rows(self, ids):
         try:

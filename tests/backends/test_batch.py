@@ -13,6 +13,7 @@ from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.solver import SolverError
+from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
 from slam.geometry.trajectory import Trajectory
@@ -20,6 +21,8 @@ from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
 from slam.run.simulated_recording import true_recording
+from slam.system import StereoSlam
+from slam.worlds import open_world
 from tests.backends.scenes import RIG, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
@@ -151,3 +154,24 @@ def test_the_trajectory_is_the_callers_own():
     assert isinstance(first, Trajectory)
     first.poses[:] = 0
     assert np.abs(backend.trajectory().poses).max() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("dark", "stamps"),
+    [
+        ((0,), (0.0, 1.5)),
+        ((0,), (0.0, 1.5, 1.6, 1.7, 1.8)),
+        ((0, 1), (0.0, 0.5, 0.6)),
+        ((0, 1, 2, 3), (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)),
+    ],
+)
+def test_dark_frames_at_the_start_leave_a_path_and_a_map(dark, stamps):
+    world = open_world("desk?frames=10")
+    system = StereoSlam(world.rig, None, "batch")
+    for k, stamp in enumerate(stamps):
+        seen = world.observations(k)
+        nothing = StereoFeatures.empty(stamp, seen.descriptors.shape[1])
+        system.process_features(nothing if k in dark else replace(seen, stamp=stamp))
+    path, found = system.trajectory(), system.estimate()
+    assert path.stamps.tolist() == list(stamps) and np.isfinite(path.poses).all()
+    assert len(found.ids) and np.isfinite(found.positions).all() and np.linalg.eigvalsh(found.covariances).min() > 0

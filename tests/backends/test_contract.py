@@ -12,8 +12,9 @@ import pytest
 import backends
 from slam import registry
 from slam.errors import ConfigurationError, MeasurementError
+from slam.geometry import se3
 from slam.interfaces import Backend
-from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, findings
+from slam.testing import BACKEND_CHECKS, RIG, RIGHT, RUNS, check_backend, estimation, findings, hostile
 from slam.testing.__main__ import main
 from tests.backends.fixed_map import FixedMapBackend
 from tests.backends.scenes import path, scene
@@ -49,7 +50,7 @@ def third_party(tmp_path, monkeypatch):
     registry._table.cache_clear()
 
 
-@pytest.mark.parametrize("check", BACKEND_CHECKS, ids=by_name)
+@pytest.mark.parametrize("check", [*RUNS, *RIGHT], ids=by_name)
 def test_third_party_contract(third_party, check):
     check(registry.resolve("backends", third_party))
 
@@ -83,6 +84,18 @@ class Boastful(FixedMapBackend):
         return super().estimate(landmarks)
 
 
+class Nosy(FixedMapBackend):
+    def trajectory(self):
+        self.poses[-1] = self.poses[-1] @ se3.exp(np.full(6, 1e-15))
+        return super().trajectory()
+
+
+class Twice(FixedMapBackend):
+    def update(self, observations, guess=None):
+        self.measured = False
+        return super().update(observations, guess)
+
+
 class Empty:
     def __init__(self, rig, models=None):
         pass
@@ -93,7 +106,10 @@ class Buggy(FixedMapBackend):
         return self.nothing_of_this_name
 
 
-TIER_OF = {Forgetful: "runs", Careless: "right", Boastful: "right", Empty: "runs", Buggy: "runs"}
+TIER_OF = {
+    Forgetful: "runs", Careless: "right", Boastful: "right", Nosy: "right", Twice: "right", Empty: "runs",
+    Buggy: "runs", FixedMapBackend: "good",
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -139,10 +155,30 @@ def test_a_status_that_is_a_word_is_told_from_the_right_one():
     )
 
 
+@pytest.mark.parametrize(
+    ("broken", "check"),
+    [
+        (Nosy, hostile.queries_are_pure),
+        (Twice, hostile.a_stamp_has_one_update),
+        (FixedMapBackend, estimation.landmarks_are_corrected),  # it never updates its landmarks
+    ],
+)
+def test_a_fault_is_found_by_its_own_check(broken, check):
+    with pytest.raises(AssertionError):
+        check(broken)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 120))
+@pytest.mark.parametrize("name", backends.names())
+def test_hostile_calls(name, seed):
+    hostile.play(registry.resolve("backends", name), seed, calls=80)
+
+
 @pytest.mark.slow
 def test_tiers_are_taken_one_after_the_other():
     assert [found.tier for found in findings(FixedMapBackend, "right")] == ["runs"] * len(RUNS) + ["right"] * len(RIGHT)
-    check_backend(FixedMapBackend)
+    check_backend(FixedMapBackend, "right")
     with pytest.raises(ConfigurationError, match="unknown tier 'best'; known: runs, right, good"):
         check_backend(FixedMapBackend, "best")
 

@@ -160,7 +160,7 @@ def test_innovation_covariances_are_blocks_of_the_dense_ones():
     S = H @ P @ H.T + 0.25 * np.eye(12)
     cross = P[6:, :6].reshape(4, 3, 6)
     blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
-    found = innovation_covariances(line, P[:6, :6], cross, blocks, 0.5)
+    found = innovation_covariances(line, P[:6, :6], cross, blocks) + 0.25 * np.eye(3)
     for i in range(4):
         np.testing.assert_allclose(found[i], S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-9)
 

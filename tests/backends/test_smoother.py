@@ -94,8 +94,9 @@ def test_what_removed_landmarks_have_told_stays_known():
     backend.remove(backend.estimate().ids)
     assert len(backend.estimate().ids) == 0
     assert set(measurements_in_factors(backend)) == set(rows) - informative
-    np.testing.assert_array_equal(backend.trajectory().poses, before.poses)
-    np.testing.assert_array_equal(backend.estimate().covariance, P)
+    # To rounding: the answer is solved for again, with the factors in another order.
+    np.testing.assert_allclose(backend.trajectory().poses, before.poses, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(backend.estimate().covariance, P, rtol=0, atol=1e-12 * np.abs(P).max())
     report = step(backend, 2.5, Observations.empty(), set())
     assert report.status is UpdateStatus.EMPTY
     grown = backend.estimate().covariance

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -12,12 +13,14 @@ from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker
 from backends.smoother.marginal import MarginalPrior
+from backends.smoother.reference_pose import ReferencePose
 from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Observations
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.models import EstimatorModels, MotionModel
+from slam.testing import hostile
 from slam.window.pose_only import residual_noise
 from slam.window.stereo import RectifiedStereo
 from tests.backends.scenes import RIG, path, run, scene, step
@@ -212,3 +215,20 @@ def test_batch_leaves_nothing_out():
     run(backend, data)
     assert len(backend.trajectory()) == 70
     assert backend._smoother.measurement_log.history.first == 0
+
+
+def test_a_held_pose_gets_back_its_covariance_from_the_solver_that_holds_it():
+    rng = np.random.default_rng(2)
+    A, B = rng.normal(0, 1, (2, 6, 6))
+    known, measured = A @ A.T + np.eye(6), 50 * (B @ B.T)  # information of what left, and of the rest
+    held = ReferencePose(pose_key(3), np.eye(4), known, np.linalg.inv(known))
+    P = np.linalg.inv(1e4 * known + known + measured)  # it is held by so many times what is known of it
+    found = held.with_covariance_from(P)
+    truth = np.linalg.inv(known + measured)
+    np.testing.assert_allclose(found.covariance, truth, rtol=1e-6, atol=1e-6 * np.abs(truth).max())
+    assert np.trace(found.covariance) < 0.9 * np.trace(held.covariance)
+    assert held.with_covariance_from(np.linalg.inv(1e4 * known - np.eye(6))) is held  # digits that are lost
+
+
+def test_queries_are_pure_with_a_short_lag():
+    hostile.queries_are_pure(partial(SmootherBackend, lag=4, window=3, track=3, explicit=5))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _UNKNOWN_DIRECTION = np.pi / np.sqrt(3)  # derived: standard deviation of an unknown angle [rad]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapAnchor:
     """A pose with its uncertainty in the map, from which those of later poses are propagated.
 
@@ -77,7 +77,7 @@ class MapAnchor:
         return np.asarray(J @ self.covariance @ J.T + np.outer(found, found))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrackingGap:
     """A time in which the camera moved without being tracked, and after which a new back end took over.
 
@@ -95,7 +95,7 @@ class TrackingGap:
     anchor: MapAnchor | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Atlas:
     """What a run keeps of the places that it has visited.
 

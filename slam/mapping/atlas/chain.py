@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, inverse, log
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
     """The path of the keyframes as the back end estimated it, step by step.
 

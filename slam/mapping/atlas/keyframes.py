@@ -16,7 +16,7 @@ from slam.rig_error import Correction
 _ROUNDING = 1e-14  # numerics: variances below this share of the largest are rounding
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Keyframe:
     """A frame that is kept.
 
@@ -65,7 +65,7 @@ class Keyframe:
         return replace(self, points=points, correction=correction)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Loop:
     """Two keyframes that show the same place.
 

@@ -51,7 +51,7 @@ _LARGEST = 6e4  # guard: largest number in a keyframe's descriptors, which are h
 _HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches right one place in a hundred is missed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Found:
     """Pose and place of a camera found without a prior.
 

@@ -22,7 +22,7 @@ _ROUNDS = 10  # numerics: of k-means
 _NONE = 1e-12  # numerics: length below which a vector counts as zero
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlaceIndex:
     """VLAD vectors of keyframes, and the visual words they are made with.
 

@@ -30,7 +30,7 @@ _FAST = 0.1  # numerics: the normal equations are kept while χ² decreases by l
 _HALVINGS = 8  # numerics: most halvings of a step that increases χ²
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The keyframes' poses.
 
@@ -47,7 +47,7 @@ class Solution:
     disagreement: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Path and loops, with the poses and common errors that minimise χ².
 
@@ -130,7 +130,7 @@ def solve(chain: Chain, loops: Sequence[Loop], start: Array) -> Solution:
     return PoseGraph.solved(chain, loops, start).solution()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Problem:
     """Measured motions between keyframes: those of stretches first, then those of loops.
 
@@ -244,7 +244,7 @@ class _Problem:
         return poses, common, normal
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Normal:
     """Normal equations of poses, sparse, and of common errors, dense.
 

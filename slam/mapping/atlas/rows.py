@@ -12,7 +12,7 @@ from slam.mapping.atlas.keyframes import Keyframe
 _LEAST = 64  # cost: rows allocated at first
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KeyframeRows:
     """Data of keyframes as arrays, see `slam.mapping.atlas.keyframes.Keyframe`; rows beyond `count` are unused.
 

@@ -25,7 +25,7 @@ _ROUNDS = 5  # numerics: most iterations of least squares
 _CONVERGED = 1e-6  # numerics: step [rad], [m]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verified:
     """A keyframe's place, seen again.
 

@@ -36,7 +36,7 @@ _LAP = 0.3  # by which these overlap where the ground is not level [m]
 _SMOOTHED = 6.0  # standard deviation of the mean that gives the ground's height [m]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """What stands on one side of a stretch.
 

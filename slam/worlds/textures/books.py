@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 
 from slam.worlds.textures import layout, paint
-from slam.worlds.textures.paint import Colour
-
-if TYPE_CHECKING:
-    from slam.worlds.textures.surfaces import ShelfBay, Shelves
+from slam.worlds.textures.paint import Area, Colour
 
 _WOOD = (110.0, 150.0, 190.0)
 
@@ -28,18 +23,25 @@ _BINDINGS = np.array(
 _INKS = ((225.0, 235.0, 240.0), (90.0, 190.0, 220.0), (25.0, 25.0, 25.0), (50.0, 50.0, 160.0))
 
 
-def paint_bay(bay: ShelfBay, density: float) -> np.ndarray:
-    """The picture of one bay of a wall of shelves, BGR uint8, `density` texels per metre."""
-    shelves = bay.shelves
-    rng = np.random.default_rng([shelves.seed, 61, bay.number])
-    size = round(bay.height * density), round(bay.width * density)
+def paint_bay(area: Area, books: layout.Books, number: int, last: bool, seed: int, density: float) -> np.ndarray:
+    """The picture of one bay of a wall of shelves, BGR uint8.
+
+    Args:
+        area: height, width [m].
+        books: of the whole wall, from the bay's left edge.
+        number: of the bay, from the left.
+        last: whether it is the last one.
+        seed: which wall.
+        density: texels per metre.
+    """
+    rng = np.random.default_rng([seed, 61, number])
+    size = round(area[0] * density), round(area[1] * density)
     cloth = 1 + 0.04 * rng.standard_normal(size, np.float32) + 0.04 * paint.clouds(size, rng, 0.012 * density, 2)
     canvas = paint.tinted(0.32 * cloth, _WOOD)  # the back board, seen between and above the books
-    books = shelves.books.moved(-bay.left)
-    for i in np.flatnonzero((books.left >= 0) & (books.left < bay.width)).tolist():
-        _book(canvas, cloth, books, i, density, np.random.default_rng([shelves.seed, 62, int(books.series[i])]), rng)
-    _shadows(canvas, shelves, density)
-    _woodwork(canvas, bay, density, rng)
+    for i in np.flatnonzero((books.left >= 0) & (books.left < area[1])).tolist():
+        _book(canvas, cloth, books, i, density, np.random.default_rng([seed, 62, int(books.series[i])]), rng)
+    _shadows(canvas, area[0], density)
+    _woodwork(canvas, area[0], (number == 0, last), density, rng)
     return cv2.convertScaleAbs(cv2.subtract(canvas, (_BLACK, _BLACK, _BLACK, 0)), alpha=_CONTRAST)
 
 
@@ -123,21 +125,25 @@ def _label(canvas: np.ndarray, label: float, density: float, rng: np.random.Gene
         paint.lettering(canvas, text, line, (30.0, 30.0, 30.0), rng)
 
 
-def _shadows(canvas: np.ndarray, shelves: Shelves, density: float) -> None:
+def _shadows(canvas: np.ndarray, high: float, density: float) -> None:
     """The shade under each board, and the light falling off downwards."""
     y = np.arange(canvas.shape[0], dtype=np.float32) / density
-    light = 1.0 - 0.18 * y / max(shelves.height, 1e-6)
-    for board in layout.shelf_rows(shelves.height):
+    light = 1.0 - 0.18 * y / max(high, 1e-6)
+    for board in layout.shelf_rows(high):
         below = y - (board - layout.ROW + layout.BOARD)
         light *= np.where((below > 0) & (below < 0.12), 0.45 + 0.55 * np.clip(below / 0.12, 0, 1) ** 0.6, 1.0)
     for row, share in enumerate(light):
         canvas[row] = cv2.convertScaleAbs(canvas[row], alpha=float(share))
 
 
-def _woodwork(canvas: np.ndarray, bay: ShelfBay, density: float, rng: np.random.Generator) -> None:
-    """Boards with labels on their edges, plinth, top, and the bay's share of the uprights beside it."""
+def _woodwork(
+    canvas: np.ndarray, high: float, ends: tuple[bool, bool], density: float, rng: np.random.Generator
+) -> None:
+    """Boards with labels on their edges, plinth, top, and the bay's share of the uprights beside it.
+
+    `ends` says whether the wall ends on its left and on its right.
+    """
     height, width = canvas.shape[:2]
-    high = bay.height
     thick = round(layout.BOARD * density)
     for board in layout.shelf_rows(high):
         y = round(board * density)
@@ -151,8 +157,8 @@ def _woodwork(canvas: np.ndarray, bay: ShelfBay, density: float, rng: np.random.
     canvas[: max(top, thick)] = paint.wood((max(top, thick), width), rng, _WOOD, density)
     half = layout.UPRIGHT / 2
     wide, narrow = (round(share * half * density) for share in (2, 1))
-    on_left = narrow if bay.number else wide
-    on_right = wide if bay.number == bay.shelves.bays - 1 else narrow
+    on_left = wide if ends[0] else narrow
+    on_right = wide if ends[1] else narrow
     for x, thick in ((0, on_left), (width - on_right, on_right)):
         canvas[:, x : x + thick] = paint.wood((thick, height), rng, _WOOD, density).transpose(1, 0, 2)
     canvas[:, on_left : on_left + 3] //= 2

@@ -14,7 +14,7 @@ BOARD = 0.025  #: thickness of the boards [m]
 ROW = 0.34  #: height from board to board [m]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Books:
     """Books on a shelf wall, a row each; lengths in metres from the wall's top-left corner.
 

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from slam.errors import UnknownNameError
+from slam.geometry.se3 import Array
 from slam.worlds.textures import outdoors, paint, things
-from slam.worlds.textures.paint import Colour
-
-if TYPE_CHECKING:
-    from slam.worlds.textures.surfaces import Material
+from slam.worlds.textures.paint import Area, Colour
 
 _INKS: tuple[Colour, ...] = ((25, 30, 40), (235, 240, 240), (40, 40, 170), (150, 70, 30))
 
 Painter = Callable[["tuple[int, int]", np.random.Generator, float], np.ndarray]
 
 
-def paint_material(material: Material, density: float) -> np.ndarray:
-    """The picture of a piece of material, BGR uint8, `density` texels per metre.
+def paint_material(name: str, area: Area, spots: Array, seed: int, density: float) -> np.ndarray:
+    """The picture of a piece of material, BGR uint8.
+
+    Args:
+        name: of the material.
+        area: height, width [m].
+        spots: things scattered over it (N, 3): x, y, diameter [m].
+        seed: which piece.
+        density: texels per metre.
 
     Raises:
         UnknownNameError: there is no such material.
     """
     try:
-        recipe = RECIPES[material.material]
+        recipe = RECIPES[name]
     except KeyError:
-        raise UnknownNameError(f"unknown material {material.material!r}; known: {', '.join(RECIPES)}") from None
-    rng = np.random.default_rng([material.seed, 63])
+        raise UnknownNameError(f"unknown material {name!r}; known: {', '.join(RECIPES)}") from None
+    rng = np.random.default_rng([seed, 63])
     density *= recipe.detail
-    size = max(1, round(material.height * density)), max(1, round(material.width * density))
+    size = max(1, round(area[0] * density)), max(1, round(area[1] * density))
     canvas = recipe.ground(size, rng, density)
-    for x, y, diameter in material.marks() * density:
+    for x, y, diameter in spots * density:
         recipe.spot(canvas, x, y, diameter, rng)
     return canvas
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from slam.geometry.se3 import Array
 from slam.worlds.textures import paint
-from slam.worlds.textures.paint import Colour
-
-if TYPE_CHECKING:
-    from slam.worlds.textures.surfaces import Facade
+from slam.worlds.textures.paint import Area, Colour
 
 Size = tuple[int, int]
 
@@ -28,10 +24,18 @@ _PAINTS: tuple[Colour, ...] = (
 )  # fmt: skip
 
 
-def paint_facade(facade: Facade, density: float) -> np.ndarray:
-    """The picture of a house front, BGR uint8, `density` texels per metre."""
-    rng = np.random.default_rng([facade.seed, 64])
-    size = round(facade.height * density), round(facade.width * density)
+def paint_facade(area: Area, windows: Array, spots: Array, seed: int, density: float) -> np.ndarray:
+    """The picture of a house front, BGR uint8, `density` texels per metre.
+
+    Args:
+        area: height, width [m].
+        windows: (M, 4) left, top, width, height [m].
+        spots: what is scattered on the wall (N, 3): x, y, diameter [m].
+        seed: which house.
+        density: texels per metre.
+    """
+    rng = np.random.default_rng([seed, 64])
+    size = round(area[0] * density), round(area[1] * density)
     colour = _WALLS[int(rng.integers(len(_WALLS)))]
     light = 1 + 0.06 * paint.clouds(size, rng, 1.5 * density, 5) + 0.03 * rng.standard_normal(size, np.float32)
     canvas = paint.tinted(light, colour)
@@ -41,10 +45,10 @@ def paint_facade(facade: Facade, density: float) -> np.ndarray:
     base = 0.7 * density
     paint.bar(canvas, (0, size[0] - base, width, base), (95.0, 100.0, 105.0))
     paint.bar(canvas, (0, 0, width, 0.35 * density), (70.0, 80.0, 110.0))
-    for left, top, w, h in facade.windows * density:
+    for left, top, w, h in windows * density:
         _window(canvas, (left, top, w, h), density, rng)
     _door(canvas, size, density, rng)
-    for x, y, diameter in facade.marks()[6 * len(facade.windows) :] * density:
+    for x, y, diameter in spots * density:
         darker = rng.uniform(0.55, 0.85)
         shade = (colour[0] * darker, colour[1] * darker, colour[2] * darker)
         paint.bar(canvas, (x - diameter / 2, y - diameter / 6, diameter, diameter / 3), shade)

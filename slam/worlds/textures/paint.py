@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 Colour = tuple[float, float, float]  #: blue, green, red
+Area = tuple[float, float]  #: height, width [m]
 Box = tuple[float, float, float, float]  #: left, top, width, height [texels]
 
 _LETTERS = "ABCDEFGHIJKLMNOPRSTUVWZ"

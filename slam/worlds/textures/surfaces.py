@@ -67,6 +67,11 @@ class ShelfBay:
     number: int
 
     @property
+    def last(self) -> bool:
+        """Whether the wall ends with it."""
+        return self.number == self.shelves.bays - 1
+
+    @property
     def left(self) -> float:
         """Where it begins on the wall [m]."""
         return self.number * layout.BAY + layout.UPRIGHT / 2 if self.number else 0.0
@@ -74,8 +79,7 @@ class ShelfBay:
     @property
     def width(self) -> float:
         """Its width [m]."""
-        last = self.number == self.shelves.bays - 1
-        return (self.shelves.width if last else (self.number + 1) * layout.BAY + layout.UPRIGHT / 2) - self.left
+        return (self.shelves.width if self.last else (self.number + 1) * layout.BAY + layout.UPRIGHT / 2) - self.left
 
     @property
     def height(self) -> float:
@@ -90,7 +94,10 @@ class ShelfBay:
         """The picture, BGR."""
         from slam.worlds.textures import books
 
-        return books.paint_bay(self, density)
+        return books.paint_bay(
+            (self.height, self.width), self.shelves.books.moved(-self.left), self.number, self.last, self.shelves.seed,
+            density,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -120,7 +127,7 @@ class Material:
         """The picture, BGR."""
         from slam.worlds.textures import materials
 
-        return materials.paint_material(self, density)
+        return materials.paint_material(self.material, (self.height, self.width), self.marks(), self.seed, density)
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,8 @@ class Facade:
         """The picture, BGR."""
         from slam.worlds.textures import outdoors
 
-        return outdoors.paint_facade(self, density)
+        spots = self.marks()[6 * len(self.windows) :]
+        return outdoors.paint_facade((self.height, self.width), self.windows, spots, self.seed, density)
 
 
 @dataclass(frozen=True)
@@ -182,4 +190,4 @@ class SignBoard:
         """The picture, BGR."""
         from slam.worlds.textures import things
 
-        return things.sign_board(self, density)
+        return things.sign_board((self.height, self.width), self.marks(), self.seed, density)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from slam.geometry.se3 import Array
 from slam.worlds.textures import paint
-
-if TYPE_CHECKING:
-    from slam.worlds.textures.surfaces import SignBoard
+from slam.worlds.textures.paint import Area
 
 Size = tuple[int, int]
 
@@ -153,12 +150,19 @@ def wood(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     return paint.wood(size, rng, (105.0, 150.0, 190.0), density)
 
 
-def sign_board(board: SignBoard, density: float) -> np.ndarray:
-    """A white board with signs: discs and squares with a pattern of their own around and on them."""
-    rng = np.random.default_rng([board.seed, 65])
-    size = round(board.height * density), round(board.width * density)
+def sign_board(area: Area, signs: Array, seed: int, density: float) -> np.ndarray:
+    """A white board with signs: discs and squares with a pattern of their own around and on them.
+
+    Args:
+        area: height, width [m].
+        signs: (N, 3) x, y, diameter [m].
+        seed: which patterns.
+        density: texels per metre.
+    """
+    rng = np.random.default_rng([seed, 65])
+    size = round(area[0] * density), round(area[1] * density)
     canvas = paint.tinted(1 + 0.01 * paint.clouds(size, rng, 0.2 * density), (205.0, 212.0, 215.0))
-    for x, y, diameter in board.marks() * density:
+    for x, y, diameter in signs * density:
         dark = rng.random() < 0.7
         ground, ink = ((215.0,) * 3, (30.0,) * 3) if dark else ((45.0,) * 3, (225.0,) * 3)
         field = 2.2 * diameter

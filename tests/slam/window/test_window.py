@@ -79,7 +79,9 @@ def test_covariances_are_those_of_dense_least_squares():
     found = solve(w)
     P, n = np.linalg.inv(dense(found.equations.window)), 6 * POSES
     scale = np.sqrt(np.diag(P[:n, :n]))
-    np.testing.assert_allclose(found.pose_covariance / np.outer(scale, scale), P[:n, :n] / np.outer(scale, scale), atol=1e-6)
+    np.testing.assert_allclose(
+        found.pose_covariance / np.outer(scale, scale), P[:n, :n] / np.outer(scale, scale), atol=1e-6
+    )
     local, world = found.point_covariances(POSES - 1)
     T = w.poses[-1]
     by_pose = se3.points_by_pose(se3.transform(se3.inverse(T), w.points))
@@ -119,8 +121,8 @@ def with_everything():
 def test_gradient_is_the_costs_derivative():
     """Of a window with each kind of knowledge, whose points are at their best for its poses."""
     w = with_everything()
-    prior = marginalised(replace(w, rows=w.rows.select(w.rows.pose == 0), motion=Motion.none(), places=Places.none()), 0,
-                         np.zeros(0, bool), np.arange(10, 20))[0]  # fmt: skip
+    part = replace(w, rows=w.rows.select(w.rows.pose == 0), motion=Motion.none(), places=Places.none())
+    prior = marginalised(part, 0, np.zeros(0, bool), np.arange(10, 20))[0]
     rest = w.rows.select(w.rows.pose > 0)
     w = replace(w, poses=w.poses[1:], rows=replace(rest, pose=rest.pose - 1), prior=prior, motion=Motion(
         np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.full((2, 6), 3.0)))  # fmt: skip
