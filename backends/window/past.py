@@ -89,7 +89,7 @@ class Past:
         known, where = dict(poses), dict(points)
         for one in reversed(self.left):
             moved = [where[serial] for serial in one.stayed.tolist()]
-            y = [(np.array(moved).reshape(-1, 3) - one.positions).ravel()]
+            y: list[Array] = [(np.array(moved).reshape(-1, 3) - one.positions).ravel()]
             y.append(log(inverse(one.poses) @ np.array([known[frame] for frame in one.frames.tolist()])).ravel())
             x = one.mean - one.gain @ np.concatenate(y)
             known[one.frame] = one.pose @ exp(x[-6:])

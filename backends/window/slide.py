@@ -54,8 +54,7 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
     part = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
     w = part.window
     keeps = (member | joins | ends)[part.points]
-    information = np.where(keeps[:, None, None], w.information, 0.0)
-    w = replace(w, information=information)
+    w = replace(w, information=np.where(keeps[:, None, None], marks.information[part.points], 0.0))
     joining = np.flatnonzero(joins[part.points])
     ending = ends[s.prior.points]
     prior, conditional, cost = marginalised(w, leaving, ending, joining)
