@@ -20,7 +20,7 @@ import numpy as np
 
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.evaluation.truth_error import RowArray, doubtful, truth_covariances
-from slam.geometry.arrays import Array
+from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
@@ -123,9 +123,9 @@ def stretch_nees(
     return values
 
 
-def _are_covariances(P: Array) -> RowArray:
+def _are_covariances(P: Array) -> BoolArray:
     """Which symmetric matrices (M, 6, 6) are finite and positive definite, also after rounding (M,)."""
-    good = np.isfinite(P).all(axis=(1, 2))
+    good: BoolArray = np.asarray(np.isfinite(P).all(axis=(1, 2)))
     values = np.linalg.eigvalsh(P[good])
     good[good] = values[:, 0] > np.maximum(_SMALLEST, _ROUNDING * values[:, -1])
     return good

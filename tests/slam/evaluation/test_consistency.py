@@ -100,7 +100,7 @@ def test_stretches_across_a_loop_are_left_out_and_counted_where_shared_errors_sh
     figures = consistency_figures(own, true, P, NONE, common)
     assert "no covariance over 10 m" not in honest
     assert 0.0 < figures["no covariance over 10 m"] < 0.5
-    assert 3.0 < figures["NEES over 10 m"]
+    assert figures["NEES over 10 m"] > 3.0
     assert np.isfinite(figures["mean NEES"])
 
 

@@ -16,6 +16,7 @@ from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.consensus import agreeing, spaced
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.atlas.loop_closer import LoopCloser
+from slam.mapping.atlas.pose_graph import PoseGraph
 from slam.rig_error import CommonError
 from tests.slam.scene import RIG
 
@@ -117,3 +118,20 @@ def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
     assert {x.pair for x in true} <= {x.pair for x in atlas.loops}
     assert {x.pair for x in false} <= set(atlas.refused)
     assert error(atlas) < 0.4
+
+
+@pytest.mark.parametrize("size", [1e300, np.nan])
+def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
+    """Numbers beyond computing make the pose graph singular: no reason to end a run."""
+    config = SystemConfig.for_kind("driving", None, "ekf")
+    closer = LoopCloser(RIG, replace(config.atlas, agreeing=1), config.association, config.models, 0.3)
+    steps = CHAIN.steps[:81].copy()
+    steps[:] = size * np.eye(6)
+    chain, path = Chain(ODOM[:81], steps), Trajectory(0.1 * np.arange(81), ODOM[:81])
+    monkeypatch.setattr(Atlas, "chain", lambda *_: chain)
+    with np.errstate(all="ignore"):
+        after, back = closer._close(atlas_of(81), loop(80), SimpleNamespace(), CommonError(), lambda: path)  # type: ignore[arg-type]
+        with pytest.raises(np.linalg.LinAlgError):
+            PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
+    assert after.refused == (loop(80).pair,)
+    assert back is None
