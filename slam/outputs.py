@@ -60,6 +60,9 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
     Raises:
         SlamError: one line says which output, and why.
     """
+    for output in outputs:
+        if "\0" in str(output.path):
+            raise SlamError(f"{output.path}: no possible file name")
     read = [Path(os.path.realpath(path)) for path in inputs]
     made = {output.real for output in outputs if output.names is not None}
     for output in outputs:
@@ -76,8 +79,6 @@ def require_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = (), over
 def _require_possible(output: Output, made: set[Path]) -> None:
     """Raise where there is something else, or no folder to write to; `made` are folders that other outputs make."""
     path, is_folder = output.path, output.names is not None
-    if "\0" in str(path):
-        raise SlamError(f"{path}: no possible file name")
     there = _status(path)
     if there is not None and not (stat.S_ISDIR if is_folder else stat.S_ISREG)(there.st_mode):
         wanted = "folder" if is_folder else "regular file"
@@ -87,9 +88,11 @@ def _require_possible(output: Output, made: set[Path]) -> None:
     if is_folder and there is None and path.is_symlink():
         raise SlamError(f"{path}: cannot be written: a link to a folder that is not there")
     place = path if is_folder and there is not None else output.real.parent
+    near = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
     above = next(folder for folder in (place, *place.absolute().parents) if os.path.lexists(folder))
-    if not above.is_dir():
-        raise SlamError(f"{path}: cannot be written: {above} is not a folder")
+    for folder in (near, above):
+        if not folder.is_dir():  # such as a link to nothing
+            raise SlamError(f"{path}: cannot be written: {folder} is not a folder")
     if above != place and not is_folder and not output.makes_folder and place not in made:
         raise SlamError(f"{path}: cannot be written: there is no folder {path.parent}")
     with tempfile.TemporaryFile(dir=above):  # permissions alone do not say it

@@ -81,7 +81,7 @@ def test_two_outputs_are_not_the_same(tmp_path, overwrite):
     [
         ("loop", "symbolic links"), ("loop/a", "symbolic links"), ("folder", "not a regular file"),
         ("pipe", "not a regular file"), ("text/a", "not a folder"), ("missing/a", "no folder"), ("x" * 300, "too long"),
-        ("a\0b", "no possible"), ("nothing/a", "no folder"),
+        ("a\0b", "no possible"), ("nothing/a", "not a folder"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_written_is_said(tmp_path, path, words):
