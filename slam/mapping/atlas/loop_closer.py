@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvalsh
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
@@ -202,8 +203,6 @@ class LoopCloser:
             added = step_covariance(last, T, P)
         elif len(gaps) == 1 and gaps[0].covariance is not None:
             added = gaps[0].covariance + P
-        with np.errstate(under="ignore"):  # tiny numbers become 0
-            descriptors = np.clip(features.descriptors[rows], -_LARGEST, _LARGEST).astype(np.float16)
         return Keyframe(
             step.index,
             features.stamp,
@@ -213,8 +212,8 @@ class LoopCloser:
             step.common.jacobian,
             travelled,
             float(np.median(points[:, 2])),
-            points.astype(np.float32),
-            descriptors,
+            narrowed(points, np.float32),
+            narrowed(np.clip(features.descriptors[rows], -_LARGEST, _LARGEST), np.float16),
             features.laplacian[rows],
             landmark_of[rows],
             step.correction,
