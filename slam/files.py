@@ -12,6 +12,7 @@ import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,6 +30,26 @@ TEXT_LIMIT = 128 * _MEBI
 _JSON_LIMIT = 16 * _MEBI
 _LARGEST = 1e15  # number in a table: stamps in nanoseconds are larger, but no table of ours has them
 
+_inputs: ContextVar[list[Path] | None] = ContextVar("inputs", default=None)
+
+
+@contextmanager
+def noting_inputs() -> Iterator[list[Path]]:
+    """A list of what is read meanwhile: files, and folders of which all is an input."""
+    found: list[Path] = []
+    token = _inputs.set(found)
+    try:
+        yield found
+    finally:
+        _inputs.reset(token)
+
+
+def note_input(path: str | Path) -> None:
+    """Say that a file, or what is in a folder, is read."""
+    found = _inputs.get()
+    if found is not None:
+        found.append(Path(path).absolute())
+
 
 def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceError) -> bytes:
     """The content of a regular file.
@@ -43,6 +64,7 @@ def read_bytes(path: str | Path, limit: int, error: type[SlamError] = SequenceEr
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | _not_blocking())
+        note_input(path)
     except OSError as fault:
         raise error(f"{path}: {reason(fault)}") from fault
     except (ValueError, TypeError) as fault:  # a NUL or a lone surrogate in the name; no name at all
@@ -117,6 +139,7 @@ def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
     if not status.st_size:
         raise error(f"{path}: the file is empty")
     require_utf8(path, error)
+    note_input(path)
 
 
 def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
@@ -132,7 +155,7 @@ def require_utf8(path: Path, error: type[SlamError] = SlamError) -> None:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write an image as PNG, whatever the file is called.
+    """Write an image as PNG, whatever the file is called; a link that is there is replaced, not followed.
 
     Raises:
         OSError: it cannot be written; no part of it is left.
@@ -141,6 +164,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
     content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
     try:
+        remove_file(path)
         path.write_bytes(content)
     except OSError:
         with suppress(OSError):
@@ -168,8 +192,14 @@ def reason(fault: OSError) -> str:
     return fault.strerror or str(fault)
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file or a link if there is one; anything else stays, and raises OSError where it is written to."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+
+
 def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
-    """Raise where a file could not be written for certain, before work is done for it.
+    """Raise where a file could not be written for certain.
 
     Raises:
         SlamError: of type `error`, where there is no folder for it, or something at its place that is not a regular
@@ -180,8 +210,9 @@ def require_target(path: Path, error: type[SlamError] = SlamError) -> None:
     try:
         if not path.parent.is_dir():
             raise error(f"{path}: cannot be written: there is no folder {path.parent}")
-        if path.exists() and not path.is_file():
-            raise error(f"{path}: cannot be written: there is something that is not a regular file")
+        with suppress(FileNotFoundError):
+            if not stat.S_ISREG(path.stat().st_mode):  # raises for links in a circle
+                raise error(f"{path}: cannot be written: there is something that is not a regular file")
     except OSError as fault:
         raise error(f"{path}: cannot be written: {reason(fault)}") from fault
 
@@ -229,10 +260,11 @@ def write_text(path: str | Path, text: str) -> None:
 class RowFile:
     """A text file that grows by whole rows: rows that cannot be written completely are removed again.
 
-    Rows are handed to the operating system before `write` returns, so that a kill loses none.
+    Rows are handed to the operating system before `write` returns, so that a kill loses none. What a link points to is
+    left alone.
 
     Args:
-        path: of the file, which is created or emptied.
+        path: of the file; an old one is removed.
 
     Raises:
         OSError: it cannot be opened, or what is there is not a regular file.
@@ -242,7 +274,8 @@ class RowFile:
         self.path = path
         if path.exists() and not path.is_file():
             raise OSError(f"{path.name} is there already and not a regular file")
-        self._file = path.open("wb", buffering=0)
+        remove_file(path)
+        self._file = path.open("xb", buffering=0)
         self._length = 0
 
     def write(self, text: str) -> None:

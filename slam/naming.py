@@ -1,10 +1,11 @@
-"""Suggestions for unknown names, for error messages."""
+"""Names: suggestions for unknown ones, for error messages, and how any can be shown."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+_UNSHOWN = "\N{REPLACEMENT CHARACTER}"
 _LIKE = 0.6  # least similarity of a suggestion, from 0 to 1
 
 
@@ -13,6 +14,15 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     by_case = {other.lower(): other for other in known}
     near = get_close_matches(str(name).lower(), by_case, 1, _LIKE)
     return by_case[near[0]] if near else None
+
+
+def printable(text: str) -> str:
+    """A text for pictures and pages: control characters and halves of characters are replaced.
+
+    >>> printable("a" + chr(27) + "b")
+    'a�b'
+    """
+    return "".join(letter if letter.isprintable() else _UNSHOWN for letter in text)
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -224,6 +224,7 @@ class StereoSlam:
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
         self._roll_back()
         index, stages, search = self._last.index + 1, self._stages, self._relocalizer.search
+        backends = len(self.restarted)
         if search is not None and not self._locate(features, index):
             self._last, self._stamp = replace(self._last, index=index), features.stamp
             return search.lost(index, replace(features, images=None))
@@ -233,7 +234,8 @@ class StereoSlam:
             seen = self._associate(prediction, features, index)
         with stages.stage("update"):  # the measurement of the landmarks
             report, left_out, state = self._update(seen, dt)
-            seen = self._start_new_map(seen, state, index)
+            if self._needs_new_map(state):
+                seen, report, left_out = self._begin_new_map(features, index)
         with stages.stage("estimate"):
             estimate = self._estimate_pose(report)
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
@@ -251,7 +253,7 @@ class StereoSlam:
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # Commit the step in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
-            self._last.after(step, len(change.added), anchors, index in self.restarted[-1:]), change.landmarks, atlas,
+            self._last.after(step, len(change.added), anchors, len(self.restarted) > backends), change.landmarks, atlas,
             Stages(),
         )  # fmt: skip
         return result
@@ -464,27 +466,30 @@ class StereoSlam:
         self._take_over(new, path, self.atlas.relocalized(gap, place), index)
         return landmarks, prediction, self._localizer.match(prediction, landmarks, positions, features, index)
 
-    def _start_new_map(self, seen: AssociatedFrame, state: TrackingState, index: int) -> AssociatedFrame:
-        """If the camera is in an unknown place, begin a new map there with a new back end.
+    def _needs_new_map(self, state: TrackingState) -> bool:
+        """Whether the camera is in an unknown place, and a new back end can begin a map there."""
+        unknown, enabled = state.in_unknown_place(self.config.map.restart_after), self.config.atlas.enabled
+        return unknown and enabled and len(self.atlas) > 0 and self._relocalizer.can_restart(self.backend)
+
+    def _begin_new_map(self, features: StereoFeatures, index: int) -> tuple[AssociatedFrame, UpdateReport, IdArray]:
+        """Begin a new map with a new back end, and the frame again: nothing in it refers to the old one's landmarks.
 
         The new map's pose relative to the earlier one is as uncertain as the predicted pose, until a place of the atlas
         is seen again. The earlier landmarks remain in the atlas only.
         """
-        unknown, c = state.in_unknown_place(self.config.map.restart_after), self.config.atlas
-        if not (unknown and c.enabled and len(self.atlas) and self._relocalizer.can_restart(self.backend)):
-            return seen
         before = self._rig_error.added_to(require_estimate(self.backend.estimate(landmarks=False), self.backend))
-        new, path = self._relocalizer.start_new_map(self.backend, seen.features.stamp)
+        new, path, prediction, report = self._relocalizer.start_new_map(self.backend, features.stamp)
         after, common = new.estimate(landmarks=False), self._rig_error.common(as_given=False)
         since, models = self._last.measured_at, self.config.models
         self._take_over(new, path, self.atlas.with_new_map(since, before, after, common, models), index)
-        none = LandmarkTable.empty(seen.features.descriptors.shape[1])
-        return replace(seen, landmarks=none, matches=LandmarkMatches.nothing())
+        corrected = replace(self.calibration.correct(features), images=None)
+        return AssociatedFrame.of_nothing_known(features, corrected, prediction), report, report.used
 
     def _take_over(self, new: Backend, path: Trajectory, atlas: Atlas, index: int) -> None:
         """Continue with a new back end; `path` is the old one's."""
+        self.objects.restart()
+        self._localizer.forget()
         r = self._relocalizer
         self.backend, self.atlas, self._rig_error.given, r.past, r.restarted = (
             new, atlas, self.calibration.applied, [*r.past, path], [*r.restarted, index],
         )  # fmt: skip
-        self.objects.restart()

@@ -13,6 +13,7 @@ from rich.table import Table
 from slam.commands.display import Progress
 from slam.data import FrameResult
 from slam.errors import ConfigurationError
+from slam.files import noting_inputs
 from slam.run.calibrating import Calibrated, Targets
 from slam.run.calibrating import calibrate as run
 from slam.sequences import Sequence as StereoSequence
@@ -43,7 +44,9 @@ def calibrate(
     twice = next((text for k, text in enumerate(texts) if text in texts[:k]), None)
     if twice is not None:
         raise ConfigurationError(f"{twice}: given twice; it would count as two recordings that agree")
-    done = run([open_sequence(text, format=format) for text in texts], targets, show, settings, frames)
+    with noting_inputs() as inputs:
+        opened = [open_sequence(text, format=format) for text in texts]
+    done = run(opened, targets, show, settings, frames, inputs)
     if done.warning:
         logging.getLogger(__name__).warning("%s", done.warning)
     if not quiet:

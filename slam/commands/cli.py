@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slam.commands import completion
-from slam.commands.error_exit import one_line_errors
+from slam.commands.error_exit import lasting_streams, one_line_errors
 from slam.commands.options import (
     BackendOption,
     CalibrationOption,
@@ -42,6 +42,7 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import catch_signals, leaving, whole_frames
+from slam.runtime.memory import require_address_space
 
 if TYPE_CHECKING:
     from slam.run.recorded import Recording
@@ -59,14 +60,15 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point; errors end as `slam.commands.error_exit` says."""
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
-    logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
     os.environ["MPLBACKEND"] = "agg"  # pictures are files here, whatever windows are to be drawn with elsewhere
     catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma
             stream.reconfigure(errors="backslashreplace")
-    with one_line_errors():
+    with one_line_errors(), lasting_streams():
+        logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+        logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
+        require_address_space()
         app(prog_name="slam")
 
 
@@ -116,20 +118,24 @@ def run_command(
     from slam.commands.background_compilation import compiled_in_background
     from slam.commands.display import Progress
     from slam.commands.folders import run_folder
-    from slam.commands.run import Wanted, prepare
+    from slam.commands.run import Wanted, prepare, shown
+    from slam.files import noting_inputs
+    from slam.outputs import require_outputs
     from slam.run.runner import run
     from slam.sequences import is_live
 
     wanted = Wanted(
         sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
     )
-    opened, options, origin = prepare(wanted)
+    with noting_inputs() as inputs:
+        opened, options, origin = prepare(wanted)
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
-        folder = stack.enter_context(run_folder(out, opened.name, options.backend, overwrite))
+        folder = stack.enter_context(run_folder(out, opened.name, options.backend))
+        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
+        require_outputs([*options.outputs, *shown(draw, viewer)], [*inputs, *options.inputs], overwrite)
         if options.config.objects.mode != "off":
             stack.enter_context(compiled_in_background(options.backend))
-        options = replace(options, out=folder, record=record, save_map=save_map, overlap=overlap, live=live)
         options = replace(options, origin=origin.to_json(folder))
         watches = _watches(stack, opened, viewer, draw)
         until = threading.Event() if live or is_live(opened) else None
@@ -169,6 +175,7 @@ def replay_command(
     from slam.commands.folders import run_folder
     from slam.commands.run import command_line
     from slam.config import SystemConfig
+    from slam.outputs import require_outputs
     from slam.run.recording import load_recording
     from slam.run.runner import RunOptions, run_recording
 
@@ -176,8 +183,9 @@ def replay_command(
     default = SystemConfig.for_kind(loaded.kind, None, name)
     config = replace(default, models=loaded.models).with_settings(settings or [])
     progress = Progress(len(loaded), _title(loaded, name), quiet)
-    with run_folder(out, loaded.name, name, overwrite) as folder:
+    with run_folder(out, loaded.name, name) as folder:
         options = RunOptions(name, "recording", config, folder, origin={"command": command_line()})
+        require_outputs(options.outputs, [recording], overwrite)
         with progress, whole_frames(progress.frame, folder) as end_of_frame:
             summary = run_recording(loaded, options, end_of_frame)
     _finish(summary, folder, picture, quiet)
@@ -197,11 +205,12 @@ def plot_command(
     width: Annotated[
         float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.commands.plot import plot_runs
 
-    for file, caption in plot_runs(folders, out, figure, width):
+    for file, caption in plot_runs(folders, out, figure, width, overwrite):
         print(f"{file}: {caption}")
 
 
@@ -256,6 +265,7 @@ def compare_command(
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
+    overwrite: OverwriteOption = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no conclusions.")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
@@ -267,7 +277,7 @@ def compare_command(
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
     with leaving("trials done so far are kept: the same command continues"):
-        command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet)
+        command.compare(command.quick(plan) if quick else plan, out, workers, scheduler, quiet, overwrite)
 
 
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
@@ -290,7 +300,7 @@ def calibrate_command(
     settings: SetOption = None,
     frames: FramesOption = None,
     format: FormatOption = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
@@ -313,11 +323,15 @@ def render_command(
 ) -> None:
     """Write a built-in sequence as an EuRoC folder with its truth, for other programs."""
     from slam.commands.display import counting
+    from slam.files import noting_inputs
+    from slam.outputs import Output, require_outputs
     from slam.run.runner import parse_frames
     from slam.sequences import open_sequence
-    from slam.worlds.export import require_world, write_euroc
+    from slam.worlds.export import FOLDER, require_world, write_euroc
 
-    opened = require_world(open_sequence(sequence))
+    with noting_inputs() as inputs:
+        opened = require_world(open_sequence(sequence))
+    require_outputs([Output(out, "--out", [f"{FOLDER}/"])], inputs, overwrite=None)
     start, stop = parse_frames(frames)
     with counting(_frame_count(opened, start, stop), f"{opened.name} · render", quiet) as progress:
         root = write_euroc(opened, out, start, stop, progress, truth_images)
@@ -329,11 +343,12 @@ def render_command(
 def view_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
     target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
     from slam.run.viewer import view_run
 
-    view_run(folder, target)
+    view_run(folder, target, overwrite)
 
 
 @app.command("list", short_help="List back ends, sequences and formats.")
@@ -360,12 +375,13 @@ def warm_up_command(quiet: QuietOption = False) -> None:
 def demo_command(
     out: OutOption = Path("slam_demo"),
     frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
+    overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Run both back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo
 
-    demo(out, frames, quiet)
+    demo(out, frames, quiet, overwrite)
 
 
 def _title(sequence: Sequence | Recording, backend: str) -> str:

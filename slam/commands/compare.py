@@ -41,7 +41,12 @@ def quick(plan: Plan) -> Plan:
 
 
 def compare(
-    plan: Plan, out: Path, workers: int | None = None, address: str | None = None, quiet: bool = False
+    plan: Plan,
+    out: Path,
+    workers: int | None = None,
+    address: str | None = None,
+    quiet: bool = False,
+    overwrite: bool = False,
 ) -> list[Run]:
     """Run a comparison to its end and leave ``report.html``, tables and figures in `out`.
 
@@ -51,6 +56,7 @@ def compare(
         workers: processes on this machine; None for as many as there are cores.
         address: of a Dask scheduler to be used instead.
         quiet: show nothing.
+        overwrite: run all again, and replace files that are there.
 
     Raises:
         SlamError: bad input; nothing has been run then.
@@ -62,7 +68,7 @@ def compare(
         raise ConfigurationError(f"comparison: there must be {wanted}, got {workers}")
     count = workers or available_cores()
     where = f"{count} at a time on this machine" if address is None else f"on the Dask cluster at {address}"
-    frames = check(plan)  # before there is a progress bar
+    frames = check(plan, out, overwrite)  # before there is a progress bar
     planned = [frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)]
     if not quiet:
         print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}", flush=True)
@@ -70,7 +76,7 @@ def compare(
         scheduler: Scheduler = LocalScheduler(count, bar.frames) if address is None else DaskScheduler(address)
         runs = sweep(
             plan, out, scheduler,
-            lambda trial: bar.ended(frames[trial.sequence]), lambda trial: bar.kept(frames[trial.sequence]),
+            lambda trial: bar.ended(frames[trial.sequence]), lambda trial: bar.kept(frames[trial.sequence]), overwrite,
         )  # fmt: skip
     write_tables(plan, runs, out)
     write_paper(plan, runs, out)

@@ -8,9 +8,10 @@ from typing import Any
 from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
 from slam.files import write_png
+from slam.outputs import Output, require_outputs
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.figures import RunData, draw_map_3d, draw_top_view
-from slam.run.outputs import write_json
+from slam.run.outputs import NAMES, write_json
 from slam.run.plots import plot
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -18,7 +19,10 @@ from slam.sequences import open_sequence
 BACKENDS = ("ekf", "smoother")
 
 
-def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
+_PICTURES = ("top_view.png", "map_3d.png", "errors.png", "frame.png")
+
+
+def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -> list[dict[str, Any]]:
     """Run the demo; returns the runs' summaries, which are also in ``summary.json`` of each run's folder.
 
     Leaves a folder per back end with the files of a run, ``comparison.json``, and the pictures ``top_view.png``,
@@ -28,8 +32,15 @@ def demo(out: Path, frames: int, quiet: bool = False) -> list[dict[str, Any]]:
         out: folder for everything.
         frames: number of frames.
         quiet: show nothing.
+        overwrite: whether files that are there may be replaced.
+
+    Raises:
+        SlamError: a file cannot be written, or is there already.
     """
     import matplotlib
+
+    own = Output(out, "--out", ["comparison.json", *_PICTURES])
+    require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in BACKENDS)], (), overwrite)
 
     matplotlib.use("Agg")
     world = f"synthetic:aisle?frames={frames}&speed=2&box=1"

@@ -23,7 +23,7 @@ RunOutOption = Annotated[
     Path | None,
     typer.Option("--out", "-o", metavar="DIR", help="Folder for the files; default: results/SEQUENCE-BACKEND-N."),
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the files of a run in the folder.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there; never an input.")]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(

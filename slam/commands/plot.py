@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slam.errors import ConfigurationError, SlamError
+from slam.files import noting_inputs
+from slam.outputs import Output, require_outputs
 from slam.run.plots import PICTURE, plot, read_runs
 
 
 def plot_runs(
-    folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None
+    folders: Sequence[Path], out: Path | None, kind: str, width: float | None = None, overwrite: bool = False
 ) -> list[tuple[Path, str]]:
     """Draw runs, those of one sequence in one picture; returns files and captions.
 
@@ -20,19 +22,19 @@ def plot_runs(
         out: PNG, PDF or SVG; None for a PNG in the first folder of each sequence.
         kind: name of the figure, see `slam.run.plots.KINDS`.
         width: of the pictures [mm]; None for what suits a screen.
+        overwrite: whether files that are there may be replaced.
 
     Raises:
         SlamError: a folder is none of a finished run, or a file cannot be written.
     """
-    groups = read_runs(folders)
+    with noting_inputs() as inputs:
+        groups = read_runs(folders)
     if out is not None and len(groups) > 1:
         names = ", ".join(runs[0].sequence for runs in groups)
         raise ConfigurationError(f"runs of {len(groups)} sequences ({names}) do not go into one file: leave out --out")
-    files = []
-    for runs in groups:
-        file = out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png")
-        files.append((file, plot(runs, file, kind, width)))
-    return files
+    files = [out or runs[0].folder / (PICTURE if kind == "summary" else f"{kind}.png") for runs in groups]
+    require_outputs([Output(file, "--out", makes_folder=True) for file in files], inputs, overwrite)
+    return [(file, plot(runs, file, kind, width)) for runs, file in zip(groups, files)]
 
 
 def leave_picture(folder: Path) -> None:

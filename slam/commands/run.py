@@ -11,6 +11,9 @@ from pathlib import Path
 
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
+from slam.outputs import Output
+from slam.run import drawing
+from slam.run import viewer as viewing
 from slam.run.repeat import Origin, Repeat, changed_versions, load, versions
 from slam.run.runner import RunOptions, parse_frames
 from slam.sequences import Sequence as StereoSequence
@@ -84,6 +87,12 @@ def prepare(wanted: Wanted) -> tuple[StereoSequence, RunOptions, Origin]:
     options = RunOptions(backend, frontend, config, Path(), start, stop, prior_map=prior_map, mono=mono)
     options = replace(options, calibration=calibration)
     return opened, options, Origin(command_line(), text or "", format, kind, prior_map, mono, calibration)
+
+
+def shown(draw: Path | None, viewer: str | None) -> list[Output]:
+    """What is written for people who watch: pictures or a video, and a file for Rerun."""
+    pictures = [] if draw is None else [drawing.output(draw)]
+    return pictures + ([] if viewer is None else viewing.outputs(viewer, "--viewer"))
 
 
 def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str) -> SystemConfig:

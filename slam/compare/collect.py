@@ -177,10 +177,11 @@ class Lifetimes:
     def add(self, result: FrameResult) -> None:
         """One more frame."""
         self._last = result.index
-        for i in result.added.tolist():
-            self._first[i] = result.index
+        for i in (*result.added.tolist(), *result.returned.tolist()):
+            self._first.setdefault(i, result.index)
         for i in result.erased.tolist():
-            self._ended.append(result.index - self._first.pop(i))
+            if i in self._first:  # else one of an old place, by which a kidnapped camera was found
+                self._ended.append(result.index - self._first.pop(i))
 
     def figures(self) -> dict[str, float]:
         """Median and mean in frames; none where there was no landmark."""

@@ -22,6 +22,7 @@ from slam.evaluation.metrics import align, associate, chi_square_band
 from slam.files import read_numbers
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
+from slam.naming import printable
 from slam.run.figures import stretch, widths
 from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 from slam.sequences import open_sequence
@@ -322,5 +323,5 @@ def as_pdf(figure: Figure, title: str) -> bytes:
 
     content = io.BytesIO()
     with rc_context(dict(_STYLE)):
-        figure.savefig(content, format="pdf", metadata={"CreationDate": None, "Title": title})
+        figure.savefig(content, format="pdf", metadata={"CreationDate": None, "Title": printable(title)})
     return content.getvalue()

@@ -16,6 +16,7 @@ from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
 from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
 from slam.files import whole_file, write_text
+from slam.naming import printable
 
 TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
 
@@ -103,7 +104,7 @@ def differences_table(group: Group, tests: int) -> str:
 
 def latex(text: str) -> str:
     """Plain text for LaTeX."""
-    return text.translate(_LATEX)
+    return printable(text).translate(_LATEX)
 
 
 def _figures(group: Group, folder: Path) -> Iterable[str]:

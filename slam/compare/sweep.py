@@ -6,6 +6,7 @@ A trial's folder appears at once with all its files, ``result.json`` among them,
 from __future__ import annotations
 
 import json
+import secrets
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -31,12 +32,19 @@ from slam.compare.trial import (
     run_trial,
 )
 from slam.errors import SlamError
-from slam.files import read_object
+from slam.files import noting_inputs, read_object, remove_file
+from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
 RUNS, SWEEP = "runs", "sweep.json"
+
+#: What a comparison leaves in its folder.
+NAMES = (
+    SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html", "tables.tex",
+    "figures.tex", "figures/",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,7 @@ def sweep(
     scheduler: Scheduler,
     on_done: Callable[[Trial], None] | None = None,
     on_kept: Callable[[Trial], None] | None = None,
+    overwrite: bool = False,
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 
@@ -78,16 +87,19 @@ def sweep(
         scheduler: where trials run.
         on_done: called for each trial that ends.
         on_kept: called for each that was done before.
+        overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
         SlamError: a sequence, name or setting is bad (nothing is run then), or the folder holds something else.
     """
-    check(plan)
-    _prepare(plan, out)
+    check(plan, out, overwrite)
+    with naming_folder(out):
+        out.mkdir(parents=True, exist_ok=True)
+    write_json(out / SWEEP, {"plan": plan.to_json(), "command": plan.command(), "versions": running_code()})
     for mode in plan.modes:
         jobs = {}
         for trial in plan.trials_of(mode):
-            if _is_done(trial, out):
+            if not overwrite and _is_done(trial, out):
                 if on_kept is not None:
                     on_kept(trial)
             else:
@@ -99,12 +111,31 @@ def sweep(
     return [read_run(trial, out) for mode in plan.modes for trial in plan.trials_of(mode)]
 
 
-def check(plan: Plan) -> dict[str, int]:
-    """Try every sequence, front end, back end and setting once; raises SlamError for what cannot work.
+def check(plan: Plan, out: Path, overwrite: bool = False) -> dict[str, int]:
+    """Try every sequence, front end, back end and setting once, and whether the files can be written.
+
+    Args:
+        plan: what to run.
+        out: folder.
+        overwrite: whether files that are there may be replaced.
 
     Returns:
         number of frames of a run, by sequence.
+
+    Raises:
+        SlamError: something cannot work.
     """
+    with noting_inputs() as inputs:
+        frames = _tried(plan)
+    goes_on = not overwrite and (out / SWEEP).is_file()
+    if goes_on:
+        _require_same_versions(out / SWEEP)
+    require_outputs([Output(out, "--out", NAMES)], inputs, overwrite or goes_on)
+    return frames
+
+
+def _tried(plan: Plan) -> dict[str, int]:
+    """Number of frames of a run by sequence; raises SlamError for what cannot work."""
     frames: dict[str, int] = {}
     for trial in plan.trials_of(CLOSED_LOOP):
         if trial.seed:
@@ -164,16 +195,28 @@ def _keep(
     if files is None:
         files = result_files(trial, failure(error or SlamError("nothing came back")))
     folder = out / RUNS / trial.folder
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
     with naming_folder(folder):
-        part.mkdir(parents=True)
-        for name, content in files.items():
-            (part / name).write_bytes(content)
-        shutil.rmtree(folder, ignore_errors=True)
-        part.rename(folder)
+        if folder.exists():  # without a whole result, or to be replaced: of what else is there nothing is
+            (folder / RESULT).unlink(missing_ok=True)
+            _write_all(folder, files)
+        else:
+            part = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.part")
+            part.mkdir(parents=True)
+            try:
+                _write_all(part, files)
+                part.rename(folder)
+            except OSError:
+                shutil.rmtree(part, ignore_errors=True)
+                raise
     if on_done is not None:
         on_done(trial)
+
+
+def _write_all(folder: Path, files: Files) -> None:
+    """Write a trial's files, its result last."""
+    for name in sorted(files, key=lambda name: name == RESULT):
+        remove_file(folder / name)
+        (folder / name).write_bytes(files[name])
 
 
 def _is_done(trial: Trial, out: Path) -> bool:
@@ -194,18 +237,6 @@ def _is_done(trial: Trial, out: Path) -> bool:
     if before != json.loads(json.dumps(asdict(trial))):
         raise SlamError(f"{path.parent}: holds a run with other settings; give another --out")
     return True
-
-
-def _prepare(plan: Plan, out: Path) -> None:
-    """The folder, and in it what is run; raises SlamError where it holds a sweep of other versions."""
-    path = out / SWEEP
-    if path.exists():
-        _require_same_versions(path)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(path, {"plan": plan.to_json(), "command": plan.command(), "versions": running_code()})
-    except OSError as error:
-        raise SlamError(f"cannot write to {out}: {error.strerror or error}") from error
 
 
 def _require_same_versions(path: Path) -> None:

@@ -4,7 +4,7 @@ With ``T_true = T_estimated exp(e)`` the error of the relative pose from frame i
 ``e_j − A e_i`` with ``A = Ad((T_i⁻¹ T_j)⁻¹)``. Errors of odometry by noise grow by increments that do not depend on
 what was before, so the covariance of that difference is ``N_j − A N_i Aᵀ``. Errors of the rig are the same in all
 frames: poses are off by ``J_i δ``, so they add ``(J_j − A J_i) Σ (J_j − A J_i)ᵀ`` with Σ as known in frame j. Where an
-old place is measured again the former may not be positive definite; such stretches are left out.
+old place is measured again the former may not be positive definite; such stretches are left out and counted.
 
 Truth has errors of its own, the first pose included: else its turn would count as an error of the whole path. Their
 covariance is added, and stretches over which the truth contradicts itself are left out
@@ -20,7 +20,7 @@ import numpy as np
 
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.evaluation.truth_error import RowArray, doubtful, truth_covariances
-from slam.geometry.arrays import Array
+from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.se3 import adjoint, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
@@ -30,6 +30,7 @@ STRETCHES = (1.0, 10.0, 100.0)
 
 _DOF = 6
 _SMALLEST = 1e-12  # eigenvalue of a covariance [rad², m²] below which it is none
+_ROUNDING = 1e-14  # eigenvalues below this share of the largest are rounding
 
 
 def consistency_figures(
@@ -53,8 +54,9 @@ def consistency_figures(
 
     Returns:
         "mean NEES" from the start and its 95 % band for independent errors, "NEES over L m" for each of `STRETCHES`;
-        six is right for all of these; "doubtful truth over L m", the share of stretches left out, where there are any;
-        "scale error [%]" and "scale sigma [%]".
+        six is right for all of these; "doubtful truth over L m" and "no covariance over L m", the shares of stretches
+        left out because the truth contradicts itself or an old place was measured again within them, where there are
+        any; "scale error [%]" and "scale sigma [%]".
     """
     first = np.zeros(len(own) - 1, np.intp)
     from_start = stretch_nees(own, true, covariances, noise, first, np.arange(1, len(own)), common)
@@ -65,13 +67,15 @@ def consistency_figures(
     for length in STRETCHES:
         last = np.searchsorted(along, along + length).astype(np.intp)
         starts = np.flatnonzero(last < len(own))
-        starts = starts[closed[starts] == closed[last[starts]]]
         values = stretch_nees(own, true, covariances, noise, starts, last[starts], common)
+        values[closed[starts] != closed[last[starts]]] = np.nan
         if np.isfinite(values).any():
             figures[f"NEES over {length:g} m"] = _mean(values)
         left_out = doubtful(true, noise, starts, last[starts])
-        if left_out.any():
-            figures[f"doubtful truth over {length:g} m"] = float(np.mean(left_out))
+        none = ~np.isfinite(values) & ~left_out
+        for what, rows in (("doubtful truth", left_out), ("no covariance", none)):
+            if rows.any():
+                figures[f"{what} over {length:g} m"] = float(np.mean(rows))
     figures.update(_scale(own, true, covariances, noise))
     return figures
 
@@ -105,20 +109,26 @@ def stretch_nees(
     A = adjoint(inverse(estimated))
     noises = covariances if common is None else covariances - np.array([one.covariance for one in common])
     N = noises[last] - A @ noises[first] @ np.swapaxes(A, 1, 2) + truth_covariances(true, noise, first, last, A)
+    G: Array = np.zeros((len(first), _DOF, 0))
+    if common is not None and len(first):
+        N, G = _shared(A, [(common[i], common[j]) for i, j in zip(first, last)], N)
     N = 0.5 * (N + np.swapaxes(N, 1, 2))
-    finite = np.isfinite(N).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
-    usable = np.flatnonzero(finite & ~doubtful(true, noise, first, last))
-    usable = usable[np.linalg.eigvalsh(N[usable])[:, 0] > _SMALLEST]
+    usable = np.isfinite(residuals).all(axis=1) & ~doubtful(true, noise, first, last)
+    usable[usable] = _are_covariances(N[usable]) & _are_covariances(_with(N[usable], G[usable]))
     values = np.full(len(first), np.nan)
-    if len(usable):
-        N, A = N[usable], A[usable]
-        G: Array = np.zeros((len(usable), _DOF, 0))
-        if common is not None:
-            ends = [(common[i], common[j]) for i, j in zip(first[usable], last[usable])]
-            G = _shared(A, ends, N)
+    if usable.any():
+        N, A, G = N[usable], A[usable], G[usable]
         errors = _remounted(np.concatenate([residuals[usable, :, None], G], axis=2), A, _with(N, G), noise.mounting)
         values[usable] = nees(errors[:, :, 0], _with(N, errors[:, :, 1:]))
     return values
+
+
+def _are_covariances(P: Array) -> BoolArray:
+    """Which symmetric matrices (M, 6, 6) are finite and positive definite, also after rounding (M,)."""
+    good: BoolArray = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    values = np.linalg.eigvalsh(P[good])
+    good[good] = values[:, 0] > np.maximum(_SMALLEST, _ROUNDING * values[:, -1])
+    return good
 
 
 def _with(N: Array, G: Array) -> Array:
@@ -146,18 +156,20 @@ def _remounted(errors: Array, A: Array, P: Array, mounting: float) -> Array:
     return np.asarray(errors - J @ np.linalg.solve(information, np.tensordot(JW, errors, axes=((0, 2), (0, 1)))))
 
 
-def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> Array:
-    """How relative poses (M) depend on errors of unit variance that the poses at their ends share (M, 6, k).
+def _shared(A: Array, ends: Sequence[tuple[CommonError, CommonError]], N: Array) -> tuple[Array, Array]:
+    """What errors of unit variance that the poses at their ends share make of relative poses (M).
 
-    Where one end is after a loop nothing is apart: there the difference of the covariances is added to `N` (M, 6, 6).
+    Returns:
+        the covariances `N` (M, 6, 6), and how the relative poses depend on the shared errors (M, 6, k). Where one end
+        is after a loop nothing is apart: there the difference of both covariances is added to `N`.
     """
-    G = np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
+    N, G = N.copy(), np.zeros((len(ends), _DOF, max(last.root.shape[1] for _, last in ends)))
     for row, (a, (first, last)) in enumerate(zip(A, ends)):
         if first.jacobian.shape == last.jacobian.shape:
             G[row, :, : last.root.shape[1]] = (last.jacobian - a @ first.jacobian) @ last.root
         else:
             N[row] += last.covariance - a @ first.covariance @ a.T
-    return G
+    return N, G
 
 
 def _scale(own: Trajectory, true: Trajectory, covariances: Array, noise: TruthNoise) -> dict[str, float]:

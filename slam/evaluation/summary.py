@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,8 @@ from slam.geometry.se3 import Array, inverse, rotation_angle
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
 
+logger = logging.getLogger("slam.evaluation")
+
 _TOLERANCE = 0.02  # truth may lie so far from a frame in time [s]
 
 
@@ -33,11 +36,16 @@ class WithTruth(Protocol):
 
 
 def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
-    """Errors of an estimated path against the sequence's truth; empty where fewer than 3 poses have any."""
+    """Errors of an estimated path against the sequence's truth; empty where fewer than 3 poses have any.
+
+    Figures that cannot be computed for this path, such as those of one that runs off to infinity, are left out.
+    """
     figures: dict[str, float] = {}
     pairs = _common(estimate, sequence.ground_truth)
     if pairs is not None:
-        figures.update(_against_truth(*pairs))
+        for part in (_absolute, _from_start, _relative, _segments):
+            figures.update(_where_possible(part, *pairs))
+        figures["poses with truth"] = float(len(pairs[0]))
     gps = getattr(sequence, "gps", None)
     if gps is not None and len(estimate) >= 3:
         figures.update(_against_gps(estimate, gps))
@@ -72,26 +80,45 @@ def _against_gps(estimate: Trajectory, gps: Array) -> dict[str, float]:
     }
 
 
-def _against_truth(own: Trajectory, true: Trajectory) -> dict[str, float]:
-    ate, rpe = absolute_errors(own, true), relative_errors(own, true)
+def _where_possible(part: Callable[..., dict[str, float]], *arguments: object) -> dict[str, float]:
+    """Figures of a path; none, with a warning, where they cannot be computed."""
+    try:
+        return part(*arguments)
+    except (TrajectoryError, np.linalg.LinAlgError) as error:
+        logger.warning("figures are left out: %s", error)
+        return {}
+
+
+def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
+    ate = absolute_errors(own, true).translation_statistics
+    return {"ATE RMSE [m]": ate.rmse, "ATE max [m]": ate.max}
+
+
+def _from_start(own: Trajectory, true: Trajectory) -> dict[str, float]:
     # Turned by the first pose, not by the aligned path: a straight path leaves the turn about itself open.
     turn = inverse(own.poses[0]) @ own.poses @ inverse(inverse(true.poses[0]) @ true.poses)
-    segments = segment_errors(own, true)
+    rms = np.sqrt(np.mean(rotation_angle(turn[:, :3, :3]) ** 2))
+    return {"rotation RMSE from start [deg]": float(np.degrees(rms))}
+
+
+def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:
+    rpe = relative_errors(own, true)
     return {
-        "ATE RMSE [m]": ate.translation_statistics.rmse,
-        "ATE max [m]": ate.translation_statistics.max,
-        "rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(rotation_angle(turn[:, :3, :3]) ** 2)))),
         "RPE RMSE [m/frame]": rpe.translation_statistics.rmse,
         "RPE rotation RMSE [deg/frame]": rpe.rotation_statistics.rmse,
-        "segment error [%]": segments.mean_translation,
-        "poses with truth": float(len(own)),
     }
+
+
+def _segments(own: Trajectory, true: Trajectory) -> dict[str, float]:
+    return {"segment error [%]": segment_errors(own, true).mean_translation}
 
 
 def consistency(
     estimate: Trajectory, covariances: Array, sequence: WithTruth, common: Sequence[CommonError] | None = None
 ) -> dict[str, float]:
     """How honest the pose covariances are, see `slam.evaluation.consistency`; empty without truth for the first pose.
+
+    Empty, too, where the path's errors and covariances are beyond computing.
 
     Args:
         estimate: the online path.
@@ -105,4 +132,4 @@ def consistency(
     rows = np.searchsorted(estimate.stamps, pairs[0].stamps)
     noise = getattr(sequence, "truth_noise", TruthNoise())
     shared = None if common is None else [common[row] for row in rows]
-    return consistency_figures(*pairs, covariances[rows], noise, shared)
+    return _where_possible(consistency_figures, *pairs, covariances[rows], noise, shared)

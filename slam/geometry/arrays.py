@@ -20,6 +20,12 @@ IndexArray = NDArray[np.intp]
 _MANY = 500  # cost: NumPy is quicker with more
 
 
+def narrowed(values: np.ndarray, dtype: type[np.floating[Any]]) -> NDArray[Any]:
+    """The values in a smaller floating-point type; those below its range become 0, also where NumPy is to raise."""
+    with np.errstate(under="ignore"):
+        return values.astype(dtype)
+
+
 def isin(ids: IdArray | IndexArray, others: IdArray | IndexArray) -> BoolArray:
     """Which of `ids` (N,) are among `others` (M,): ``np.isin``, which takes several times as long for so few."""
     if len(ids) + len(others) > 2 * _MANY:

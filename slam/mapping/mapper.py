@@ -141,7 +141,8 @@ class Mapper:
         backend.place(ids, returned.local[free], returned.covariances[free])
         rows = returned.rows[free]
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        return replace(change, landmarks=landmarks, returned=LandmarkMatches(ids, rows))
+        erased = change.erased[~isin(change.erased, ids)]
+        return replace(change, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
 
     def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
         """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""

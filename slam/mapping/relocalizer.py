@@ -36,6 +36,7 @@ from slam.tracking.localizer import Localizer
 POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
 
 REASON = "the camera has not been found in the map yet"
+NEW_MAP = "the place is not in the map: a new map begins"
 
 
 class Relocalizer:
@@ -115,20 +116,21 @@ class Relocalizer:
         )
         return self._new(models)
 
-    def start_new_map(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory]:
+    def start_new_map(self, old: Backend, stamp: float) -> tuple[Backend, Trajectory, Prediction, UpdateReport]:
         """A new back end without landmarks at the old one's pose, which is exact for it: it defines its coordinates.
 
         A single estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen
         from there: linearisation fails over such angles and makes it overconfident in a wrong pose.
 
         Returns:
-            the new back end at the time `stamp` [s], and the old one's path without its newest pose.
+            the new back end at the time `stamp` [s], the old one's path without its newest pose, and what the new one
+            predicts and reports for that time, without any landmark.
         """
         T = old.estimate(landmarks=False).T_world_left
         new = self._new(replace(self._models, T_world_left=T.tolist()))
-        new.predict(stamp)
-        new.update(Observations.empty(), None)
-        return new, old.trajectory().select(slice(None, -1))
+        prediction = new.predict(stamp)
+        report = replace(new.update(Observations.empty(), None), reason=NEW_MAP)
+        return new, old.trajectory().select(slice(None, -1)), prediction, report
 
     def _new(self, models: EstimatorModels) -> Backend:
         """Another back end of the same kind."""

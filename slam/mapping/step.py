@@ -39,6 +39,16 @@ class AssociatedFrame:
     withheld: IdArray
     withheld_rows: NDArray[np.intp]
 
+    @classmethod
+    def of_nothing_known(
+        cls, features: StereoFeatures, corrected: StereoFeatures, prediction: Prediction
+    ) -> AssociatedFrame:
+        """A frame in an empty map, with its features as measured and corrected."""
+        none, aligned = np.zeros(0, np.int64), Aligned(features, PatchAnchors.none())
+        empty = LandmarkTable.empty(features.descriptors.shape[1])
+        nothing = LandmarkMatches.nothing()
+        return cls(aligned, corrected, empty, prediction, nothing, none, nothing.rows)
+
     @property
     def pose(self) -> Array:
         """The pose T_world_left (4, 4) on which the matches agree, or the predicted one."""

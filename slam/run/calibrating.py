@@ -18,8 +18,9 @@ from slam.calibration.saved import RigNumbers
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.errors import CalibrationError, ConfigurationError
-from slam.files import require_target, write_text
+from slam.files import write_text
 from slam.geometry.rig import StereoRig
+from slam.outputs import Output, require_outputs
 from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence as StereoSequence
 from slam.sequences import is_live
@@ -58,17 +59,13 @@ class Targets:
     kalibr: Path | None = None
     overwrite: bool = False
 
-    def require(self, rig: StereoRig) -> None:
-        """Raise where a file could not be written, before hours of work are done for it."""
+    def require(self, rig: StereoRig, inputs: Sequence[Path]) -> None:
+        """Raise where a file could not be written, before hours of work are done for it; `inputs` are not replaced."""
         if self.kalibr is not None:
             require_kalibr(self.kalibr, rig)
-        files = [file for file in (self.out, self.opencv, self.kalibr) if file is not None]
-        for file in files:
-            require_target(file)
-            if file.exists() and not self.overwrite:
-                raise ConfigurationError(f"{file}: is there already; give another name, or --overwrite to replace it")
-        if len(set(files)) < len(files):
-            raise ConfigurationError(f"{files[-1]}: two files cannot have one name")
+        files = ((self.out, "--out"), (self.opencv, "--opencv"), (self.kalibr, "--kalibr"))
+        wanted = [Output(file, option) for file, option in files if file is not None]
+        require_outputs(wanted, inputs, self.overwrite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +115,7 @@ def calibrate(
     show: Show,
     settings: Sequence[str] = (),
     frames: tuple[int, int | None] = (0, None),
+    inputs: Sequence[Path] = (),
 ) -> Calibrated:
     """Run recordings of one rig, and write what they say of it.
 
@@ -127,13 +125,14 @@ def calibrate(
         show: the progress of each.
         settings: as ``--set`` takes them.
         frames: the first of each, and the one after the last; None for all.
+        inputs: files and folders that must not be replaced.
 
     Raises:
         SlamError: bad input; one line says what and where.
     """
     _require_one_rig(sequences)
     rig = sequences[0].rig
-    targets.require(rig)
+    targets.require(rig, inputs)
     found = [_run(sequence, settings, frames, show) for sequence in sequences]
     model = RigModel(rig)
     evidence = [one.evidence for one in found if one.evidence is not None]

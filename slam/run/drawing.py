@@ -16,6 +16,7 @@ from slam.files import reason, require_utf8, write_png
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
+from slam.outputs import Output
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
@@ -24,6 +25,7 @@ _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
 _LEGEND = 24  # height of the bar with the legend [px]
+_FILM, _DIGITS = ".mp4", 6  # a video's suffix; of a picture's name, at least
 _PARTS = 12  # pieces of an edge, each drawn on its own where the camera sees it
 
 
@@ -162,6 +164,12 @@ def _pixel(u: float, v: float, scale: int) -> tuple[int, int]:
     return round(scale * (u + 0.5)), round(scale * (v + 0.5))
 
 
+def output(path: Path) -> Output:
+    """What `FramePictures` writes: a video, or pictures in a folder."""
+    film = path.suffix.lower() == _FILM
+    return Output(path, "--draw", None if film else ["[0-9]" * _DIGITS + "*.png"], makes_folder=True)
+
+
 class FramePictures:
     """Writes pictures of frames to a folder of PNG files, or to a video where the path ends in ``.mp4``.
 
@@ -176,7 +184,7 @@ class FramePictures:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._film = path.suffix.lower() == ".mp4"
+        self._film = path.suffix.lower() == _FILM
         self._first: tuple[float, np.ndarray] | None = None
         self._video: Any = None
         if path.suffix and not self._film:
@@ -195,7 +203,7 @@ class FramePictures:
     def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
         """Append one picture, `number` in its sequence, taken at `stamp` [s]."""
         if not self._film:
-            file = self.path / f"{number:06d}.png"
+            file = self.path / f"{number:0{_DIGITS}d}.png"
             try:
                 write_png(file, picture)
             except OSError as error:

@@ -13,9 +13,10 @@ import numpy as np
 
 from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
-from slam.files import read_object, read_text
+from slam.files import read_object, read_text, whole_file
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
+from slam.naming import printable
 from slam.run.schema import STAGES
 from slam.run.style import backend_colours
 
@@ -95,7 +96,7 @@ class RunData:
         located = [row for row in frames if row["sd_x"]]
         config = read_object(folder / "config.json")
         return cls(
-            name,
+            printable(name),
             Trajectory.read_tum(folder / "trajectory.txt"),
             final,
             _numbers(landmarks, ("x", "y", "z")),
@@ -106,8 +107,8 @@ class RunData:
             [row["status"] for row in frames],
             {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
             Trajectory.read_tum(truth) if truth.exists() else None,
-            str(config["sequence"]),
-            str(config["backend"]),
+            printable(str(config["sequence"])),
+            printable(str(config["backend"])),
             folder,
             config["format"] == "synthetic",
             _pairs(frames, final, "loop"),
@@ -363,5 +364,6 @@ def _figure(count: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
 def _save(figure: Any, path: Path, **options: Any) -> None:
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=110, metadata={"Software": None}, **options)
+    with whole_file(path) as file:
+        figure.savefig(file, dpi=110, metadata={"Software": None}, **options)
     plt.close(figure)

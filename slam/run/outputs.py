@@ -17,7 +17,7 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.errors import SlamError
-from slam.files import RowFile, lock_folder, reason, write_text
+from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory, tum_line
@@ -26,6 +26,15 @@ from slam.object_data import MovingObject
 from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
+
+_ROWS = ("trajectory.txt", "frames.csv", "objects.csv")  # grow frame by frame
+_WHOLE = (
+    "config.json", "schema.json", "trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png",
+)  # fmt: skip
+
+_SPARE = 8  # file descriptors kept for the last files
+#: All files that a run leaves in its folder.
+NAMES = (*_ROWS, *_WHOLE)
 
 _NUMBER = r"\s+(?:-?\d[-+.\deE]*|null)"
 _NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\s+\]")  # as json indents them; no text holds a line break
@@ -50,14 +59,16 @@ class RunFiles:
             lock = lock_folder(folder)
             if lock is not None:
                 stack.callback(os.close, lock)
-            for stale in ("trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png"):
-                (folder / stale).unlink(missing_ok=True)
+            for name in _WHOLE:
+                remove_file(folder / name)
             self._trajectory, self._frames, self._objects = (
-                stack.enter_context(closing(RowFile(folder / name)))
-                for name in ("trajectory.txt", "frames.csv", "objects.csv")
+                stack.enter_context(closing(RowFile(folder / name))) for name in _ROWS
             )
             self._frames.write(_rows([FRAME_COLUMNS]))
             self._objects.write(_rows([OBJECT_COLUMNS]))
+            self._spare = stack.enter_context(ExitStack())
+            for _ in range(_SPARE):
+                self._spare.callback(os.close, os.open(os.devnull, os.O_RDONLY))
             self._stack = stack.pop_all()
 
     def __enter__(self) -> RunFiles:
@@ -67,6 +78,10 @@ class RunFiles:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+
+    def free_spare(self) -> None:
+        """Give back the file descriptors that are kept for the last files, should a run have used up all others."""
+        self._spare.close()
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
         """Append one frame to trajectory.txt, frames.csv and objects.csv.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from slam.errors import SlamError
+from slam.files import whole_file
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
@@ -48,7 +49,7 @@ _HANDLE = 4.8  # width of what stands beside a label of a legend, in sizes of th
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
-    "pdf.fonttype": 42,
+    "pdf.fonttype": 42, "text.parse_math": False,
 }  # fmt: skip
 _SMALL_STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.titlesize": 8, "legend.fontsize": 7}
 
@@ -115,7 +116,8 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             metadata = {"Title": _title(runs), **_METADATA[path.suffix.lower()]}
-            figure.savefig(path, dpi=110 if width is None else 300, metadata=metadata)
+            with whole_file(path) as file:
+                figure.savefig(file, format=path.suffix[1:], dpi=110 if width is None else 300, metadata=metadata)
         except OSError as error:
             raise SlamError(f"cannot write to {path}: {error.strerror or error}") from error
     return caption

@@ -16,14 +16,15 @@ from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
 from slam.evaluation.summary import true_path
-from slam.files import require_target
+from slam.files import noting_inputs
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
+from slam.outputs import Output, require_outputs
 from slam.run.last_files import LastFiles
 from slam.run.outcome import motion_doubt, outcome
-from slam.run.outputs import RunFiles
+from slam.run.outputs import NAMES, RunFiles
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
 from slam.run.repeat import portable, versions
@@ -79,6 +80,20 @@ class RunOptions:
     live: bool = False
     origin: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that the run reads besides its sequence; raises SlamError where the calibration cannot be read."""
+        with noting_inputs() as found:
+            if self.calibration is not None:
+                load_calibration(self.calibration)
+        return found if self.prior_map is None else [*found, self.prior_map]
+
+    @property
+    def outputs(self) -> list[Output]:
+        """What the run writes."""
+        files = ((self.record, "--record"), (self.save_map, "--save-map"))
+        return [Output(self.out, "--out", NAMES), *(Output(path, option) for path, option in files if path is not None)]
+
 
 @one_blas_thread
 def run(
@@ -93,7 +108,7 @@ def run(
 
     The files are completed however the run ends: on an error or an interrupt the frames done so far are kept, the
     summary says how it ended, recording and map are written, and the exception goes on. Where a file cannot be written
-    the others are; of several errors the first one is raised.
+    the others are; of several errors the first one is raised. Files of an earlier run in the folder are replaced.
 
     Args:
         sequence: what to run.
@@ -106,11 +121,7 @@ def run(
     Raises:
         SlamError: bad input; one line says what and where.
     """
-    for target in (options.record, options.save_map):
-        if target is not None:
-            require_target(target)
-    if options.record is not None and options.record == options.save_map:
-        raise SlamError(f"{options.record}: the recording and the map cannot be one file")
+    require_outputs(options.outputs, overwrite=True)
     if options.prior_map is not None and options.record is not None:
         raise SlamError("a run that starts in a prior map cannot be recorded: the recording would lack the map")
     if options.config.map.monocular and options.record is not None:
@@ -196,6 +207,7 @@ def _drive(
             ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
             raise
         finally:
+            files.free_spare()
             if live is not None and live.ended_early and stopped_by is None:
                 ended = "ended by the user"
             summary = _finish(sequence, options, system, record, files, ended, score, last, live)

@@ -14,10 +14,11 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult, StereoFrame
 from slam.errors import SlamError
-from slam.files import require_utf8
+from slam.files import noting_inputs, require_utf8
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
+from slam.outputs import Output, require_outputs
 from slam.run.figures import RunData, read_objects
 from slam.system import StereoSlam
 
@@ -151,13 +152,25 @@ class Viewer:
         self._recording.log(path, what, static=static)
 
 
-def view_run(folder: Path, target: str) -> None:
+def outputs(target: str, option: str) -> list[Output]:
+    """The file that a `Viewer` writes; none where it opens a window."""
+    return [] if target == LIVE else [Output(Path(target), option, makes_folder=True)]
+
+
+def view_run(folder: Path, target: str, overwrite: bool = False) -> None:
     """Show a finished run from its files: path, objects, and the map at its end; images are not among them.
+
+    Args:
+        folder: of the run.
+        target: as of `Viewer`.
+        overwrite: whether a file that is there may be replaced.
 
     Raises:
         SlamError: the folder does not hold a finished run, or see `Viewer`.
     """
-    run, objects = RunData.read(folder, folder.name), read_objects(folder)
+    with noting_inputs() as inputs:
+        run, objects = RunData.read(folder, folder.name), read_objects(folder)
+    require_outputs(outputs(target, "--to"), inputs, overwrite)
     with Viewer(target) as viewer:
         for number, (stamp, pose) in enumerate(zip(run.online.stamps, run.online.poses)):
             viewer.show_pose(number, float(stamp), pose)

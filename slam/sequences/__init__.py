@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
-from slam.files import expanded, reason
+from slam.files import expanded, note_input, reason
 from slam.naming import nearest, suggestion, unknown
 from slam.sequences.base import RecordedSequence, Sequence, is_live
 
@@ -85,6 +85,7 @@ def _open_folder(text: str, format: str | None) -> RecordedSequence:
     module = import_module(_FORMATS[name][0])
     _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
     open_folder: Callable[[Path, dict[str, str]], RecordedSequence] = module.open_folder
+    note_input(folder)
     return open_folder(folder, options)
 
 

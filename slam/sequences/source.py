@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
+from slam.files import note_input
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.faults import FaultLog
@@ -138,6 +139,7 @@ def image_names(folder: Path) -> list[str]:
         raise SequenceError(f"{folder}: a file where a folder of images should be") from None
     except OSError as error:
         raise SequenceError(f"{folder}: {error.strerror or error}") from error
+    note_input(folder)
     return sorted(n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES)  # noqa: PTH122
 
 

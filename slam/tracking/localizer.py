@@ -84,6 +84,10 @@ class Localizer:
         self._lost_after = lost_after
         self._hypotheses = PoseHypotheses()
 
+    def forget(self) -> None:
+        """Forget poses that await more frames: another map or another pose is believed now."""
+        self._hypotheses = PoseHypotheses()
+
     def localize(
         self,
         prediction: Prediction,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,6 +22,9 @@ from slam.worlds.sequence import WorldSequence
 
 #: Steps per metre of the depth images, by kind of motion: 16 bits then reach 32 m or 256 m.
 DEPTH_STEPS = {"handheld": 2000, "driving": 256}
+
+#: Folder in which a recording is written.
+FOLDER = "mav0"
 
 OBJECT_COLUMNS = (
     "stamp", "id", "x", "y", "z", "roll", "pitch", "yaw",
@@ -47,8 +51,8 @@ def write_euroc(
     """
     sequence = require_world(sequence)
     first, last = frame_range(start, stop, len(sequence))
-    root = Path(folder) / "mav0"
-    if root.exists():
+    root = Path(folder) / FOLDER
+    if os.path.lexists(root):
         raise SequenceError(f"{root}: exists already; choose another folder")
     try:
         _write(sequence, root, range(first, last), progress, truth_images)

@@ -8,6 +8,7 @@ poses that the system reports are in the map.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -318,7 +319,9 @@ class Atlas:
         from slam.mapping.atlas.pose_graph import solve
 
         chain = self.chain(self.solved.rig, path)
-        moved = solve(chain, self.loops, self.in_map(chain)).poses
+        moved = self.in_map(chain)
+        with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
+            moved = solve(chain, self.loops, moved).poses
         stamps = self.rows.stamps[self.prior_count :]
         return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
 

@@ -13,6 +13,7 @@ from slam.errors import SlamError
 from slam.mapping.atlas.keyframes import Keyframe
 
 _ALIGNMENT = 8  # fixed: bytes
+_PIECE = 2**26  # fixed: bytes of the file that are mapped at once; each piece takes a file descriptor
 
 
 class FeatureFile:
@@ -23,9 +24,11 @@ class FeatureFile:
 
     def __init__(self) -> None:
         self._file: IO[bytes] | None = None
+        self._piece = np.zeros(0, np.uint8)  # the last piece of the file, where it begins, and how much of it is used
+        self._begin = self._used = 0
 
     def __getstate__(self) -> dict[str, object]:
-        return {"_file": None}
+        return FeatureFile().__dict__
 
     def put(self, keyframe: Keyframe) -> Keyframe:
         """The same keyframe, with its features in the file.
@@ -37,13 +40,7 @@ class FeatureFile:
         arrays = [np.ascontiguousarray(a) for a in (k.landmarks, k.points, k.descriptors, k.laplacian)]
         data = b"".join(a.tobytes() for a in arrays)
         try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="slam_keyframes_")  # noqa: SIM115
-                weakref.finalize(self, self._file.close)
-            begin = self._file.seek(0, 2)
-            self._file.write(data + bytes(-len(data) % _ALIGNMENT))
-            self._file.flush()
-            whole = np.memmap(self._file, np.uint8, "r", begin, (len(data),))
+            whole = self._written(data + bytes(-len(data) % _ALIGNMENT))
         except OSError as error:
             raise SlamError(f"atlas.on_disk: {error.strerror or error}") from error
         found, at = [], 0
@@ -52,3 +49,20 @@ class FeatureFile:
             at += a.nbytes
         landmarks, points, descriptors, laplacian = found
         return replace(keyframe, landmarks=landmarks, points=points, descriptors=descriptors, laplacian=laplacian)
+
+    def _written(self, data: bytes) -> np.ndarray:
+        """The bytes in the file, memory-mapped; raises OSError where there is no room for them."""
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="slam_keyframes_", buffering=0)  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
+        if self._used + len(data) > len(self._piece):
+            begin, size = self._file.seek(0, 2), max(_PIECE, len(data))
+            self._file.truncate(begin + size)  # takes no room on the disk yet
+            self._piece, self._begin, self._used = np.memmap(self._file, np.uint8, "r", begin, (size,)), begin, 0
+        self._file.seek(self._begin + self._used)
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        found = self._piece[self._used : self._used + len(data)]
+        self._used += len(data)
+        return found

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvalsh
 
 from slam.data import BoolArray, IdArray, StereoFeatures
+from slam.geometry.arrays import narrowed
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
@@ -157,14 +158,8 @@ class LoopCloser:
         points, T = keyframe.points.astype(float), T_odom_left @ self._rectified.T_left_rectified
         P = T[:3, :3] @ self._rig.triangulation_covariance(points, self._sigma) @ T[:3, :3].T
         descriptors = keyframe.descriptors.astype(np.float32)
-        return KnownPlace(
-            keyframe.landmarks,
-            transform(T, points),
-            0.5 * (P + np.swapaxes(P, 1, 2)),
-            descriptors,
-            keyframe.laplacian,
-            T[:3, 3],
-        )
+        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        return KnownPlace(keyframe.landmarks, transform(T, points), P, descriptors, keyframe.laplacian, T[:3, 3])
 
     def _rectify(self, features: StereoFeatures) -> StereoFeatures:
         """Features in pixels of the rectified rig."""
@@ -217,8 +212,8 @@ class LoopCloser:
             step.common.jacobian,
             travelled,
             float(np.median(points[:, 2])),
-            points.astype(np.float32),
-            np.clip(features.descriptors[rows], -_LARGEST, _LARGEST).astype(np.float16),
+            narrowed(points, np.float32),
+            narrowed(np.clip(features.descriptors[rows], -_LARGEST, _LARGEST), np.float16),
             features.laplacian[rows],
             landmark_of[rows],
             step.correction,
@@ -263,13 +258,9 @@ class LoopCloser:
         return np.asarray((length > c.return_depths * new.depth) & (far < reach))
 
     def _verified(
-        self,
-        atlas: Atlas,
-        candidates: NDArray[np.intp],
-        features: StereoFeatures,
-        correction: Correction | None,
+        self, atlas: Atlas, candidates: NDArray[np.intp], features: StereoFeatures, correction: Correction | None,
         seed: int,
-    ) -> list[tuple[Loop, Verified]]:
+    ) -> list[tuple[Loop, Verified]]:  # fmt: skip
         """The candidates that geometry confirms, as loops that end at the present camera.
 
         Their second number is that of the newest keyframe, which is the present camera's unless it is lost.
@@ -291,6 +282,15 @@ class LoopCloser:
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
+        self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
+    ) -> tuple[Atlas, Returned | None]:
+        """Close a loop or refuse it; one that cannot be judged is refused."""
+        try:
+            return self._judge(atlas, loop, seen, rig, path)
+        except np.linalg.LinAlgError:
+            return replace(atlas, refused=(*atlas.refused, loop.pair)), None
+
+    def _judge(
         self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop."""
@@ -354,12 +354,8 @@ class LoopCloser:
 
     def _returned(self, seen: Verified) -> Returned:
         """The old keyframe's inliers, in coordinates of the present left camera."""
-        keyframe, m, X, back = (
-            seen.keyframe,
-            seen.matches,
-            self._rectified.T_left_rectified,
-            inverse(seen.T_keyframe_left),
-        )
+        keyframe, m, X = seen.keyframe, seen.matches, self._rectified.T_left_rectified
+        back = inverse(seen.T_keyframe_left)
         points = keyframe.points[m.landmarks].astype(float)
         near, R = transform(back, points), back[:3, :3]
         J = points_by_pose(near)

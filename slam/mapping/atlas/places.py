@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.arrays import narrowed
+
 Vectors = NDArray[np.float32]
 
 _LENGTH = 1024  # cost: of a keyframe's vector: 4 kB
@@ -41,7 +43,7 @@ class PlaceIndex:
     def with_new(self, descriptors: Vectors) -> PlaceIndex:
         """A copy with one more keyframe, which has descriptors (F, D)."""
         count = self.count + 1
-        early = (*self.early, descriptors.astype(np.float16)) if count <= _LEARN_AT[-1] else ()
+        early = (*self.early, narrowed(descriptors, np.float16)) if count <= _LEARN_AT[-1] else ()
         if count not in _LEARN_AT:
             return replace(self._appended(descriptors), early=early)
         every = np.concatenate(early).astype(np.float32)

@@ -77,6 +77,9 @@ class PoseGraph:
             start: poses (K, 4, 4) of all keyframes, at which the graph is first linearised.
             also: further keyframes whose poses are variables, besides those at which loops end.
             common: the common errors (m,) to start from; zero by default.
+
+        Raises:
+            LinAlgError: the equations are singular to working precision.
         """
         problem = _Problem.of(chain, loops, also)
         common = np.zeros(chain.common.shape[2]) if common is None else common
@@ -283,6 +286,9 @@ class _Normal:
             B: by the second poses (E, 6, 6).
             C: by the common errors (E, 6, m).
             W: information (E, 6, 6).
+
+        Raises:
+            LinAlgError: they are singular, or not finite.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.linalg import splu
@@ -299,7 +305,13 @@ class _Normal:
                 columns.append(np.tile(6 * (j[both, None] - 1) + np.arange(6), 6).ravel())
                 values.append((XW @ Y)[both].ravel())
         entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        solver = splu(coo_array(entries, shape=(size, size)).tocsc(), permc_spec="MMD_AT_PLUS_A", options=_SYMMETRIC)
+        matrix = coo_array(entries, shape=(size, size)).tocsc()
+        if not np.isfinite(entries[0]).all():
+            raise np.linalg.LinAlgError("pose graph: a number is not finite")
+        try:
+            solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", options=_SYMMETRIC)
+        except RuntimeError as error:  # SuperLU's word for it
+            raise np.linalg.LinAlgError(f"pose graph: {error}") from error
         flat = border[1:].reshape(size, m)
         through = solver.solve(flat) if m else flat
         follow = np.concatenate([np.zeros((1, 6, m)), through.reshape(count - 1, 6, m)])

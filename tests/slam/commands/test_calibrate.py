@@ -82,7 +82,7 @@ def test_it_is_the_prior_of_a_run_and_of_its_repetition(made, tmp_path):
         (["calibrate", WORLD, "--set", "self_calibration.enabled=false"], "enabled"),
         (["calibrate", "synthetic:desk?frames=1"], "no recording"),
         (["calibrate", WORLD, "--out", "nowhere/rig.json"], "nowhere"),
-        (["calibrate", WORLD, "--out", "a.yaml", "--opencv", "a.yaml"], "one name"),
+        (["calibrate", WORLD, "--out", "a.yaml", "--opencv", "a.yaml"], "same place"),
     ],
 )
 def test_bad_input_is_one_line(made, words, message, tmp_path, monkeypatch):

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -280,7 +282,7 @@ def test_bad_input_is_one_line(runs, tmp_path):
     with pytest.raises(SlamError, match=r"unknown figure 'eror'.*did you mean 'errors'"):
         plot_runs([runs / "a"], tmp_path / "a.png", "eror")
     (tmp_path / "file").write_text("")
-    with pytest.raises(SlamError, match="cannot write to"):
+    with pytest.raises(SlamError, match="cannot be written"):
         plot_runs([runs / "a"], tmp_path / "file" / "a.png", "path")
 
 
@@ -314,3 +316,20 @@ def test_a_row_of_frames_that_lost_its_end_has_no_loop(runs, tmp_path):
     moved[1].pop()
     (folder / "frames.csv").write_text("\n".join(map(",".join, moved)) + "\n", encoding="utf-8")
     assert len(RunData.read(folder, "cut").loops) == 0
+
+
+@pytest.mark.parametrize("name", ["x^$", r"\frac{$", "a\x1b\x01b", "$a$"])
+def test_any_name_of_a_folder_can_be_drawn(runs, tmp_path, name):
+    folder = tmp_path / name
+    shutil.copytree(runs / "a", folder)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "sequence": name, "backend": name}))
+    plot_runs([folder], tmp_path / "a.svg", "summary")
+    ElementTree.fromstring((tmp_path / "a.svg").read_bytes())
+
+
+def test_a_picture_that_is_there_is_not_replaced(runs, tmp_path):
+    (tmp_path / "paper.pdf").write_text("mine")
+    with pytest.raises(SlamError, match="is there already"):
+        plot_runs([runs / "a"], tmp_path / "paper.pdf", "path")
+    assert (tmp_path / "paper.pdf").read_text() == "mine"

@@ -7,7 +7,6 @@ import pytest
 from typer.testing import CliRunner
 
 from slam.commands.cli import app
-from slam.commands.folders import require_free
 from slam.errors import SlamError
 from slam.run.repeat import changed_versions, load, portable
 
@@ -141,25 +140,11 @@ def test_runs_have_folders_of_their_own(here):
     assert len(list((here / "results").iterdir())) == 2  # what was not begun leaves no folder
 
 
-def test_folders_that_may_not_be_read_are_no_runs(here, monkeypatch):
-    def refuse(path, *args, **kwargs):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    (here / "mine" / "private").mkdir(parents=True)
-    monkeypatch.setattr("pathlib.Path.exists", refuse)
-    require_free(here / "mine")
-    monkeypatch.setattr("pathlib.Path.iterdir", refuse)
-    with pytest.raises(SlamError, match=r"cannot read .*mine: Permission denied"):
-        require_free(here / "mine")
-
-
 def test_another_run_is_not_overwritten_without_being_told(here):
     slam("run", WORLD, "--frames", "0:2", "--out", "mine", "-q", "--no-picture")
     before = (here / "mine/config.json").read_bytes()
-    with pytest.raises(SlamError, match=r"\.: holds runs in folders of their own, such as mine; give --out NAME"):
-        slam("run", WORLD, "--frames", "0:2", "--out", ".", "-q")
     for words in (["run", WORLD, "--frames", "0:3"], ["run", "--config", "mine"]):
-        with pytest.raises(SlamError, match="mine: holds a run already; give another --out, or --overwrite"):
+        with pytest.raises(SlamError, match=r"config\.json: is (there already|an input)"):
             slam(*words, "--out", "mine", "-q")
     assert (here / "mine/config.json").read_bytes() == before
     slam("run", WORLD, "--frames", "0:3", "-o", "mine", "--overwrite", "-q", "--no-picture")

@@ -149,10 +149,10 @@ def test_bad_input_of_a_trial_is_an_outcome(tmp_path):
         ({"variants": (Variant("a", "simulated", ("backend.colour=1",)),)}, "colour"),
     ],
 )
-def test_what_cannot_work_is_said_before_anything_runs(change, word):
+def test_what_cannot_work_is_said_before_anything_runs(change, word, tmp_path):
     whole = {"sequences": PLAN.sequences, "backends": PLAN.backends, "variants": PLAN.variants}
     with pytest.raises(SlamError, match=word):
-        check(Plan(**{**whole, **change}))
+        check(Plan(**{**whole, **change}), tmp_path)
 
 
 def test_a_folder_with_other_runs_is_left_alone(done, tmp_path):

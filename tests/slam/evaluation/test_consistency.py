@@ -89,6 +89,21 @@ def with_common_error(seed: int):
     return own, true, P + np.array([c.covariance for c in common]), common
 
 
+def test_stretches_across_a_loop_are_left_out_and_counted_where_shared_errors_shrink_there():
+    """After a loop nothing is known apart, and the whole covariance may be smaller than the shared part before it."""
+    own, true, P, common = with_common_error(0)
+    honest = consistency_figures(own, true, P, NONE, common)
+    A, P[29] = adjoint(inverse(exp(STEP))), P[29] - 0.4 * common[29].covariance
+    for k in range(30, 60):
+        common[k], P[k] = CommonError(), A @ P[k - 1] @ A.T + np.diag(SIGMA**2)
+    P[29] += 0.4 * common[29].covariance
+    figures = consistency_figures(own, true, P, NONE, common)
+    assert "no covariance over 10 m" not in honest
+    assert 0.0 < figures["no covariance over 10 m"] < 0.5
+    assert figures["NEES over 10 m"] > 3.0
+    assert np.isfinite(figures["mean NEES"])
+
+
 def test_errors_that_all_poses_share_count_once():
     runs = [with_common_error(seed) for seed in range(40)]
     apart = [consistency_figures(own, true, P, NONE, common) for own, true, P, common in runs]

@@ -16,6 +16,7 @@ from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.consensus import agreeing, spaced
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.atlas.loop_closer import LoopCloser
+from slam.mapping.atlas.pose_graph import PoseGraph, _Normal
 from slam.rig_error import CommonError
 from tests.slam.scene import RIG
 
@@ -117,3 +118,25 @@ def test_false_loops_of_one_place_do_not_outvote_true_ones(number):
     assert {x.pair for x in true} <= {x.pair for x in atlas.loops}
     assert {x.pair for x in false} <= set(atlas.refused)
     assert error(atlas) < 0.4
+
+
+@pytest.mark.parametrize("size", [np.inf, np.nan])
+def test_a_loop_that_cannot_be_judged_is_refused(size, monkeypatch):
+    """Numbers beyond computing make the pose graph singular: no reason to end a run."""
+    config = SystemConfig.for_kind("driving", None, "ekf")
+    closer = LoopCloser(RIG, replace(config.atlas, agreeing=1), config.association, config.models, 0.3)
+    steps = np.full((81, 6, 6), size)
+    chain, path = Chain(ODOM[:81], steps), Trajectory(0.1 * np.arange(81), ODOM[:81])
+    monkeypatch.setattr(Atlas, "chain", lambda *_: chain)
+    with np.errstate(all="ignore"):
+        after, back = closer._close(atlas_of(81), loop(80), SimpleNamespace(), CommonError(), lambda: path)  # type: ignore[arg-type]
+        with pytest.raises(np.linalg.LinAlgError):
+            PoseGraph.solved(chain, [], ODOM[:81], [20, 80])
+    assert after.refused == (loop(80).pair,)
+    assert back is None
+
+
+def test_singular_equations_are_said_to_be():
+    one, none = np.eye(6)[None], np.zeros((1, 6, 6))
+    with pytest.raises(np.linalg.LinAlgError, match="singular"):
+        _Normal.of(2, np.array([0]), np.array([1]), one, one, none[:, :, :0], none)

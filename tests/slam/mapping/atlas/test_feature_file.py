@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,3 +45,10 @@ def test_a_disk_that_takes_nothing_is_one_clear_line(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("tempfile.TemporaryFile", full)
     with pytest.raises(SlamError, match=r"^atlas\.on_disk: No space left on device$"):
         FeatureFile().put(KEYFRAMES[0])
+
+
+def test_many_keyframes_take_few_file_descriptors():
+    file, before = FeatureFile(), len(list(Path("/proc/self/fd").iterdir()))
+    kept = [file.put(KEYFRAMES[k % len(KEYFRAMES)]) for k in range(300)]
+    assert len(list(Path("/proc/self/fd").iterdir())) - before <= 2
+    assert all(same(keyframe, KEYFRAMES[k % len(KEYFRAMES)]) for k, keyframe in enumerate(kept))

@@ -1,0 +1,133 @@
+"""Outputs are checked before any work: what is there stays, inputs always, and no two outputs are one file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from slam.errors import SlamError
+from slam.files import RowFile, note_input, noting_inputs, read_bytes, write_png, write_text
+from slam.outputs import Output, require_outputs
+
+
+def file(path, option="--save-map", **more):
+    return Output(Path(path), option, **more)
+
+
+def folder(path, *names, option="--out"):
+    return Output(Path(path), option, names or ("a.txt", "[0-9]*.png", "runs/"))
+
+
+def refused(outputs, match, inputs=(), overwrite=False):
+    with pytest.raises(SlamError, match=match) as caught:
+        require_outputs(outputs, inputs, overwrite)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_there_is_not_replaced_without_being_asked(tmp_path):
+    for name in ("old", "a.txt", "000001.png", "mine.txt"):
+        (tmp_path / name).write_text("x")
+    before = sorted(tmp_path.iterdir())
+    refused([file(tmp_path / "old")], r"old: is there already; give another --save-map, or --overwrite to replace it$")
+    refused([file(tmp_path / "old")], "give another --save-map$", overwrite=None)
+    refused([folder(tmp_path)], r"000001\.png: is there already")
+    require_outputs([file(tmp_path / "old"), folder(tmp_path)], overwrite=True)
+    require_outputs([folder(tmp_path, "b.txt"), folder(tmp_path / "new" / "er"), file(tmp_path / "new.map")])
+    assert sorted(tmp_path.iterdir()) == before  # and nothing is made
+
+
+def test_an_input_is_never_replaced(tmp_path):
+    images = tmp_path / "data" / "image_0"
+    images.mkdir(parents=True)
+    for path in (images / "a.png", tmp_path / "data" / "calib.txt", tmp_path / "a.map"):
+        path.write_text("x")
+    (tmp_path / "link").symlink_to("data/calib.txt")
+    os.link(tmp_path / "a.map", tmp_path / "same.map")
+    inputs = [tmp_path / "data", tmp_path / "a.map"]
+    for path in ("a.map", "same.map", "link", "data/calib.txt", "data/image_0/../calib.txt"):
+        refused([file(tmp_path / path)], "is an input", inputs, overwrite=True)
+    for path in ("data", "data/image_0"):
+        refused([folder(tmp_path / path)], "in a folder of inputs", inputs, overwrite=True)
+    require_outputs([folder(tmp_path / "data" / "results" / "1"), file(tmp_path / "data" / "new.map")], inputs)
+    run = tmp_path / "data" / "run"
+    run.mkdir()
+    for name in ("config.json", "frames.csv", "a.txt"):
+        (run / name).write_text("x")
+    require_outputs([folder(run)], inputs, overwrite=True)  # of an earlier run: not what was recorded
+    refused([folder(run)], "is there already", inputs)
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_two_outputs_are_not_the_same(tmp_path, overwrite):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "link").symlink_to("out")
+    out = folder(tmp_path / "out")
+    words = "cannot write to the same place"
+    for path in ("out/a.txt", "link/a.txt", "out/000000.png", "out/runs/x.map", "out/./a.txt"):
+        refused([out, file(tmp_path / path, makes_folder=True)], words, overwrite=overwrite)
+    for path in ("out", "link", "link/a.txt", "link/runs/deep"):
+        refused([out, folder(tmp_path / path, option="--draw")], words, overwrite=overwrite)
+    for one, other in (("x", "x"), ("x", "./x"), ("x", "x/y")):
+        pair = [file(tmp_path / one), file(tmp_path / other, "--record", makes_folder=True)]
+        refused(pair, words, overwrite=overwrite)
+    require_outputs([out, file(tmp_path / "out/my.map"), folder(tmp_path / "out" / "pictures", option="--draw")])
+    require_outputs([folder(tmp_path / "new"), file(tmp_path / "new" / "my.map")])  # in a folder that will be made
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("loop", "symbolic links"), ("loop/a", "symbolic links"), ("folder", "not a regular file"),
+        ("pipe", "not a regular file"), ("text/a", "not a folder"), ("missing/a", "no folder"), ("x" * 300, "too long"),
+        ("a\0b", "no possible"), ("nothing/a", "not a folder"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_written_is_said(tmp_path, path, words):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "nothing").symlink_to("nowhere")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "text").write_text("x")
+    os.mkfifo(tmp_path / "pipe")
+    for overwrite in (False, True):
+        refused([file(tmp_path / path)], words, overwrite=overwrite)
+    if path not in ("folder", "missing/a"):
+        refused([folder(tmp_path / path)], "cannot be written|no possible", overwrite=True)
+
+
+def test_a_system_that_takes_no_file_is_said():
+    refused([file("/proc/a.map")], "cannot be written")
+    refused([folder("/proc/out")], "cannot be written")
+    refused([file("/dev/full")], "not a regular file", overwrite=True)
+
+
+def test_something_else_in_place_of_a_file_of_a_folder(tmp_path):
+    (tmp_path / "a.txt").mkdir()
+    refused([folder(tmp_path)], "not a regular file", overwrite=True)
+    (tmp_path / "a.txt").rmdir()
+    (tmp_path / "runs").write_text("x")
+    refused([folder(tmp_path)], "not a folder", overwrite=True)
+
+
+def test_what_is_read_is_noted(tmp_path):
+    (tmp_path / "a").write_text("x")
+    with noting_inputs() as found:
+        read_bytes(tmp_path / "a", 10)
+        note_input(tmp_path)
+    read_bytes(tmp_path / "a", 10)
+    assert found == [tmp_path / "a", tmp_path]
+
+
+def test_what_a_link_points_to_is_left_alone(tmp_path):
+    import numpy as np
+
+    (tmp_path / "real").write_text("mine")
+    for name in ("rows", "picture.png"):
+        (tmp_path / name).symlink_to("real")
+    RowFile(tmp_path / "rows").close()
+    write_png(tmp_path / "picture.png", np.zeros((4, 4), np.uint8))
+    assert (tmp_path / "real").read_text() == "mine"
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(SlamError, match="symbolic links"):
+        write_text(tmp_path / "loop", "x")
