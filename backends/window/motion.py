@@ -14,6 +14,7 @@ from slam.geometry.se3 import Array, pose, so3_exp, so3_left_jacobian, so3_log
 from slam.models import EstimatorModels
 
 LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
+_RATIO = 1e4  # numerics: of an interval to the one before it, from which on the earlier velocity tells nothing
 
 
 def velocity_sigmas(models: EstimatorModels, dt: float, first: bool) -> Array:
@@ -25,6 +26,11 @@ def velocity_sigmas(models: EstimatorModels, dt: float, first: bool) -> Array:
             [models.initial_angular_velocity_sigma**2, models.initial_velocity_sigma**2], 3
         )
     return np.sqrt(variances)
+
+
+def is_first(before: float | None, dt: float) -> bool:
+    """Whether the velocity over `dt` [s] is taken for unknown: no interval is before it, or one that is far shorter."""
+    return before is None or dt > _RATIO * before
 
 
 def predict(T0: Array, T1: Array, dt01: float, dt12: float) -> tuple[Array, Array, Array, Array]:

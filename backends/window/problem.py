@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.window.motion import LONGEST, velocity_sigmas
+from backends.window.motion import LONGEST, is_first, velocity_sigmas
 from backends.window.state import State
 from slam.data import IndexArray
 from slam.models import EstimatorModels
@@ -29,12 +29,13 @@ def motion_between(s: State, models: EstimatorModels) -> Motion:
     for i in range(1, len(f)):
         if f[i] != f[i - 1] + 1 or f[i] == s.begun:
             continue
-        first = f[i] == s.begun + 1
-        if not first and (i < 2 or f[i - 2] != f[i] - 2):
-            continue
         dt = min(t[i] - t[i - 1], LONGEST)
+        before = min(t[i - 1] - t[i - 2], LONGEST) if i > 1 and f[i - 2] == f[i] - 2 and f[i] > s.begun + 1 else None
+        first = is_first(before, dt)
+        if before is None and f[i] > s.begun + 1:
+            continue  # what the motion model said of it is in the prior
         poses.append((-1 if first else i - 2, i - 1, i))
-        interval.append((1.0 if first else min(t[i - 1] - t[i - 2], LONGEST), dt))
+        interval.append((1.0 if before is None else before, dt))
         weight.append(1 / velocity_sigmas(models, dt, first))
     if not poses:
         return Motion.none()

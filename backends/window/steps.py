@@ -65,12 +65,12 @@ class Steps:
         if len(s.frames) >= self.config.poses:
             s = slid(s, self.stereo, self.models, self.config)
         K, t = len(s.frames), s.stamps
-        dt, first = min(stamp - t[-1], motion.LONGEST), bool(s.frames[-1] == s.begun)
-        J = np.zeros((6, 6 * K))
-        if first:
+        dt = min(stamp - t[-1], motion.LONGEST)
+        before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
+        first, J = motion.is_first(before, dt), np.zeros((6, 6 * K))
+        if before is None or first:
             T, J[:, -6:], Jw = motion.predict_from_rest(s.poses[-1], dt)
         else:
-            before = min(t[-1] - t[-2], motion.LONGEST)
             T, J[:, -12:-6], J[:, -6:], Jw = motion.predict(s.poses[-2], s.poses[-1], before, dt)
         noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
         cross = J @ s.covariance
