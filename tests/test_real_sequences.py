@@ -30,7 +30,7 @@ def test_kitti_06(slam_data, tmp_path, backend, bar):
     assert summary["accuracy"]["online"]["ATE RMSE [m]"] < bar
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_kitti_raw_0013_with_two_overtaking_cars(slam_data, tmp_path, backend):
     """The first 80 frames, in which both cars pass close by; measured 0.2 to 0.4 m."""
     summary = run_defaults(slam_data / RAW_0013, backend, tmp_path, 80)
@@ -38,7 +38,7 @@ def test_kitti_raw_0013_with_two_overtaking_cars(slam_data, tmp_path, backend):
     assert summary["accuracy"]["online"]["GPS distance RMSE [m]"] < 1.0
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_euroc_keyframes_up_to_seconds_apart(slam_data, tmp_path, backend):
     """Unrectified, and turned by up to 48 degrees from one to the next; measured 0.01 to 0.05 m.
 

@@ -22,7 +22,7 @@ def replayed(folder, name, start, stop, wrong=0.0):
     return steps, backend, off
 
 
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
 def test_the_first_frames_are_not_rejected(slam_data, name):
     """At 11 m/s, of which nothing is known at first. The truth of these frames is off by 1.4 m itself.
 
@@ -35,7 +35,7 @@ def test_the_first_frames_are_not_rejected(slam_data, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
 def test_far_tracks_alone_do_not_make_it_run_away(slam_data, name, wrong):
     """Where all tracks were 80 m away, each frame was solved again from frame 435 on, and was off by up to 16 m."""
     steps, backend, off = replayed(slam_data, name, 370, 450, wrong)

@@ -33,7 +33,7 @@ RENDERED = {"aisle?frames=12": 0.005, "desk?frames=12": 0.005, "box?frames=12": 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 @pytest.mark.parametrize("world", OBSERVED)
 def test_observed_world(world, backend):
     sequence = open_sequence(f"synthetic:{world}")
@@ -54,7 +54,7 @@ def test_observed_world(world, backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 @pytest.mark.parametrize("world", RENDERED)
 def test_rendered_world(world, backend, tmp_path):
     sequence = open_sequence(f"synthetic:{world}")
@@ -64,7 +64,7 @@ def test_rendered_world(world, backend, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_faults_are_survived(backend, tmp_path):
     """Black frames, a missing right image, missing frames: the run goes on, and its status says what happened."""
     sequence = open_sequence("synthetic:desk?frames=40&black=12:15&dropright=20:22&drop=27")

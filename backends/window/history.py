@@ -121,7 +121,7 @@ def _state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array
     T, marks = s.poses[-1], s.landmarks
     local = (marks.position - T[:3, 3]) @ T[:3, :3]
     z, _ = stereo.project(local)
-    seen = np.isfinite(z).all(axis=1)
+    seen = np.isfinite(z).all(axis=1) & stereo.rectified_rig.rig.left.in_image(z[:, :2])
     there = local.copy()
     there[seen] = stereo.triangulate(_corrected(z[seen], correct))
     there = np.where(np.isfinite(there), there, local)

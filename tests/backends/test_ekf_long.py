@@ -10,7 +10,7 @@ from experiments.long_run import RIG, Corridor, Loop, has_cholesky, measured, ru
 from slam.data import Observations
 
 
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
 def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
     assert name in backends.names()
     checkpoints = list(run(name, 60, 20, Corridor(density=4, speed=4.0)))
@@ -24,7 +24,7 @@ def test_a_walk_in_which_the_map_is_replaced_again_and_again(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ekf", "smoother"])
+@pytest.mark.parametrize("name", ["ekf", "smoother", "window"])
 def test_rounds_past_the_same_landmarks(name):
     """Two rounds: the second adds next to no landmark, and comes back to where the first began."""
     last = list(run(name, 220, 110, Loop(count=150, speed=3.0)))

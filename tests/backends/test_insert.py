@@ -17,7 +17,7 @@ RIG = StereoRig.rectified_pair(f=400.0, u0=319.5, v0=239.5, baseline=0.2, width=
 SIGMA = 0.5
 DT = 0.1
 KNOWN = 0.01  # standard deviation of what is known of a landmark [m]
-NAMES = ("ekf", "smoother", "batch")
+NAMES = ("ekf", "smoother", "window", "batch")
 START = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.4]))  # the camera's true place at first
 
 
@@ -101,7 +101,7 @@ def test_measuring_makes_the_map_better_and_its_covariances_fit(name):
     assert 0.5 < distances.mean() / 3 < 1.6  # 40 landmarks, correlated through the pose
 
 
-@pytest.mark.parametrize("name", ("ekf", "smoother"))
+@pytest.mark.parametrize("name", ("ekf", "smoother", "window"))
 def test_left_pixels_alone_are_enough_in_a_prior_map(name):
     scene = Scene(mono=True)
     estimate = tracked(name, scene).estimate()

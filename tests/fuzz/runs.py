@@ -10,11 +10,13 @@ import signal
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from slam.config import SystemConfig
+from slam.data import StereoFrame
 from slam.errors import SequenceError, SlamError
 from slam.files import lock_folder
 from slam.geometry.trajectory import Trajectory
@@ -48,14 +50,19 @@ class Scripted:
         for k in range(FRAMES):
             if self._error is not None and k == self._at:
                 raise self._error
-            yield _Numbered(k, self.features[k])
+            yield _Numbered.of(k, self.features[k])
 
 
-class _Numbered:
+@dataclass(frozen=True, eq=False)
+class _Numbered(StereoFrame):
     """A frame that holds its features already."""
 
-    def __init__(self, index: int, features: object) -> None:
-        self.index, self.features = index, features
+    features: object = None
+
+    @classmethod
+    def of(cls, index: int, features: object) -> _Numbered:
+        """Without an image."""
+        return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features)
 
 
 class _Frontend:

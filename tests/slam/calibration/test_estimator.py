@@ -236,7 +236,7 @@ def test_the_system_corrects_what_it_is_given():
     assert np.abs(run(wrong) - run(frames)).max() > 1e-3
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_revision_does_not_move_the_camera(backend):
     """Landmarks follow the new correction: else a sudden change of all pixels looks like motion."""
     correction = RigCorrection(RigModel(RIG), parameters(left_k1=-0.05, right_k1=-0.05, right_cx=1e-3))

@@ -22,7 +22,7 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5))
 
 

@@ -19,7 +19,7 @@ from slam.testing import GENERAL_RIG
 from slam.tracking.localizer import Localizer
 from tests.slam.scene import RIG, Cloud
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 STEP = se3.exp(np.array([0.02, 0.05, -0.03, 0.3, 0.05, 0.1]))  # the camera now, in its coordinates then
 NOISE = np.diag(np.repeat([1e-3, 5e-3], 3) ** 2)
 SIGMA = 0.5

@@ -36,7 +36,7 @@ def run(backend, speed):
     return system, near, frames
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 @pytest.mark.parametrize("speed", [0.3, 1.0])
 def test_landmarks_that_begin_to_move_leave_the_map(backend, speed):
     _, movers, frames = run(backend, speed)

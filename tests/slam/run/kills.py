@@ -31,7 +31,7 @@ class Seen(Scripted):
         return FRAMES
 
     def frames(self, start=0, stop=None):
-        yield from (_Numbered(k, seen) for k, seen in enumerate(self.features))
+        yield from (_Numbered.of(k, seen) for k, seen in enumerate(self.features))
 
 
 def _rows(path: Path) -> int:

@@ -19,7 +19,7 @@ COUNT = 20
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_twenty_kills_leave_whole_rows(tmp_path, backend):
     command = [sys.executable, "-W", "ignore", "-m", "tests.slam.run.kills", backend, str(tmp_path), str(COUNT)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600)

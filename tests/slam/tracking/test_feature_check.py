@@ -18,7 +18,7 @@ from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MapConfig(target_in_view=40, max_depth_error=0.3))
 COLUMNS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
 

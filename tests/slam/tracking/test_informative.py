@@ -65,7 +65,7 @@ def test_takes_all_where_there_are_no_more():
     ]
 
 
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_a_run_measures_no_more_and_keeps_the_others_in_the_map(backend: str):
     sequence = slam.open_sequence("synthetic:aisle?frames=15")
     config = SystemConfig.for_kind(sequence.kind, None, backend).with_settings(["association.measured=20"])

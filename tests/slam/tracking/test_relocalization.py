@@ -18,7 +18,7 @@ from slam.tracking.hypotheses import PoseHypotheses
 from slam.tracking.state import TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 MAP = MapConfig(target_in_view=40, max_depth_error=0.3, restart_after=12)
 CONFIG = SystemConfig(models=EstimatorModels(pixel_sigma=0.5), map=MAP)
 

@@ -204,7 +204,7 @@ def test_an_interrupted_keyframe_leaves_the_atlas_as_it_was(sequence, monkeypatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
+@pytest.mark.parametrize("backend", ["ekf", "smoother", "window"])
 def test_landmarks_of_an_old_place_are_measured_again(sequence, backend: str):
     _, results = drive(sequence, backend, "map.target_in_view=30")  # so that few of them are landmarks already
     first = first_loop(results)

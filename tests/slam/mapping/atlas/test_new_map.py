@@ -18,7 +18,7 @@ from slam.system import StereoSlam
 from tests.slam.mapping.atlas.test_atlas import sequence, system_for  # noqa: F401 (a fixture)
 from tests.slam.scene import RIG, Cloud, path
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother", "window")
 SEEN, DARK, SKIPPED = 35, 30, 12  # frames before the dark, in it, and how much farther than they the camera was carried
 
 
