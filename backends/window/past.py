@@ -9,6 +9,7 @@ import numpy as np
 
 from slam.data import IdArray, IndexArray
 from slam.geometry.se3 import Array, exp, inverse, log, transform
+from slam.window.marginal import Conditional
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +21,7 @@ class Left:
         serials, points: of landmarks that left (G,), and positions then (G, 3).
         frames, poses: of poses that stayed (K,), (K, 4, 4).
         stayed, positions: of landmarks that stayed (D,), (D, 3).
-        mean, gain: changes of landmarks and pose that left are ``mean − gain y`` by those y of what stayed.
+        conditional: changes of the pose and of landmarks that left, by those of what stayed.
     """
 
     frame: int
@@ -31,19 +32,13 @@ class Left:
     poses: Array
     stayed: IdArray
     positions: Array
-    mean: Array
-    gain: Array
+    conditional: Conditional
 
     def moved(self, M: Array) -> Left:
         """Moved by a rigid motion of the world (4, 4)."""
-        R, g, s = M[:3, :3], self.points.size, self.positions.size
-        mean, gain = self.mean.copy(), self.gain.copy()
-        mean[:g] = (mean[:g].reshape(-1, 3) @ R.T).ravel()
-        gain[:g] = (R @ gain[:g].reshape(len(self.points), 3, gain.shape[1])).reshape(g, gain.shape[1])
-        gain[:, :s] = (gain[:, :s].reshape(len(gain), len(self.stayed), 3) @ R.T).reshape(len(gain), s)
         return replace(
             self, pose=M @ self.pose, points=transform(M, self.points), poses=M @ self.poses,
-            positions=transform(M, self.positions), mean=mean, gain=gain,
+            positions=transform(M, self.positions), conditional=self.conditional.turned(M[:3, :3]),
         )  # fmt: skip
 
 
@@ -88,10 +83,9 @@ class Past:
         """
         known, where = dict(poses), dict(points)
         for one in reversed(self.left):
-            moved = [where[serial] for serial in one.stayed.tolist()]
-            y: list[Array] = [(np.array(moved).reshape(-1, 3) - one.positions).ravel()]
-            y.append(log(inverse(one.poses) @ np.array([known[frame] for frame in one.frames.tolist()])).ravel())
-            x = one.mean - one.gain @ np.concatenate(y)
-            known[one.frame] = one.pose @ exp(x[-6:])
-            where.update(zip(one.serials.tolist(), one.points + x[:-6].reshape(-1, 3)))
+            now = np.array([where[serial] for serial in one.stayed.tolist()]).reshape(-1, 3)
+            poses_now = np.array([known[frame] for frame in one.frames.tolist()])
+            points, pose = one.conditional.of(now - one.positions, log(inverse(one.poses) @ poses_now))
+            known[one.frame] = one.pose @ exp(pose)
+            where.update(zip(one.serials.tolist(), one.points + points))
         return {one.frame: known[one.frame] for one in self.left}

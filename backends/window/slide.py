@@ -54,10 +54,12 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
     part = problem(s, stereo, models, rows.select(absorbed_row), places.select(absorbed_place), motion)
     w = part.window
     keeps = (member | joins | ends)[part.points]
-    w = replace(w, information=np.where(keeps[:, None, None], marks.information[part.points], 0.0))
-    joining = np.flatnonzero(joins[part.points])
+    w = replace(
+        w, information=np.where(keeps[:, None, None], marks.information[part.points], 0.0),
+        joining=np.flatnonzero(joins[part.points]),
+    )  # fmt: skip
     ending = ends[s.prior.points]
-    prior, conditional, cost = marginalised(w, leaving, ending, joining)
+    prior, conditional, cost = marginalised(w, leaving, ending)
     past = s.past.with_one(_left(s, leaving, part.points[prior.points], s.prior.points[ending], conditional))
     stays = ~absorbed_row & (rows.pose != leaving)
     free = marks.information.copy()
@@ -77,7 +79,7 @@ def _left(s: State, leaving: int, stayed: IndexArray, ended: IndexArray, conditi
     marks, stay = s.landmarks, np.arange(len(s.frames)) != leaving
     return Left(
         int(s.frames[leaving]), s.poses[leaving], marks.serial[ended], marks.position[ended], s.frames[stay],
-        s.poses[stay], marks.serial[stayed], marks.position[stayed], conditional.mean, conditional.gain,
+        s.poses[stay], marks.serial[stayed], marks.position[stayed], conditional,
     )  # fmt: skip
 
 

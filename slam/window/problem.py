@@ -163,6 +163,7 @@ class Window:
         places: points that are known relative to a pose.
         motion: constant velocity between successive poses.
         prior: what is known of the first poses and of some points together.
+        joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
     """
 
     stereo: RectifiedStereo
@@ -176,6 +177,19 @@ class Window:
     places: Places = field(default_factory=Places.none)
     motion: Motion = field(default_factory=Motion.none)
     prior: RelativePrior = field(default_factory=RelativePrior.none)
+    joining: IndexArray = field(default_factory=lambda: np.zeros(0, np.intp))
+
+    @cached_property
+    def members(self) -> IndexArray:
+        """Points that are unknowns: those of the prior, then those that join (D + J,)."""
+        return np.concatenate([self.prior.points, self.joining])
+
+    @cached_property
+    def basis(self) -> Array:
+        """Charts of `members` in the first pose's axes (D + J, 3, 3)."""
+        if not len(self.joining):
+            return self.prior.basis
+        return np.concatenate([self.prior.basis, kernels.relative_charts(self.poses[0], self.points[self.joining])[0]])
 
     @cached_property
     def place(self) -> IndexArray:
@@ -183,23 +197,23 @@ class Window:
         place = np.full(len(self.points), ELIMINATED)
         if self.known is not None:
             place[self.known] = KNOWN
-        place[self.prior.points] = np.arange(len(self.prior.points))
+        place[self.members] = np.arange(len(self.members))
         return place
 
     @cached_property
     def column(self) -> IndexArray:
         """First unknown of each pose (K,), −1 for a fixed one."""
-        first = 3 * len(self.prior.points)
+        first = 3 * len(self.members)
         if self.free is None:
             return first + 6 * np.arange(len(self.poses))
         column = np.full(len(self.poses), -1)
         column[self.free] = first + 6 * np.arange(int(self.free.sum()))
         return column
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """Number of unknowns, without the points that are eliminated."""
-        return 3 * len(self.prior.points) + 6 * int((self.column >= 0).sum())
+        return 3 * len(self.members) + 6 * int((self.column >= 0).sum())
 
     @cached_property
     def by_point(self) -> tuple[IndexArray, IndexArray]:

@@ -69,22 +69,23 @@ class NormalEquations:
             self.gradient, x,
         )  # fmt: skip
         moved = replace(w, poses=poses, points=points)
-        for name in ("place", "column", "by_point", "pose_of_row"):  # these do not change
-            moved.__dict__[name] = getattr(w, name)
+        for name in ("members", "basis", "place", "column", "unknowns", "by_point", "pose_of_row"):
+            moved.__dict__[name] = getattr(w, name)  # these do not change
         return moved
 
 
-def linearised(w: Window, centre: int = 0) -> NormalEquations:
+def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquations:
     """The normal equations of a window at its present values.
 
     Args:
         w: the window.
         centre: the pose from which inverse distances of points outside the prior count.
+        whole: with H; without it, H is left undefined, and only a factor of other equations may be used.
     """
     n, rows = w.unknowns, w.rows
-    H, b = np.zeros((n, n)), np.zeros(n)
-    cost = _begin_with_prior(w, H, b)
-    E = kernels.charts(w.poses, centre, w.points, w.place, w.prior.basis, 0)
+    H, b = np.zeros((n, n)) if whole else np.empty((n, n)), np.zeros(n)
+    cost = _begin_with_prior(w, H, b, whole)
+    E = kernels.charts(w.poses, centre, w.points, w.place, w.basis, 0)
     squares, information, gradient, cross = kernels.linearise(
         w.stereo.intrinsics,
         w.stereo.R_left,
@@ -117,7 +118,7 @@ def linearised(w: Window, centre: int = 0) -> NormalEquations:
     return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
 
 
-def _begin_with_prior(w: Window, H: Array, b: Array) -> float:
+def _begin_with_prior(w: Window, H: Array, b: Array, whole: bool) -> float:
     """Begin the normal equations with the prior; returns its cost, ∞ where a point has left its chart."""
     prior, n = w.prior, len(w.prior.vector)
     if not n:
@@ -128,15 +129,16 @@ def _begin_with_prior(w: Window, H: Array, b: Array) -> float:
         w.poses, w.points, prior.points, prior.T, prior.relative, prior.basis, prior.origin, there, delta, A
     ):
         return np.inf
-    reference = slice(3 * len(prior.points), 3 * len(prior.points) + 6)
-    V, pull = prior.information @ A, prior.vector - prior.information @ delta
-    by_reference = A.T @ pull
-    part = H[:n, :n]
-    part[:] = prior.information
-    part[:, reference], part[reference] = V, V.T
-    part[reference, reference] = A.T @ V
-    b[:n] = pull
-    b[reference] = by_reference
+    D, J = 3 * len(prior.points), 3 * len(w.joining)
+    pull = prior.vector - prior.information @ delta
+    b[:D], b[D + J : n + J] = pull[:D], pull[D:]
+    b[D + J : D + J + 6] = A.T @ pull
+    if whole:
+        V, poses, reference = prior.information @ A, slice(D + J, n + J), slice(D + J, D + J + 6)
+        H[:D, :D], H[poses, :D] = prior.information[:D, :D], prior.information[D:, :D]
+        H[poses, poses] = prior.information[D:, D:]
+        H[reference, :D], H[poses, reference], H[reference, poses] = V[:D].T, V[D:], V[D:].T
+        H[reference, reference] = A.T @ V
     return float(-delta @ (pull + prior.vector))
 
 
@@ -164,7 +166,7 @@ class Solution:
     @cached_property
     def pose_covariance(self) -> Array:
         """Joint covariance (6 F, 6 F) of the free poses, perturbed on the right."""
-        first = 3 * len(self.window.prior.points)
+        first = 3 * len(self.window.members)
         X = self.inverse_factor[first:, first:]
         return np.asarray(X.T @ X)
 
@@ -173,7 +175,7 @@ class Solution:
         w, e = self.window, self.equations
         return kernels.point_relations(
             w.poses[pose], w.points, w.place, e.E, w.pose_of_row, e.cross, *w.by_point, w.column, e.inverse,
-            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.prior.points),
+            self.inverse_factor, self.pose_covariance, int(w.column[pose]), 3 * len(w.members),
         )  # fmt: skip
 
 
@@ -188,8 +190,8 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
         numpy.linalg.LinAlgError: something is not determined, or a value is not finite.
     """
     now = linearised(window)
-    x, _ = now.step(now.factor)
     for taken in range(1, _STEPS + 1):
+        x, _ = now.step(now.factor)
         following = _descended(now, x)
         if following is None:
             return Solution(now.window, now, now.cost, taken)
@@ -198,15 +200,14 @@ def solve(window: Window, close: float = CLOSE) -> Solution:
             raise np.linalg.LinAlgError("a window's step is not finite")
         if rest < close:  # so near the end the last factor serves once more
             return Solution(following.after(x), now, following.cost - rest, taken)
-        now = following
-        x, _ = now.step(now.factor)
+        now = linearised(following.window)
     return Solution(now.window, now, now.cost, _STEPS)
 
 
 def _descended(now: NormalEquations, x: Array) -> NormalEquations | None:
-    """The equations after a step, or after the longest of its halves that does not raise the cost; None for none."""
+    """Equations, not whole, after a step, or the longest of its halves that does not raise the cost; None for none."""
     for halving in range(_HALVINGS):
-        following = linearised(now.after(0.5**halving * x))
+        following = linearised(now.after(0.5**halving * x), whole=False)
         if following.cost <= now.cost + 1e-9 * abs(now.cost) + 1e-12:
             return following
     return None

@@ -122,7 +122,7 @@ def test_gradient_is_the_costs_derivative():
     """Of a window with each kind of knowledge, whose points are at their best for its poses."""
     w = with_everything()
     part = replace(w, rows=w.rows.select(w.rows.pose == 0), motion=Motion.none(), places=Places.none())
-    prior = marginalised(part, 0, np.zeros(0, bool), np.arange(10, 20))[0]
+    prior = marginalised(replace(part, joining=np.arange(10, 20)), 0, np.zeros(0, bool))[0]
     rest = w.rows.select(w.rows.pose > 0)
     w = replace(w, poses=w.poses[1:], rows=replace(rest, pose=rest.pose - 1), prior=prior, motion=Motion(
         np.array([(0, 1, 2), (1, 2, 3)]), np.full((2, 2), 0.1), np.full((2, 6), 3.0)))  # fmt: skip
@@ -173,8 +173,8 @@ def test_a_pose_that_leaves_changes_nothing(leaves):
     """The rest is solved as before, with the same covariance: here everything is linear next to the solution."""
     found = solve(window())
     w, rows = found.window, found.window.rows
-    part = replace(w, rows=rows.select(rows.pose == leaves))
-    prior, conditional, _ = marginalised(part, leaves, np.zeros(0, bool), np.arange(POINTS))
+    part = replace(w, rows=rows.select(rows.pose == leaves), joining=np.arange(POINTS))
+    prior, conditional, _ = marginalised(part, leaves, np.zeros(0, bool))
     rest = rows.select(rows.pose != leaves)
     rest = replace(rest, pose=rest.pose - (rest.pose > leaves))
     others = np.arange(POSES) != leaves
@@ -190,21 +190,21 @@ def test_what_left_follows_what_stayed():
     """The conditional is that of the joint covariance: moving the rest as one moves what left along."""
     w = solve(window()).window
     rows = w.rows
-    prior, conditional, _ = marginalised(
-        replace(w, rows=rows.select(rows.pose == 1)), 1, np.zeros(0, bool), np.arange(POINTS)
-    )
+    part = replace(w, rows=rows.select(rows.pose == 1), joining=np.arange(POINTS))
+    prior, conditional, _ = marginalised(part, 1, np.zeros(0, bool))
     M = se3.exp(1e-4 * np.array([1.0, -2, 0.5, 3, 1, -2]))
     others = np.arange(POSES) != 1
-    y = [(se3.transform(M, w.points[prior.points]) - w.points[prior.points]).ravel()]
-    y += [se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]]
-    x = conditional.mean - conditional.gain @ np.concatenate(y)
+    points = se3.transform(M, w.points[prior.points]) - w.points[prior.points]
+    poses = np.array([se3.log(se3.inverse(T) @ M @ T) for T in w.poses[others]])
+    x = conditional.of(points, poses)[1]
     np.testing.assert_allclose(w.poses[1] @ se3.exp(x), M @ w.poses[1], atol=1e-6)
 
 
 def test_the_prior_does_not_mind_where_all_stands():
     """Moved as one, only what is known of the first pose in the world resists."""
     w = solve(window()).window
-    prior = marginalised(replace(w, rows=w.rows.select(w.rows.pose == 0)), 0, np.zeros(0, bool), np.arange(POINTS))[0]
+    part = replace(w, rows=w.rows.select(w.rows.pose == 0), joining=np.arange(POINTS))
+    prior = marginalised(part, 0, np.zeros(0, bool))[0]
     far = se3.exp(np.array([0.3, -1.0, 0.4, 30, -20, 10]))
     there = replace(prior, T=far @ prior.T)
     moved = Window(STEREO, far @ w.poses[1:], se3.transform(far, w.points), Rows.none(), prior=there)
