@@ -9,6 +9,7 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, MeasurementError
 from slam.geometry.rig import StereoRig
+from slam.grey_range import eight_bits
 from slam.models import EstimatorModels
 from slam.tracking.feature_check import usable
 from slam.tracking.pair_check import NO_DISPARITY, pair_geometry
@@ -192,4 +193,4 @@ def _eight_bits(image: np.ndarray) -> np.ndarray:
 
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
-    return np.ascontiguousarray(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
+    return np.ascontiguousarray(eight_bits(image))
