@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.landmarks import LandmarkTable
-from slam.tracking.association import match_everywhere, match_in_boxes, pairs_in_boxes
-from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.association import match_in_boxes, pairs_in_boxes
+from slam.tracking.localizer import LandmarkMatches
 from slam.tracking.visibility import MapView
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
@@ -276,48 +276,3 @@ class MonocularDepth:
             expected, _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
         )  # fmt: skip
         return found.features, found.landmarks
-
-
-def find_pose(
-    rig: StereoRig,
-    landmarks: LandmarkTable,
-    positions: Array,
-    features: StereoFeatures,
-    localizer: Localizer,
-    seed: int,
-) -> Array | None:
-    """The camera's pose (4, 4) in a map from left pixels alone, by P3P and RANSAC.
-
-    Args:
-        rig: the cameras.
-        landmarks: the map (N rows).
-        positions: of its landmarks (N, 3) [m].
-        features: of the frame.
-        localizer: whose settings are used.
-        seed: of the random choice of points.
-
-    Returns:
-        the pose, or None where too few landmarks agree on one.
-    """
-    import cv2
-
-    config = localizer.config
-    matches = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, config)
-    if len(matches) < config.minimum_consistent:
-        return None
-    points, uv = positions[matches.landmarks], features.uv_left[matches.features]
-    bearings = rig.left.normalise(uv)
-    rng = np.random.default_rng(seed)
-    poses = []
-    for _ in range(config.wide_hypotheses):
-        three = rng.choice(len(points), 3, replace=False)
-        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
-        for turn, shift in zip(turns, shifts):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            poses.append(T)
-    threshold = config.consistency_sigmas * localizer.pixel_sigma
-    support = [int((np.abs(rig.left.project(transform(T, points)) - uv) < threshold).all(axis=1).sum()) for T in poses]
-    if not poses or max(support) < config.minimum_consistent:
-        return None
-    return inverse(poses[int(np.argmax(support))])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
+from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.landmarks import LandmarkTable
@@ -191,7 +191,7 @@ class Localizer:
                 least = self.config.wide_share if doubtful else 0.0
             elif not tight:
                 return LandmarkMatches.nothing()
-        if not tight:
+        if not tight or consensus.inliers.sum() < CLEAR_MAJORITY * len(matches):
             expected = self._expected(consensus.T_world_left, prediction, landmarks, positions)
             matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
             if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):
