@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, log
 from slam.models import MotionModel
@@ -51,7 +52,7 @@ def outcome(
         return ""
     first = warnings[0] if warnings else _cause(record, untracked, rig, in_map) or doubt
     if not first and dropped < frames:  # where most came, the gaps are hardly all of it
-        first = _any_cause(driving)
+        first = _any_cause(record, rig, driving)
     causes = [first] if first else []
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
@@ -71,14 +72,44 @@ def _how_many(tracked: int, frames: int) -> str:
     return f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
 
 
-def _any_cause(driving: bool) -> str:
-    """What may be the cause where each step gave enough."""
+def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
+    """What may be the cause where each step gave enough, with what is known."""
     kind = "" if driving else "a vehicle's camera without --kind driving, "
+    depths = np.array(record.depths)[np.isfinite(record.depths)]
+    seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
     return (
-        f"features are found in both images, but not again in the next frame: {kind}frames too far apart, images that "
-        "are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of another "
-        "camera"
+        f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
+        f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of "
+        f"another camera or in another unit: by it the cameras are {rig.baseline:.3g} m apart{seen}"
     )
+
+
+def _rounded(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _speed(record: RunRecord) -> str:
+    """How fast the camera was where two successive frames were tracked; empty where there are none."""
+    measured = np.array(record.measured, bool)
+    both = measured[1:] & measured[:-1]
+    if not both.any():
+        return ""
+    poses = np.array(record.poses).reshape(-1, 4, 4)
+    moved = log(inverse(poses[:-1]) @ poses[1:])[both] / np.diff(record.stamps)[both, None]
+    turn, way = np.linalg.norm(moved[:, :3], axis=1).max(), np.linalg.norm(moved[:, 3:], axis=1).max()
+    fastest = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
+    return f" (where it was tracked the camera moved at up to {fastest})"
+
+
+def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
+    """Depth [m] of the feature with the median disparity; NaN where none has a right pixel."""
+    stereo = np.flatnonzero(features.has_stereo)
+    if not len(stereo):
+        return float("nan")
+    left, right = features.uv_left[stereo], features.uv_right[stereo]
+    middle = [np.argsort(left[:, 0] - right[:, 0], kind="stable")[len(stereo) // 2]]
+    return float(rig.triangulate(left[middle], right[middle])[0, 2])
 
 
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
@@ -121,6 +152,12 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
+    missing = len(set(untracked) & set(record.without_right))
+    if 2 * missing > len(untracked):
+        return (
+            f"{missing} of these {len(untracked)} frames have no right image, and so nothing new to follow; look "
+            "for the missing images, and whether they have the left ones' names or times"
+        )
     if stereo < ENOUGH_FEATURES:
         return (
             f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
