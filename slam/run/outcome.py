@@ -79,8 +79,8 @@ def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
     seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
     return (
         f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
-        f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of "
-        f"another camera or in another unit: by it the cameras are {rig.baseline:.3g} m apart{seen}"
+        f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or "
+        f"the calibration of another camera or in another unit: by it the cameras are {rig.baseline:.3g} m apart{seen}"
     )
 
 
@@ -152,11 +152,11 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
-    missing = len(set(untracked) & set(record.without_right))
+    missing = _by_missing_images(record, untracked)
     if 2 * missing > len(untracked):
         return (
-            f"{missing} of these {len(untracked)} frames have no right image, and so nothing new to follow; look "
-            "for the missing images, and whether they have the left ones' names or times"
+            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be added "
+            "to the map there: look for the missing images, and whether their names or times are the left ones'"
         )
     if stereo < ENOUGH_FEATURES:
         return (
@@ -164,3 +164,13 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
             "check that the images are of two cameras, the left one first, and the calibration"
         )
     return baseline_doubt(rig)
+
+
+def _by_missing_images(record: RunRecord, untracked: Sequence[int]) -> int:
+    """Number of frames, not tracked, that have no right image, or that come after such without a tracked one between."""
+    without, count = set(record.without_right), 0
+    for row in untracked:  # ascending
+        if row in without or row - 1 in without:
+            without.add(row)
+            count += 1
+    return count

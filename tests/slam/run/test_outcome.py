@@ -122,8 +122,8 @@ def test_doubts_of_the_motion_are_a_cause_where_nothing_else_is():
 
 def test_missing_right_images_are_the_cause_where_most_of_these_frames_have_none():
     run = record(10, features=(200, 0))
-    run.without_right.extend(range(11, 18))
-    assert "likely cause: 7 of these 10 frames have no right image" in outcome(run, RIG)
+    run.without_right.extend(range(8, 13))
+    assert "likely cause: 10 of these 10 frames have no right image or follow such" in outcome(run, RIG)
     assert "calibration" not in outcome(run, RIG)
     run = record(10)
     run.without_right.extend(range(5))
