@@ -155,8 +155,8 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
     missing = _by_missing_images(record, untracked)
     if 2 * missing > len(untracked):
         return (
-            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be added "
-            "to the map there: look for the missing images, and whether their names or times are the left ones'"
+            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be "
+            "added to the map there: look for the missing images, and whether their names or times are the left ones'"
         )
     if stereo < ENOUGH_FEATURES:
         return (
@@ -167,7 +167,7 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
 
 
 def _by_missing_images(record: RunRecord, untracked: Sequence[int]) -> int:
-    """Number of frames, not tracked, that have no right image, or that come after such without a tracked one between."""
+    """Number of untracked frames that have no right image, or follow such without a tracked one between."""
     without, count = set(record.without_right), 0
     for row in untracked:  # ascending
         if row in without or row - 1 in without:
