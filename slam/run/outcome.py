@@ -22,6 +22,8 @@ _TRACKED = "tracked"
 _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
 
+_ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
+
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
 
@@ -113,10 +115,10 @@ def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
 
 
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
-    """What to say where velocities change from frame to frame far more than the motion model lets them; else empty.
+    """What to say where velocities change far more than the motion model lets them, or a vehicle goes sideways.
 
     Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand, unless the
-    motion is known to be that of a vehicle.
+    motion is known to be that of a vehicle. Empty where the motion is as expected.
     """
     measured = np.array(record.measured, bool)
     stamps, poses = np.array(record.stamps), np.array(record.poses).reshape(-1, 4, 4)
@@ -130,6 +132,15 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     counted = changes[measured[2:] & measured[1:-1] & measured[:-2]]
     if len(counted) < _LEAST_CHANGES:
         return ""
+    if driving:
+        along = np.abs(velocities[measured[1:] & measured[:-1], 3:])
+        aside = along[(along[:, 0] > _ASIDE) & (along[:, 0] > along[:, 2]), 0]
+        if len(aside) >= _LEAST_CHANGES:
+            return (
+                f"in {len(aside)} frames the camera moved sideways, at {_rounded(float(np.median(aside)))} m/s in the "
+                "median, which no vehicle does: unless the camera looks to the side, something large that moved past "
+                "was taken for the world"
+            )
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
     if not ratio >= _JERKY:  # also where it is no number
         return ""

@@ -144,3 +144,17 @@ def test_the_median_depth_of_a_frame():
     depths = SCENE_RIG.triangulate(features.uv_left, features.uv_right)[:, 2]
     assert median_depth(features, SCENE_RIG) == pytest.approx(np.median(depths), rel=0.05)
     assert np.isnan(median_depth(replace(features, uv_right=features.uv_right * np.nan), SCENE_RIG))
+
+
+def test_a_vehicle_that_goes_sideways_is_doubted():
+    """A truck before a standing car took the camera along."""
+
+    def along(step):
+        poses = [exp(np.array([0, 0.002 * k, 0, *(k * np.array(step))])) for k in range(30)]
+        return RunRecord(stamps=(0.1 * np.arange(30)).tolist(), poses=poses, measured=[True] * 30)
+
+    said = motion_doubt(along((0.3, 0, 0.05)), MotionModel(), driving=True)
+    assert said.startswith("in 29 frames the camera moved sideways, at 3 m/s in the median, which no vehicle does")
+    assert motion_doubt(along((0.05, 0, 1.0)), MotionModel(), driving=True) == ""
+    assert motion_doubt(along((0.01, 0, 0.0)), MotionModel(), driving=True) == ""
+    assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""
