@@ -272,7 +272,10 @@ class MonocularDepth:
         """Matches of features and kept views: rows of features and rows of views, each at most once."""
         turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T[:3, :3]
         expected = self._rig.left.project((_rays(self._rig, views.uv_last)[:, None, :] @ turn)[:, 0])
+        # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
         found = match_in_boxes(
-            expected, _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
+            expected, 2 * _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
         )  # fmt: skip
+        gap = np.abs(features.uv_left[found.features] - expected[found.landmarks])
+        found = found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
         return found.features, found.landmarks

@@ -177,15 +177,10 @@ class LoopCloser:
         return replace(features, uv_left=r.rectify_left(features.uv_left), uv_right=r.rectify_right(features.uv_right))
 
     def _is_keyframe(self, atlas: Atlas, step: Step) -> bool:
-        """Whether the view differs enough from the last keyframe's, or a loop waits for confirmation.
-
-        By the path, or because most of what is measured was not seen then.
-        """
+        """Whether the view differs enough from the last keyframe's, or a loop waits for confirmation."""
         if len(atlas) == atlas.prior_count or self._in_doubt(atlas):
             return True
         last = atlas.keyframes[-1]
-        if 2 * np.isin(step.matches.ids, last.landmarks).sum() < len(step.matches):
-            return True
         X = self._rectified.T_left_rectified
         motion = inverse(X) @ inverse(last.T_odom_left) @ step.estimate.T_world_left @ X
         return view_has_changed(last, motion, self._rig, self._config)
@@ -317,7 +312,7 @@ class LoopCloser:
         seen: Verified,
         rig: CommonError,
         path: Callable[[], Trajectory],
-        same_view: bool,
+        same_view: bool = False,
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop or refuse it; one that cannot be judged is refused."""
         try:

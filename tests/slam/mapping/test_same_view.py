@@ -29,7 +29,7 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
     mover.points = mover.points * (3, 0.8, 0.15) + (0, 0, 1.2)
     system = StereoSlam(RIG, None, backend, config=SystemConfig.for_kind("handheld", None, backend))
     results = []
-    for k in range(100):
+    for k in range(85):
         here, _ = world.features(np.eye(4), k / 30, 0.3)
         there, _ = mover.features(se3.exp(np.array([0, 0, 0, -0.04 * (k - 10), 0, 0])), k / 30, 0.3)
         edge = 14.0 * (k - 20)
@@ -37,8 +37,8 @@ def test_a_camera_that_something_large_took_along_comes_back(backend):
         results.append(system.process_features(joined(here, ~covered[0], there, covered[1])))
     off = [float(np.linalg.norm(r.estimate.T_world_left[:3, 3])) for r in results]
     assert max(off) > 0.3  # taken along: that it is, others see to
-    assert any(r.loop == 0 for r in results)
-    assert off[-1] < 0.1 * max(off)
+    assert max(off[k] for k, r in enumerate(results) if r.loop == 0) < 0.05
+    assert off[-1] < 0.2 * max(off)
 
 
 def test_covariances_of_the_path_between_are_inflated():
