@@ -341,7 +341,7 @@ class LoopCloser:
         common = None if atlas.solved is None else atlas.solved.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
         limit, off = self._config.gate_sigmas**2, disagreement(graph, loop)
-        if off > limit and not same_view:
+        if off > limit and not (same_view and np.isfinite(off)):
             return self._refuse(atlas, chain, loop, seen, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
