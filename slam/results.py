@@ -88,5 +88,8 @@ def frame_status(step: Step, added: int, mapped_before: bool) -> tuple[FrameStat
         return FrameStatus.TRACKED, ""
     if not mapped_before:
         return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
-    reason = step.report.reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"
+    reason = step.report.reason
+    if step.matches.doubted:
+        reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"
+    reason = reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"
     return (FrameStatus.LOST if step.state.lost else FrameStatus.PREDICTED), reason

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import SlamError
+from slam.grey_range import eight_bits
 
 _SIZE = 150  # of a picture [px]
 _MOST_POINTS = 400  # of a drawn path
@@ -69,8 +70,7 @@ def image_html(image: NDArray | None) -> str:
     if image is None:
         return ""
     small = cv2.resize(image, None, fx=_SIZE / len(image), fy=_SIZE / len(image), interpolation=cv2.INTER_AREA)
-    small = (small >> 8).astype(np.uint8) if small.dtype == np.uint16 else small
-    done, png = cv2.imencode(".png", small)
+    done, png = cv2.imencode(".png", eight_bits(small))
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}">' if done else ""
 
 

@@ -13,6 +13,7 @@ _HALF = 4  # fixed: half width of the compared patches [half-resolution px]; the
 _SIDE = 2 * _HALF + 1
 _FLAT = 2.0  # least standard deviation of a patch [grey levels of 8-bit images]
 _LANES = 16  # cost: columns are searched in whole vector registers
+_CONTENDER = 0.5  # cost: correlation of a column below which the places beside it are no rivals
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
@@ -26,12 +27,14 @@ class HalfImage:
             or leaves the image.
         flat_pixels: these by rows in one line, and as many zeros behind them as `_correlate` reads.
         flat_weight: likewise.
+        between: grey values by rows in one line, half a column further to the right.
     """
 
     pixels: NDArray[np.float32]
     weight: NDArray[np.float32]
     flat_pixels: NDArray[np.float32]
     flat_weight: NDArray[np.float32]
+    between: NDArray[np.float32]
 
 
 def half_image(image: NDArray, full_scale: float) -> HalfImage:
@@ -44,7 +47,9 @@ def half_image(image: NDArray, full_scale: float) -> HalfImage:
     pixels, weight = flat_pixels[: small.size].reshape(small.shape), flat_weight[: small.size].reshape(small.shape)
     np.multiply(small, np.float32(255.0 / full_scale), out=pixels)
     _weigh(pixels, weight, np.empty(pixels.shape[1], np.float32), np.empty(pixels.shape[1], np.float32))
-    return HalfImage(pixels, weight, flat_pixels, flat_weight)
+    between = cv2.resize(np.roll(image, -1, axis=1), small.shape[::-1], interpolation=cv2.INTER_AREA)
+    between = between.reshape(-1) * np.float32(255.0 / full_scale)
+    return HalfImage(pixels, weight, flat_pixels, flat_weight, between)
 
 
 @kernel
@@ -141,26 +146,89 @@ def _place_of(scores, value):
     return j
 
 
-@helper
-def _search(pixels, weights, stride, rows, band, y, first, last, patch, own, scores, rivals):
-    """Best place of a patch in columns first..last of the rows within `band` of y: x, y, score and rival's score.
+@vector_helper
+def _height(pixels, weights, between, stride, y, x, patch, own, score, side):
+    """Best correlation of a patch with the places from column x, where it is `score`, to half a column to a side.
 
-    Rivals are looked for only if `rivals`.
+    Linear interpolation between two patches, that correlate by `alike` with each other and by s and n with a third,
+    correlates with that by the root of ``(s² - 2 alike s n + n²) / (1 - alike²)`` at best, if that lies between them.
+    """
+    zero, one, area = np.float32(0.0), np.float32(1.0), np.float32(_SIDE * _SIDE)
+    sa, sb, bb, ab, product = zero, zero, zero, zero, zero
+    for r in range(_SIDE):
+        start = np.uint64((y - _HALF + r) * stride + x - _HALF)
+        beside = np.uint64((y - _HALF + r) * stride + x - _HALF + (side - 1) // 2)
+        for c in range(_SIDE):
+            a, b = pixels[start + np.uint64(c)], between[beside + np.uint64(c)]
+            sa += a
+            sb += b
+            bb += b * b
+            ab += a * b
+            product += patch[r, c] * b
+    spread = bb - sb * sb / area
+    if not spread > area * np.float32(_FLAT * _FLAT):
+        return score
+    weight = one / np.sqrt(spread)
+    n, alike = product * own * weight, (ab - sa * sb / area) * weight * weights[np.uint64(y * stride + x)]
+    largest = max(score, n)
+    if min(score, n) > alike * largest and alike * alike < one:
+        largest = np.sqrt((score * score - np.float32(2.0) * alike * score * n + n * n) / (one - alike * alike))
+    return min(largest, one)
+
+
+@vector_helper
+def _unresolved(pixels, between, stride, x, y):
+    """How much too low a height may be by noise, and by linear interpolation between places half a column apart.
+
+    It is half of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained,
+    over 4: a share that falls with the fourth power of the distance in smooth images, and more slowly in coarse ones.
+    """
+    s, ss, ee = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for r in range(_SIDE):
+        start = np.uint64((y - _HALF + r) * stride + x - _HALF)
+        for c in range(_SIDE - 1):
+            k = start + np.uint64(c)
+            v = between[k]
+            e = v - np.float32(0.5) * (pixels[k] + pixels[k + np.uint64(1)])
+            s += v
+            ss += v * v
+            ee += e * e
+    spread = ss - s * s / np.float32(_SIDE * (_SIDE - 1))
+    return ee / np.float32(8.0) / max(spread, np.float32(1e-3))
+
+
+@helper
+def _search(pixels, weights, between, stride, rows, band, y, first, last, patch, own, scores):
+    """Best place of a patch in columns first..last of the rows within `band` of y: x, y and correlation.
+
+    And the heights of it and of its rival, the correlations with the best places between columns, by which they are
+    compared: a wrong place of a repeated pattern that happens to lie on a whole column looks better than the true one
+    that does not.
     """
     begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
-    found, row, score, rival = -1, -1, np.float32(-1.0), np.float32(-1.0)
+    found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
         _correlate(pixels, weights, stride, v, first, count, patch, own, scores)
-        best = _largest(scores, begin, count)
+        best, better = _largest(scores, begin, count), False
         if best > score:
+            better = True
             place = first + _place_of(scores, best)
             if abs(place - found) > _NEIGHBOURS:
-                rival = max(rival, score)
+                rival = max(rival, height)
             found, row, score = place, v, best
-        if rivals:
-            rival = max(rival, _largest(scores, begin, min(found - first - _NEIGHBOURS, count)))
-            rival = max(rival, _largest(scores, max(found - first + _NEIGHBOURS + 1, begin), count))
-    return found, row, score, rival
+        for j in range(count):
+            s = scores[j]
+            before, after = scores[j - 1] if j > 0 else s, scores[j + 1] if j < count - 1 else s
+            apart, itself = abs(first + j - found) > _NEIGHBOURS, better and first + j == found
+            if not itself and (not apart or s < _CONTENDER or s < before or s < after):
+                continue
+            side = 1 if after >= before or first + j == _HALF else -1
+            top = _height(pixels, weights, between, stride, v, first + j, patch, own, s, side)
+            if itself:
+                height = top
+            else:
+                rival = max(rival, top)
+    return found, row, score, height, rival
 
 
 def search_rows(
@@ -176,7 +244,7 @@ def search_rows(
     """Right positions (N, 2) of left features to a pixel or two, by correlation along rows; NaN where there is none.
 
     A place counts where it correlates with at least `min_correlation`, clearly better than any rival, and where
-    the search back from it, in the left image, ends within a pixel of where it began.
+    the search back from it, in the left image, does so too and ends within a pixel of where it began.
 
     Args:
         left: the rectified left image at half resolution.
@@ -191,8 +259,8 @@ def search_rows(
     out = np.full((len(uv), 2), np.nan)
     patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1] + _LANES, np.float32)
     _search_rows(
-        left.pixels, left.weight, left.flat_pixels, left.flat_weight, right.pixels, right.weight, right.flat_pixels,
-        right.flat_weight, uv, 0.5 * low, 0.5 * high, band, min_correlation,
+        left.pixels, left.weight, left.flat_pixels, left.flat_weight, left.between, right.pixels, right.weight,
+        right.flat_pixels, right.flat_weight, right.between, uv, 0.5 * low, 0.5 * high, band, min_correlation,
         uniqueness, patch, scores, out,
     )  # fmt: skip
     return out
@@ -200,8 +268,8 @@ def search_rows(
 
 @kernel
 def _search_rows(
-    left, left_weight, a, aw, right, right_weight, b, bw, uv, low, high, band, min_correlation, uniqueness, patch,
-    scores, out,
+    left, left_weight, a, aw, a_between, right, right_weight, b, bw, b_between, uv, low, high, band, min_correlation,
+    uniqueness, patch, scores, out,
 ):  # fmt: skip
     """The same into `out`, at half resolution, with the images flat as well, and with work space."""
     height, width = left.shape
@@ -213,22 +281,23 @@ def _search_rows(
         found, row = x, y
         for back in range(2):  # to the right image, and from there to the left one again
             if back:
-                image, own, pixels, weights = right, right_weight[row, found], a, aw
+                image, own, pixels, weights, between = right, right_weight[row, found], a, aw, a_between
+                unresolved = _unresolved(b, b_between, width, found, row)
                 from_, to = np.floor(found + low), np.ceil(found + high)
             else:
-                image, own, pixels, weights = left, left_weight[row, found], b, bw
+                image, own, pixels, weights, between = left, left_weight[row, found], b, bw, b_between
+                unresolved = _unresolved(a, a_between, width, found, row)
                 from_, to = np.floor(found - high), np.ceil(found - low)
             first, last = max(_HALF, int(from_)), min(width - 1 - _HALF, int(to))
             if last <= first and not back:
                 break
             _zero_mean_patch(image, found, row, patch)
-            place, line, score, rival = _search(
-                pixels, weights, width, height, band, row, first, last, patch, own, scores, not back
+            place, line, score, best, rival = _search(
+                pixels, weights, between, width, height, band, row, first, last, patch, own, scores
             )
-            if back:
-                if abs(place - x) <= 1:
-                    out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5
-            elif score < min_correlation or 1.0 - score > uniqueness * (1.0 - rival):
+            if score < min_correlation or 1.0 - best > uniqueness * (1.0 - rival - unresolved):
                 break
-            else:
+            if not back:
                 found, row = place, line
+            elif abs(place - x) <= 1:
+                out[i, 0], out[i, 1] = 2.0 * (found + px - x) + 0.5, 2.0 * (row + py - y) + 0.5

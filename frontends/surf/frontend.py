@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from frontends.surf.config import SurfConfig
 from frontends.surf.correlation import align_patches, cut_patches, patch_windows, refine
 from frontends.surf.epipolar import HalfImage, half_image, search_rows
-from frontends.surf.images import FULL_SCALE, grey
+from frontends.surf.images import FullScale, grey
 from frontends.surf.integral import integral_image
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.selection import adapted_threshold, spread
@@ -31,11 +31,12 @@ _OWN_BAND = 1.5  # rows [px] that the search reaches without looking into neighb
 
 
 class _View(NamedTuple):
-    """A rectified image: as it came, as float32, and at half resolution if it is one of two."""
+    """A rectified image: as it came, as float32, and at half resolution if it is one of two; what counts as white."""
 
     grey: NDArray
     pixels: NDArray[np.float32]
     half: HalfImage | None
+    white: float
 
 
 class SurfFrontend:
@@ -60,6 +61,7 @@ class SurfFrontend:
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
         self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
+        self._white = FullScale()
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
 
@@ -78,9 +80,11 @@ class SurfFrontend:
         if not isinstance(frame, StereoFrame):
             raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
-        views = self._surf.workers.run([partial(self._view, frame, image, k) for k, image in enumerate(given)])
+        given = [self._checked(frame, image, side) for side, image in enumerate(given)]
+        white, paired = self._white.of(given[0]), len(given) > 1
+        views = self._surf.workers.run([partial(self._view, image, k, white, paired) for k, image in enumerate(given)])
         integral = integral_image(views[0].grey)
-        keypoints, threshold = self._keypoints(views[0].grey, integral)
+        keypoints, threshold = self._keypoints(views[0], integral)
         describe = self._surf.describer(integral, keypoints)
         images = ImagePair(views[0].pixels, None if frame.right is None else views[1].pixels)
 
@@ -110,8 +114,8 @@ class SurfFrontend:
         start = np.column_stack([uv_right[:, 0] + left[:, 0] - uv_left[:, 0], left[:, 1]])
         return left, self._refine(images, left, size, start)
 
-    def _view(self, frame: StereoFrame, image: NDArray, side: int) -> _View:
-        """What is needed of the rectified image of the left (0) or right (1) camera."""
+    def _checked(self, frame: StereoFrame, image: NDArray, side: int) -> NDArray:
+        """The image of the left (0) or right (1) camera in grey."""
         what = f"frame {frame.index}, {('left', 'right')[side]} image"
         image = grey(image, what)
         if image.shape != (self.rig.height, self.rig.width):
@@ -119,9 +123,12 @@ class SurfFrontend:
                 f"{what}: {image.shape[1]}x{image.shape[0]} pixels, "
                 f"but the calibration is for {self.rig.width}x{self.rig.height}"
             )
+        return image
+
+    def _view(self, image: NDArray, side: int, white: float, paired: bool) -> _View:
+        """What is needed of the rectified image of the left (0) or right (1) camera."""
         image = self._rectify(image, side)
-        half = None if frame.right is None else half_image(image, FULL_SCALE[image.dtype])
-        return _View(image, image.astype(np.float32), half)
+        return _View(image, image.astype(np.float32), half_image(image, white) if paired else None, white)
 
     def _rectify(self, image: NDArray, side: int) -> NDArray:
         """Image of the rectified rig's left (0) or right (1) camera."""
@@ -139,7 +146,7 @@ class SurfFrontend:
             raise ConfigurationError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
         return (self._rectify((mask != 0).astype(np.uint8), 0) != 0).astype(np.uint8)
 
-    def _detect(self, image: NDArray, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+    def _detect(self, white: float, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
         """Features, and the D_threshold that found them (paper A, III.A).
 
         It was adapted after the last image. Should it still find less than half of what is wanted, as in the first
@@ -149,19 +156,19 @@ class SurfFrontend:
         target = int((_CHOICE if c.localise else 1.0) * _SURPLUS * c.features)
         for _ in range(_TRIES):
             threshold = self._threshold
-            keypoints = self._surf.detect_in(integral, FULL_SCALE[image.dtype], self._mask, threshold)
+            keypoints = self._surf.detect_in(integral, white, self._mask, threshold)
             if c.adaptive:
                 self._threshold = adapted_threshold(threshold, len(keypoints), target, c.min_threshold, c.max_threshold)
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
                 break
         return keypoints, threshold
 
-    def _keypoints(self, image: NDArray, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
+    def _keypoints(self, view: _View, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
         """Features of the left image, spread over it, and the D_threshold that found them."""
-        keypoints, threshold = self._detect(image, integral)
+        keypoints, threshold = self._detect(view.white, integral)
         if self.config.localise:
             keypoints = self._spread(keypoints, int(_CHOICE * self.config.features))
-            keypoints = self._surf.localise_in(image, keypoints)
+            keypoints = self._surf.localise_in(view.grey, keypoints, view.white)
         return self._spread(keypoints, self.config.features), threshold
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:

@@ -94,7 +94,8 @@ class Surf:
         Raises:
             SequenceError: the image is unusable.
         """
-        return self.localise_in(grey(image), keypoints)
+        image = grey(image)
+        return self.localise_in(image, keypoints, FULL_SCALE[image.dtype])
 
     def describe(self, image: NDArray, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.float32]]:
         """Orient (unless upright) and describe features; those that cannot be oriented are left out.
@@ -190,7 +191,7 @@ class Surf:
             rows = rows[_mostly_inside(rows, mask)]
         return _as_keypoints(rows[np.argsort(-rows[:, 3], kind="stable")])
 
-    def localise_in(self, image: NDArray, keypoints: Keypoints) -> Keypoints:
+    def localise_in(self, image: NDArray, keypoints: Keypoints, full_scale: float) -> Keypoints:
         """`localise` in an image as `grey` gives it; of several features that share a maximum one stays."""
         if not len(keypoints):
             return keypoints
@@ -202,7 +203,7 @@ class Surf:
         )
         rows = np.flatnonzero(np.isfinite(place[:, 0]))
         place = place[rows]
-        response = place[:, 3] * (255.0 / FULL_SCALE[image.dtype]) ** 2
+        response = place[:, 3] * (255.0 / full_scale) ** 2
         order = np.argsort(-response, kind="stable")
         place, rows, response = place[order], rows[order], response[order]
         x, y, size = np.ascontiguousarray(place[:, :3].T)

@@ -18,7 +18,7 @@ from slam.geometry.se3 import Array, exp, inverse
 MINIMAL_POINTS = 3
 
 _REFINEMENTS = 3  # numerics: Gauss-Newton steps on each minimal set
-_CLEAR_MAJORITY = 0.7  # share of the matches that agree with the guess at which no other pose is tried
+CLEAR_MAJORITY = 0.7  #: share of the matches that agree with the guess at which no other pose is tried
 _POLISHING_ROUNDS = 5  # numerics: of least squares on what agrees, at most
 STEPS = 10  #: numerics: of Gauss-Newton at most, from the last pose; it converges quadratically
 _BATCH = 50  # cost: hypotheses tried at once
@@ -52,7 +52,7 @@ def find_consensus(
 
     The guess is tried first, refined on what agrees with it, then on what disagrees with it least, and is enough where
     a clear majority agrees. Other hypotheses are rigid fits of three triangulated points, refined on their reprojection
-    errors.
+    errors; where most matches have no right pixel, poses from three left pixels (P3P).
 
     Args:
         rig: the cameras.
@@ -63,17 +63,16 @@ def find_consensus(
         hypotheses: how many minimal sets are tried.
         seed: of the random choice.
     """
-    clear = _CLEAR_MAJORITY * len(points)
+    clear = CLEAR_MAJORITY * len(points)
     first = _polish(rig, points, measured, inverse(guess), threshold)
     if first.inliers.sum() >= clear:
         return first
     nearer = _polish(rig, points, measured, _approach(rig, points, measured, inverse(guess)), threshold)
     if nearer.inliers.sum() >= max(clear, float(first.inliers.sum())):
         return nearer
-    stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
-    if len(stereo) < MINIMAL_POINTS:
+    if len(points) < MINIMAL_POINTS:
         return first
-    T_left_world = _best_hypothesis(rig, points, measured, stereo, threshold, hypotheses, seed)
+    T_left_world = _best_hypothesis(rig, points, measured, threshold, hypotheses, seed)
     if T_left_world is None:
         return first
     best = _polish(rig, points, measured, T_left_world, threshold)
@@ -81,22 +80,24 @@ def find_consensus(
 
 
 def _best_hypothesis(
-    rig: StereoRig,
-    points: Array,
-    measured: Array,
-    stereo: NDArray[np.intp],
-    threshold: float,
-    hypotheses: int,
-    seed: int,
+    rig: StereoRig, points: Array, measured: Array, threshold: float, hypotheses: int, seed: int
 ) -> Array | None:
-    """The pose T_left_world (4, 4) from three stereo matches with which most matches agree; None where there is none.
+    """The pose T_left_world (4, 4) from three matches with which most matches agree; None where there is none.
 
     Stops before all hypotheses are tried where a better one is improbable (one in a hundred).
     """
     rng = np.random.default_rng(seed)
     best, most, tried = None, 0, 0
+    stereo = np.flatnonzero(np.isfinite(measured).all(axis=1))
+    in_stereo = len(stereo) >= max(MINIMAL_POINTS, 0.5 * len(points))
+    among = stereo if in_stereo else np.flatnonzero(np.isfinite(measured[:, :2]).all(axis=1))
+    if len(among) < MINIMAL_POINTS:
+        return None
+    minimal_poses = _minimal_poses if in_stereo else _left_poses
     while tried < hypotheses:
-        poses = _minimal_poses(rig, points, measured, stereo, min(_BATCH, hypotheses - tried), rng)
+        count = min(_BATCH, hypotheses - tried)
+        triples = among[rng.random((count, len(among))).argsort(axis=1)[:, :MINIMAL_POINTS]]
+        poses = minimal_poses(rig, points, measured, triples)
         tried += _BATCH
         if not len(poses):
             continue
@@ -164,11 +165,8 @@ def _refined(
     return T
 
 
-def _minimal_poses(
-    rig: StereoRig, points: Array, measured: Array, stereo: NDArray[np.intp], count: int, rng: np.random.Generator
-) -> Array:
-    """Poses T_left_world (H, 4, 4) from random triples of stereo matches."""
-    triples = stereo[rng.random((count, len(stereo))).argsort(axis=1)[:, :MINIMAL_POINTS]]
+def _minimal_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray[np.intp]) -> Array:
+    """Poses T_left_world (H, 4, 4) from triples (K, 3) of stereo matches."""
     uv_right = np.stack([measured[:, 2], measured[:, 1]], axis=1)
     local = rig.triangulate(measured[:, :2], uv_right)
     good = np.isfinite(local[triples]).all(axis=(1, 2))
@@ -178,6 +176,22 @@ def _minimal_poses(
     poses = rigid_fit(points[triples], local[triples])
     poses = _refined(rig, points, measured, triples, poses, _REFINEMENTS)
     return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def _left_poses(rig: StereoRig, points: Array, measured: Array, triples: NDArray[np.intp]) -> Array:
+    """Poses T_left_world (H, 4, 4) from the left pixels of triples (K, 3) of matches: up to four of each (P3P)."""
+    import cv2
+
+    bearings = rig.left.normalise(measured[:, :2])
+    poses = []
+    for three in triples:
+        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
+        for turn, shift in zip(turns, shifts):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            poses.append(T)
+    found = np.array(poses).reshape(-1, 4, 4)
+    return found[np.isfinite(found).all(axis=(1, 2))]
 
 
 def rigid_fit(source: Array, target: Array) -> Array:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.landmarks import LandmarkTable
-from slam.tracking.association import match_everywhere, match_in_boxes, pairs_in_boxes
-from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.association import match_in_boxes, pairs_in_boxes
+from slam.tracking.localizer import LandmarkMatches
 from slam.tracking.visibility import MapView
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
@@ -272,52 +272,10 @@ class MonocularDepth:
         """Matches of features and kept views: rows of features and rows of views, each at most once."""
         turn = np.swapaxes(views.T_last[:, :3, :3], 1, 2) @ T[:3, :3]
         expected = self._rig.left.project((_rays(self._rig, views.uv_last)[:, None, :] @ turn)[:, 0])
+        # Of a repeated pattern a wrong one may be nearer than the right one, so twice as far away counts as a rival.
         found = match_in_boxes(
-            expected, _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
+            expected, 2 * _RADIUS, views.descriptors, views.laplacian, features, rows, _D_MATCH, _RATIO
         )  # fmt: skip
+        gap = np.abs(features.uv_left[found.features] - expected[found.landmarks])
+        found = found.select(np.flatnonzero((gap <= _RADIUS).all(axis=1)))
         return found.features, found.landmarks
-
-
-def find_pose(
-    rig: StereoRig,
-    landmarks: LandmarkTable,
-    positions: Array,
-    features: StereoFeatures,
-    localizer: Localizer,
-    seed: int,
-) -> Array | None:
-    """The camera's pose (4, 4) in a map from left pixels alone, by P3P and RANSAC.
-
-    Args:
-        rig: the cameras.
-        landmarks: the map (N rows).
-        positions: of its landmarks (N, 3) [m].
-        features: of the frame.
-        localizer: whose settings are used.
-        seed: of the random choice of points.
-
-    Returns:
-        the pose, or None where too few landmarks agree on one.
-    """
-    import cv2
-
-    config = localizer.config
-    matches = match_everywhere(landmarks.descriptors, landmarks.laplacian, features, config)
-    if len(matches) < config.minimum_consistent:
-        return None
-    points, uv = positions[matches.landmarks], features.uv_left[matches.features]
-    bearings = rig.left.normalise(uv)
-    rng = np.random.default_rng(seed)
-    poses = []
-    for _ in range(config.wide_hypotheses):
-        three = rng.choice(len(points), 3, replace=False)
-        _, turns, shifts = cv2.solveP3P(points[three], bearings[three], np.eye(3), None, cv2.SOLVEPNP_P3P)
-        for turn, shift in zip(turns, shifts):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            poses.append(T)
-    threshold = config.consistency_sigmas * localizer.pixel_sigma
-    support = [int((np.abs(rig.left.project(transform(T, points)) - uv) < threshold).all(axis=1).sum()) for T in poses]
-    if not poses or max(support) < config.minimum_consistent:
-        return None
-    return inverse(poses[int(np.argmax(support))])

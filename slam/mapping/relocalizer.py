@@ -162,15 +162,7 @@ class MapSearch:
             SlamError: the descriptors have another length than the map's.
         """
         self.known.require_fits("", features.descriptors.shape[1])
-        guess = self._guess
-        if not features.has_stereo.any():
-            from slam.mapping.monocular import find_pose
-
-            found = find_pose(self._rig, self.known.rows, self.known.positions, features, self._localizer, seed)
-            if found is None:
-                return None
-            guess = found
-        prediction = nowhere(features.stamp, guess)
+        prediction = nowhere(features.stamp, self._guess)
         matches = self._localizer.match(prediction, self.known.rows, self.known.positions, features, seed)
         return matches.T_world_left if len(matches) >= self._localizer.config.minimum_consistent else None
 

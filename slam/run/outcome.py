@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, log
 from slam.models import MotionModel
@@ -20,6 +21,8 @@ _TRACKED = "tracked"
 #: The median over the recordings and worlds at hand is .02 to .4; of times ten times too short it is 30 times as large.
 _JERKY = 3.0
 _LEAST_CHANGES = 10  # guard: changes of velocity of which a median is taken
+
+_ASIDE = 1.0  # guard: speed [m/s] at which no vehicle goes sideways
 
 _MANY = 0.1  # guard: share of frames that were not tracked, from which on it is said
 
@@ -51,7 +54,7 @@ def outcome(
         return ""
     first = warnings[0] if warnings else _cause(record, untracked, rig, in_map) or doubt
     if not first and dropped < frames:  # where most came, the gaps are hardly all of it
-        first = _any_cause(driving)
+        first = _any_cause(record, rig, driving)
     causes = [first] if first else []
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
@@ -71,21 +74,51 @@ def _how_many(tracked: int, frames: int) -> str:
     return f"{frames - tracked} of {frames} frames {'was' if frames - tracked == 1 else 'were'} not tracked"
 
 
-def _any_cause(driving: bool) -> str:
-    """What may be the cause where each step gave enough."""
+def _any_cause(record: RunRecord, rig: StereoRig, driving: bool) -> str:
+    """What may be the cause where each step gave enough, with what is known."""
     kind = "" if driving else "a vehicle's camera without --kind driving, "
+    depths = np.array(record.depths)[np.isfinite(record.depths)]
+    seen = f" and what they see is {_rounded(float(np.median(depths)))} m away in the median" if len(depths) else ""
     return (
-        f"features are found in both images, but not again in the next frame: {kind}frames too far apart, images that "
-        "are not in order of time or have other times than theirs (fps=…, times=…), or the calibration of another "
-        "camera"
+        f"features are found in both images, but not again in the next frame: {kind}frames too far apart"
+        f"{_speed(record)}, images that are not in order of time or have other times than theirs (fps=…, times=…), or "
+        f"the calibration of another camera or in another unit: by it the cameras are {rig.baseline:.3g} m apart{seen}"
     )
 
 
+def _rounded(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _speed(record: RunRecord) -> str:
+    """How fast the camera was where two successive frames were tracked; empty where there are none."""
+    measured = np.array(record.measured, bool)
+    both = measured[1:] & measured[:-1]
+    if not both.any():
+        return ""
+    poses = np.array(record.poses).reshape(-1, 4, 4)
+    moved = log(inverse(poses[:-1]) @ poses[1:])[both] / np.diff(record.stamps)[both, None]
+    turn, way = np.linalg.norm(moved[:, :3], axis=1).max(), np.linalg.norm(moved[:, 3:], axis=1).max()
+    fastest = f"{_rounded(way)} m/s and turned at up to {_rounded(np.degrees(turn))}°/s"
+    return f" (where it was tracked the camera moved at up to {fastest})"
+
+
+def median_depth(features: StereoFeatures, rig: StereoRig) -> float:
+    """Depth [m] of the feature with the median disparity; NaN where none has a right pixel."""
+    stereo = np.flatnonzero(features.has_stereo)
+    if not len(stereo):
+        return float("nan")
+    left, right = features.uv_left[stereo], features.uv_right[stereo]
+    middle = [np.argsort(left[:, 0] - right[:, 0], kind="stable")[len(stereo) // 2]]
+    return float(rig.triangulate(left[middle], right[middle])[0, 2])
+
+
 def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) -> str:
-    """What to say where velocities change from frame to frame far more than the motion model lets them; else empty.
+    """What to say where velocities change far more than the motion model lets them, or a vehicle goes sideways.
 
     Times in another unit or of another rate do so, and a vehicle that is taken for a camera in a hand, unless the
-    motion is known to be that of a vehicle.
+    motion is known to be that of a vehicle. Empty where the motion is as expected.
     """
     measured = np.array(record.measured, bool)
     stamps, poses = np.array(record.stamps), np.array(record.poses).reshape(-1, 4, 4)
@@ -99,6 +132,15 @@ def motion_doubt(record: RunRecord, motion: MotionModel, driving: bool = False) 
     counted = changes[measured[2:] & measured[1:-1] & measured[:-2]]
     if len(counted) < _LEAST_CHANGES:
         return ""
+    if driving:
+        along = np.abs(velocities[measured[1:] & measured[:-1], 3:])
+        aside = along[(along[:, 0] > _ASIDE) & (along[:, 0] > along[:, 2]), 0]
+        if len(aside) >= _LEAST_CHANGES:
+            return (
+                f"in {len(aside)} frames the camera moved sideways, at {_rounded(float(np.median(aside)))} m/s in the "
+                "median, which no vehicle does: unless the camera looks to the side, something large that moved past "
+                "was taken for the world"
+            )
     ratio = float(np.median(np.sqrt((counted**2).reshape(-1, 2, 3).mean(2)).max(1)))
     if not ratio >= _JERKY:  # also where it is no number
         return ""
@@ -121,9 +163,25 @@ def _cause(record: RunRecord, untracked: Sequence[int], rig: StereoRig, in_map: 
         return f"the images show hardly anything to follow ({features:.0f} features in the median of these frames)"
     if in_map:
         return "the camera is not where the map was made, or the place looks different now"
+    missing = _by_missing_images(record, untracked)
+    if 2 * missing > len(untracked):
+        return (
+            f"{missing} of these {len(untracked)} frames have no right image or follow such, and nothing new can be "
+            "added to the map there: look for the missing images, and whether their names or times are the left ones'"
+        )
     if stereo < ENOUGH_FEATURES:
         return (
             f"in the median of these frames {stereo:.0f} of {features:.0f} features are found in the right image: "
             "check that the images are of two cameras, the left one first, and the calibration"
         )
     return baseline_doubt(rig)
+
+
+def _by_missing_images(record: RunRecord, untracked: Sequence[int]) -> int:
+    """Number of untracked frames that have no right image, or follow such without a tracked one between."""
+    without, count = set(record.without_right), 0
+    for row in untracked:  # ascending
+        if row in without or row - 1 in without:
+            without.add(row)
+            count += 1
+    return count

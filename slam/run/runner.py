@@ -23,7 +23,7 @@ from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.outputs import Output, require_outputs
 from slam.run.last_files import LastFiles
-from slam.run.outcome import motion_doubt, outcome
+from slam.run.outcome import median_depth, motion_doubt, outcome
 from slam.run.outputs import NAMES, RunFiles
 from slam.run.recorded import RecordedFrame, Recording
 from slam.run.recording import save_recording
@@ -278,6 +278,9 @@ def _processed(
         result.milliseconds["read"] = reading.milliseconds.pop(frame.index)  # type: ignore[index]
         if reading.live is not None:
             record.ages.append(reading.live.age(frame))
+        if frame.right is None:
+            record.without_right.append(len(record.statuses))
+        record.depths.append(median_depth(result.features, system.rig))
         yield frame.index, result
         for watch in watches:
             watch(frame, result, system)

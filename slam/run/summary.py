@@ -41,6 +41,8 @@ class RunRecord:
     compiled_before: float = field(default_factory=compile_clock.seconds)  # [s]
     ages: list[float] = field(default_factory=list)  # of frames of a live run when they are done [s]
     features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
+    without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
+    depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back

@@ -9,9 +9,10 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, MeasurementError
 from slam.geometry.rig import StereoRig
+from slam.grey_range import eight_bits, grey_range
 from slam.models import EstimatorModels
 from slam.tracking.feature_check import usable
-from slam.tracking.pair_check import NO_DISPARITY, pair_geometry
+from slam.tracking.pair_check import NO_DISPARITY, PairGeometry, most, pair_geometry
 from slam.tracking.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
@@ -28,7 +29,8 @@ _OFF_MIDDLE = 0.2
 
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
-_LAST_LOOK = 64  # guard: last frame at which the stereo pair is checked
+_LAST_LOOK = 1024  # guard: last frame at which the stereo pair is checked
+_ALIKE = 0.2  # guard: distance of descriptors of which there is hardly a pair in an image without repeated patterns
 _UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 
 
@@ -50,7 +52,9 @@ class InputWarnings:
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
         self._count = self._poor = self._unpaired = 0
-        self._pair_is_known = self._texture_is_known = self._partners_are_known = False
+        self._pair_is_known = self._texture_is_known = self._partners_are_known = self._moment_is_known = False
+        self._before: StereoFrame | None = None
+        self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
         for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig))):
             self._warn(unlikely)
 
@@ -67,12 +71,12 @@ class InputWarnings:
             if len(self._stamps) > _INTERVALS:
                 self._check_intervals(float(np.median(np.diff(self._stamps))))
         if not self._texture_is_known:
-            self._check_texture(len(features))
-        if not self._pair_is_known and frame.right is not None and _is_a_power_of_two(self._count):
-            self._check_pair(frame.left, frame.right)
+            self._check_texture(frame.left, len(features))
+        if _is_a_power_of_two(self._count) and self._count <= _LAST_LOOK:
+            self._check_pair(frame)
         if not self._partners_are_known and frame.right is not None:
-            self._check_partners(len(features), int(features.has_stereo.sum()))
-        self._pair_is_known |= self._count >= _LAST_LOOK
+            self._check_partners(features)
+        self._before = frame
         self._count += 1
 
     def _check_intervals(self, interval: float) -> None:
@@ -89,58 +93,126 @@ class InputWarnings:
                 f"the frame before; use {1 / self._farthest:.2g} frames per second or more"
             )
 
-    def _check_texture(self, features: int) -> None:
+    def _check_texture(self, image: np.ndarray, features: int) -> None:
         """Warn if images show nothing for several frames."""
         self._poor = self._poor + 1 if features < ENOUGH_FEATURES else 0
         if self._poor >= _POOR:
             self._texture_is_known = True
+            low, high = grey_range(image)
             self._warn(
-                f"the images show hardly anything to follow ({features} features in frame {self._count}): more light, "
-                "sharper focus, shorter exposure, or a view with more texture"
+                f"the images show hardly anything to follow ({features} features in frame {self._count}, grey values "
+                f"from {low:.0f} to {high:.0f} of {np.iinfo(image.dtype).max}): more light, sharper focus, shorter "
+                "exposure, or a view with more texture"
             )
 
-    def _check_partners(self, features: int, stereo: int) -> None:
+    def _check_partners(self, features: StereoFeatures) -> None:
         """Warn if hardly any left feature has a right match, for several frames."""
-        self._unpaired = self._unpaired + 1 if features >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
-        if self._unpaired >= _POOR:
-            self._partners_are_known = True
+        stereo = int(features.has_stereo.sum())
+        self._unpaired = self._unpaired + 1 if len(features) >= 2 * ENOUGH_FEATURES and stereo < ENOUGH_FEATURES else 0
+        if self._unpaired < _POOR:
+            return
+        self._partners_are_known = True
+        alike = look_alikes(features)
+        found = f"only {stereo} of {len(features)} features of frame {self._count} are found in the right image"
+        if 2 * alike > len(features):
             self._warn(
-                f"only {stereo} of {features} features of frame {self._count} are found in the right image: check that "
-                "the images are of two cameras at one moment, the left one first, and that the calibration is theirs"
+                f"{found}, because the view is a repeated pattern: {alike} of them have a look-alike in the same "
+                "image, so that which belong together cannot be told; let the view show other things too"
+            )
+        else:
+            self._warn(
+                f"{found}: check that the images are of two cameras at one moment, the left one first, and that the "
+                "calibration is theirs"
             )
 
-    def _check_pair(self, left: np.ndarray, right: np.ndarray) -> None:
-        """Warn if left and right image look swapped, or rows do not match."""
-        if not (_is_image(left, self._rig) and _is_image(right, self._rig)):
-            return  # the front end refuses such images, or has a format of its own
-        try:
-            found = pair_geometry(self._rig, _eight_bits(left), _eight_bits(right), self._rows)
-        except CalibrationError:  # the rig cannot be rectified: a front end may not need that
-            self._pair_is_known = True
+    def _check_pair(self, frame: StereoFrame) -> None:
+        """Warn if left and right image look swapped or the same, are of different moments, or rows do not match."""
+        if self._pair_is_known and self._moment_is_known:
             return
-        self._pair_is_known = found.conclusive
-        self._partners_are_known |= found.swapped or found.same or found.rows_differ  # the reason is known then
-        if found.swapped:
+        own = self._geometry(frame, frame)
+        if own is None:
+            return
+        if not self._pair_is_known and (own.swapped or own.same):
+            self._pair_is_known = self._moment_is_known = True
+            self._warn(_swapped(own) if own.swapped else _the_same(own, self._rig))
+        elif not self._moment_is_known and self._before is not None:
+            self._check_moment(frame, own)
+        self._partners_are_known |= self._pair_is_known and bool(self.lines)  # the reason is known then
+
+    def _check_moment(self, frame: StereoFrame, own: PairGeometry) -> None:
+        """Warn if left images fit the right ones of other frames, or else if rows do not match."""
+        assert self._before is not None
+        neighbours = self._geometry(self._before, frame), self._geometry(frame, self._before)
+        if neighbours[0] is not None and neighbours[1] is not None:
+            self._fits += [own.as_given, neighbours[0].as_given, neighbours[1].as_given]
+        fit, *others = self._fits.tolist()
+        if most(max(others), fit):
+            self._pair_is_known = self._moment_is_known = True
+            which, wrong = ("before", "late") if others[0] >= others[1] else ("after", "early")
             self._warn(
-                f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras "
-                f"when the images are exchanged, {found.as_given} as they are; exchange them "
-                "(left=…&right=… of a folder, swap=yes of a camera)"
+                f"left and right image are not of one moment: {max(others)} features fit the rig with the left image "
+                f"of the frame {which}, {fit} with that of the same frame; the right images are a frame too {wrong}: "
+                "pair them by their times, or shift their numbers by one"
             )
-        elif found.same:
-            horizon = self._rig.rectified.rig.left.fu * self._rig.baseline / NO_DISPARITY
-            self._warn(
-                f"left and right image show the same: {found.without_disparity} of {found.matches} features have no "
-                f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
-            )
-        elif found.rows_differ:
-            self._warn(
-                f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
-                f"{found.row_offset:.1f} px in the median; check that the calibration is this camera's, at this size"
-            )
+            return
+        self._moment_is_known = all(most(fit, other) for other in others)
+        if own.conclusive and not self._pair_is_known:
+            self._pair_is_known = True
+            if own.rows_differ:
+                self._warn(_rows_differ(own, self._rig))
+
+    def _geometry(self, left: StereoFrame, right: StereoFrame) -> PairGeometry | None:
+        """How one frame's left image fits another's right one; None where an image is missing or unusable."""
+        if not (_is_image(left.left, self._rig) and _is_image(right.right, self._rig)):
+            return None  # the front end refuses such images, or has a format of its own
+        try:
+            return pair_geometry(self._rig, _eight_bits(left.left), _eight_bits(np.asarray(right.right)), self._rows)
+        except CalibrationError:  # the rig cannot be rectified: a front end may not need that
+            self._pair_is_known = self._moment_is_known = True
+            return None
 
     def _warn(self, line: str) -> None:
         self.lines.append(line)
         logger.warning("%s", line)
+
+
+def look_alikes(features: StereoFeatures) -> int:
+    """How many features have nearly the same descriptor as another one elsewhere in the image."""
+    alike = features.descriptors @ features.descriptors.T > 1 - 0.5 * _ALIKE**2
+    apart = np.abs(features.uv_left[:, None] - features.uv_left[None]).max(axis=2) > features.scale[:, None]
+    return int((alike & apart).any(axis=1).sum())
+
+
+def _swapped(found: PairGeometry) -> str:
+    return (
+        f"left and right look swapped: {found.as_swapped} of {found.matches} features fit the cameras when the images "
+        f"are exchanged, {found.as_given} as they are; exchange them (left=…&right=… of a folder, swap=yes of a camera)"
+    )
+
+
+def _the_same(found: PairGeometry, rig: StereoRig) -> str:
+    horizon = rig.rectified.rig.left.fu * rig.baseline / NO_DISPARITY
+    return (
+        f"left and right image show the same: {found.without_disparity} of {found.matches} features have no "
+        f"disparity; this is one image twice, or nothing in view is nearer than {horizon:.0f} m"
+    )
+
+
+def _rows_differ(found: PairGeometry, rig: StereoRig) -> str:
+    """That rows do not agree, and the likely cause: images that were rectified twice, or never."""
+    if rig.is_rectified:
+        cause = "were the images rectified, as this calibration says (no distortion, no rotation)?"
+    elif 2 * found.raw_offset < found.row_offset:
+        cause = (
+            f"as they are they agree to {found.raw_offset:.1f} px: they were rectified before, and the calibration "
+            "rectifies them again; give the calibration after rectification"
+        )
+    else:
+        cause = "check that the calibration is this camera's, at this size"
+    return (
+        f"rows of left and right image do not agree: {found.off_rows} of {found.matches} features are off by "
+        f"{found.row_offset:.1f} px in the median; {cause}"
+    )
 
 
 def baseline_doubt(rig: StereoRig) -> str:
@@ -192,4 +264,4 @@ def _eight_bits(image: np.ndarray) -> np.ndarray:
 
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] == 1 else np.asarray(cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY))
-    return np.ascontiguousarray(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
+    return np.ascontiguousarray(eight_bits(image))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Observations, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import isin, median
-from slam.geometry.pnp import MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
+from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
 from slam.landmarks import LandmarkTable
@@ -23,6 +23,8 @@ from slam.tracking.hypotheses import PoseHypotheses
 from slam.tracking.informative import most_informative
 from slam.tracking.state import TrackingState
 from slam.tracking.visibility import similar_view
+
+_MOST = 0.5  # fixed: share of what is in view that makes a majority
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +37,14 @@ class LandmarkMatches:
         T_world_left: the pose (4, 4) on which they agree, if there is one.
         kidnapped: the prediction's uncertainty does not allow that pose, but several frames agree on it: the camera was
             moved while it saw nothing.
+        doubted: number of landmarks that agree on a pose which is too far from the prediction to be believed yet.
     """
 
     ids: IdArray
     rows: NDArray[np.intp]
     T_world_left: Array | None = None
     kidnapped: bool = False
+    doubted: int = 0
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -48,7 +52,7 @@ class LandmarkMatches:
     def without(self, ids: IdArray) -> LandmarkMatches:
         """A copy without some landmarks."""
         keep = ~isin(self.ids, ids)
-        return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left)
+        return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left, doubted=self.doubted)
 
     def landmark_of(self, features: int) -> IdArray:
         """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
@@ -83,6 +87,7 @@ class Localizer:
         self._models = models
         self._lost_after = lost_after
         self._hypotheses = PoseHypotheses()
+        self._measured = PoseHypotheses()  # the last pose that was believed
 
     def forget(self) -> None:
         """Forget poses that await more frames: another map or another pose is believed now."""
@@ -98,27 +103,49 @@ class Localizer:
         seed: int,
         elsewhere: Callable[[], Array | None] = lambda: None,
     ) -> LandmarkMatches:
-        """`match`, but a pose farther from the prediction than its uncertainty allows needs several frames that agree.
+        """`match`, but a pose farther from the prediction than its uncertainty allows needs proof.
 
-        Until then nothing counts as matched; in the last of these frames the matches have a pose, no landmarks, and the
-        mark `kidnapped`. If nothing matches, the atlas is asked for a pose, which is treated likewise, but is accepted
-        at once if the prediction allows it and enough landmarks match around it.
+        Either most of what is in view from there agrees on it, and a camera may have moved so far since its last
+        measured pose; or several frames agree on it, wherever it is. Until then nothing counts as matched; in the last
+        of these frames the matches have a pose, no landmarks, and the mark `kidnapped`. If nothing matches, the atlas
+        is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
+        landmarks match around it.
         """
         doubtful = state.unmatched > 0
         matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
         T, farthest = matches.T_world_left, self.config.lost_jump if doubtful else self.config.max_jump
+        here = prediction, landmarks, positions, features, seed
         if T is None:
             T = elsewhere()
-            if T is not None and jump(prediction, T) <= farthest:
-                matches = self.match_around(T, prediction, landmarks, positions, features, seed)
-        if T is None or (len(matches) and jump(prediction, T) <= farthest):
-            self._hypotheses = PoseHypotheses()
+            if T is None:
+                self._hypotheses = PoseHypotheses()
+                return matches
+            if jump(prediction, T) <= farthest:
+                matches = self.match_around(T, *here)
+        allowed = jump(prediction, T) <= farthest
+        if not allowed and self._measured.after(T, features.stamp, self._models).count > 1:
+            around = self.match_around(T, *here)
+            allowed = self._most_agree(around, landmarks, positions, features)
+            matches = around if allowed else matches
+        if allowed and len(matches):
+            self._hypotheses, self._measured = PoseHypotheses(), PoseHypotheses(1, features.stamp, T)
             return matches
         self._hypotheses = self._hypotheses.after(T, features.stamp, self._models)
         if self._hypotheses.count < self.config.kidnapped_after:
-            return LandmarkMatches.nothing()
-        self._hypotheses = PoseHypotheses()
+            return replace(LandmarkMatches.nothing(), doubted=len(matches))
+        self._hypotheses, self._measured = PoseHypotheses(), PoseHypotheses(1, features.stamp, T)
         return replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+
+    def _most_agree(
+        self, matches: LandmarkMatches, landmarks: LandmarkTable, positions: Array, features: StereoFeatures
+    ) -> bool:
+        """Whether most of the landmarks in view from a pose agree on it, or of the features where these are fewer."""
+        if matches.T_world_left is None:
+            return False
+        view = self.rig.left.in_image(self.rig.left.project(transform(inverse(matches.T_world_left), positions)))
+        shown = view & self._looked_for(matches.T_world_left, landmarks, positions)
+        enough = max(_MOST * min(int(shown.sum()), len(features)), 2 * self.config.minimum_consistent)
+        return len(matches) >= enough
 
     def informative(
         self, prediction: Prediction, matches: LandmarkMatches, positions: Array, dt: float
@@ -191,7 +218,7 @@ class Localizer:
                 least = self.config.wide_share if doubtful else 0.0
             elif not tight:
                 return LandmarkMatches.nothing()
-        if not tight:
+        if not tight or consensus.inliers.sum() < CLEAR_MAJORITY * len(matches):
             expected = self._expected(consensus.T_world_left, prediction, landmarks, positions)
             matches, consensus = self._again(consensus, matches, expected, landmarks, positions, features, seed)
             if consensus.inliers.sum() < least * min(len(expected.ids), len(features)):

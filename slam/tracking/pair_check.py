@@ -17,6 +17,8 @@ from slam.geometry.se3 import Array
 _FEATURES = 1000  # guard: features of an image that are matched
 _TOLERANCE = 2.0  # guard: [px] from an epipolar line: ORB places features to a pixel or two
 
+_ROWS_AGREE = 1.0  # guard: [px] to which most rows of a rectified pair agree, at ORB's accuracy
+
 #: Disparities below this count as zero [px].
 NO_DISPARITY = _TOLERANCE
 
@@ -34,8 +36,9 @@ class PairGeometry:
         as_given: number of matches in the same row and with positive disparity, as they must be.
         as_swapped: likewise with left and right image exchanged.
         without_disparity: number of matches in the same row without disparity.
-        off_rows: number of matches whose rows differ by more than the front end allows.
+        off_rows: number of matches whose rows differ, by more than the front end finds reliably.
         row_offset: median difference of their rows [px].
+        raw_offset: the same of the images as they are, not rectified [px].
     """
 
     matches: int
@@ -45,21 +48,22 @@ class PairGeometry:
     without_disparity: int = 0
     off_rows: int = 0
     row_offset: float = 0.0
+    raw_offset: float = 0.0
 
     @property
     def swapped(self) -> bool:
         """The matches fit the rig far better with the images exchanged."""
-        return self.conclusive and _most(self.as_swapped, self.as_given)
+        return self.conclusive and most(self.as_swapped, self.as_given)
 
     @property
     def same(self) -> bool:
         """Most matches are at the same place in both images."""
-        return self.conclusive and _most(self.without_disparity, self.matches - self.without_disparity)
+        return self.conclusive and most(self.without_disparity, self.matches - self.without_disparity)
 
     @property
     def rows_differ(self) -> bool:
-        """The rows of most matches differ by more than the front end allows."""
-        return self.conclusive and _most(self.off_rows, self.matches - self.off_rows)
+        """The rows of most matches differ."""
+        return self.conclusive and most(self.off_rows, self.matches - self.off_rows)
 
 
 def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) -> PairGeometry:
@@ -90,8 +94,9 @@ def pair_geometry(rig: StereoRig, left: NDArray, right: NDArray, rows: float) ->
         int(((shift > _TOLERANCE) & (np.abs(offset) <= band)).sum()),
         int(((shift_swapped > _TOLERANCE) & (np.abs(offset_swapped) <= band)).sum()),
         int(((np.abs(shift) <= _TOLERANCE) & (np.abs(offset) <= band)).sum()),
-        int((np.abs(offset) > band).sum()),
+        int((np.abs(offset) > band - _TOLERANCE + _ROWS_AGREE).sum()),
         float(np.nanmedian(np.abs(offset))) if np.isfinite(offset).any() else 0.0,
+        float(np.median(np.abs(b[:, 1] - a[:, 1]))),
     )
 
 
@@ -108,7 +113,7 @@ def _by_chance(matches: int, rig: StereoRig) -> float:
     return _SAMPLE + matches * share + _SIGMAS * float(np.sqrt(matches * share))
 
 
-def _most(some: int, others: int) -> bool:
+def most(some: int, others: int) -> bool:
     """Whether there are significantly more of some than of the others."""
     return some - others > _SIGMAS * np.sqrt(some + others)
 

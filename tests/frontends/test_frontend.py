@@ -87,6 +87,22 @@ def test_colour_and_16_bit():
     assert features.has_stereo.mean() == pytest.approx(plain.has_stereo.mean(), abs=0.02)
 
 
+@pytest.mark.parametrize(("gain", "offset"), [(1, 0), (4, 7000), (16, 0), (50, 200)])
+def test_a_small_part_of_16_bits(gain, offset):
+    """Thermal cameras, and ones of 12 bits: features and matches as of 8 bits, also after a frame without contrast."""
+    plain = SurfFrontend(RIG).extract(StereoFrame(0, 0.0, LEFT, RIGHT))
+    frontend = SurfFrontend(RIG)
+    left, right = (image.astype(np.uint16) * gain + offset for image in (LEFT, RIGHT))
+    noise = np.random.default_rng(0).normal(8000, 2.0 * gain, LEFT.shape).astype(np.uint16)
+    for k, pair in enumerate([(left, right), (noise, noise), (left, right)]):
+        features = frontend.extract(StereoFrame(k, 0.1 * k, *pair))
+        if k == 1:
+            assert len(features) < 0.2 * len(plain)
+        else:
+            assert len(features) > 0.9 * len(plain)
+            assert features.has_stereo.mean() == pytest.approx(plain.has_stereo.mean(), abs=0.03)
+
+
 def test_mask():
     mask = np.zeros((240, 320), np.uint8)
     mask[120:] = 1

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
 _CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
 _VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
+_DIMENSIONS = 6  # fixed: mean of χ² of a pose
 _PATIENCE = 3  # keyframes within which another one must confirm a loop
 _MINIMAL = 6  # least number of features of a keyframe: enough for a pose with a covariance
 _UNKNOWN_WAY = 1000.0  # path length assumed between an earlier run and this one, or of a kidnapping [m]
@@ -119,13 +120,20 @@ class LoopCloser:
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
             return atlas, None
-        candidates = self._candidates(atlas, new, step, landmark_of)
+        known = landmark_of[landmark_of >= 0]
+        candidates = self._candidates(atlas, new, step, known)
         descriptors = new.descriptors.astype(np.float32)
         kept = new if self._file is None else self._file.put(new)
         atlas = replace(atlas.with_new(kept, descriptors), restarts=len(atlas.gaps))
         found = self._verified(atlas, candidates, step.features, step.correction, step.index)
+        if not found:  # whatever the path says
+            found = self._verified(atlas, self._anywhere(atlas, new, known), step.features, step.correction, step.index)
+            found = [one for one in found if self._is_same_view(one[1], step.features)]
         best = max(found, key=_inliers, default=None)
-        return (atlas, None) if best is None else self._close(atlas, *best, step.common, path)
+        if best is None:
+            return atlas, None
+        same = self._is_same_view(best[1], step.features)
+        return self._close(atlas, *best, step.common, path, same)
 
     @one_blas_thread
     def find(self, atlas: Atlas, features: StereoFeatures, correction: Correction | None, seed: int) -> Found | None:
@@ -219,7 +227,7 @@ class LoopCloser:
             step.correction,
         )
 
-    def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, landmark_of: IdArray) -> NDArray[np.intp]:
+    def _candidates(self, atlas: Atlas, new: Keyframe, step: Step, known: IdArray) -> NDArray[np.intp]:
         """Numbers of old keyframes that may show this place, the likeliest first.
 
         Keyframes of a place that the camera has not left yet are excluded, and those whose landmarks the back end still
@@ -232,9 +240,25 @@ class LoopCloser:
             return np.zeros(0, np.intp)
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), possible)
         likely = np.unique(np.concatenate([likely, _nearest(poses, here, new.depth, possible)]))
-        known = landmark_of[landmark_of >= 0]
-        rows = [k for k in likely.tolist() if np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL]
-        return self._ranked(atlas, np.array(rows, np.intp), step.features)
+        return self._ranked(atlas, self._not_measured(atlas, likely, known), step.features)
+
+    def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray) -> NDArray[np.intp]:
+        """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view."""
+        moved = inverse(atlas.rows.poses[:-1]) @ new.T_odom_left
+        apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
+        likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
+        return self._not_measured(atlas, likely, known)[:1]
+
+    def _not_measured(self, atlas: Atlas, rows: NDArray[np.intp], known: IdArray) -> NDArray[np.intp]:
+        """Those keyframes whose landmarks the back end does not measure."""
+        few = [np.isin(atlas.keyframes[k].landmarks, known).sum() < _MINIMAL for k in rows.tolist()]
+        return rows[np.array(few, bool)]
+
+    def _is_same_view(self, seen: Verified, features: StereoFeatures) -> bool:
+        """Whether a frame shows what a keyframe did: most features, from the same place."""
+        most = min(len(seen.keyframe), int(features.has_stereo.sum()))
+        moved = view_has_changed(seen.keyframe, seen.T_keyframe_left, self._rig, self._config)
+        return 2 * len(seen.matches) >= most and not moved
 
     def _most_alike(self, atlas: Atlas, descriptors: Vectors, possible: BoolArray) -> NDArray[np.intp]:
         """Numbers of those `possible` keyframes (K,) whose descriptors as a whole are most similar, best first."""
@@ -282,32 +306,52 @@ class LoopCloser:
         return bool(np.linalg.norm(T[:3, 3] - U[:3, 3]) < atlas.keyframes[one.first].depth)
 
     def _close(
-        self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
+        self,
+        atlas: Atlas,
+        loop: Loop,
+        seen: Verified,
+        rig: CommonError,
+        path: Callable[[], Trajectory],
+        same_view: bool = False,
     ) -> tuple[Atlas, Returned | None]:
         """Close a loop or refuse it; one that cannot be judged is refused."""
         try:
-            return self._judge(atlas, loop, seen, rig, path)
+            return self._judge(atlas, loop, seen, rig, path, same_view)
         except np.linalg.LinAlgError:
             return replace(atlas, refused=(*atlas.refused, loop.pair)), None
 
     def _judge(
-        self, atlas: Atlas, loop: Loop, seen: Verified, rig: CommonError, path: Callable[[], Trajectory]
+        self,
+        atlas: Atlas,
+        loop: Loop,
+        seen: Verified,
+        rig: CommonError,
+        path: Callable[[], Trajectory],
+        same_view: bool,
     ) -> tuple[Atlas, Returned | None]:
-        """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop."""
+        """Close a loop if it agrees with the path and a keyframe shortly before has seen the same loop.
+
+        A loop with the same view is believed against the path, whose covariance between is then as much too small as
+        the two disagree.
+        """
         from slam.mapping.atlas.consensus import disagreement
         from slam.mapping.atlas.pose_graph import PoseGraph
 
         chain = atlas.chain(rig, path())
         common = None if atlas.solved is None else atlas.solved.common_as(rig)
         graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
-        limit = self._config.gate_sigmas**2
-        if disagreement(graph, loop) > limit:
+        limit, off = self._config.gate_sigmas**2, disagreement(graph, loop)
+        if off > limit and not (same_view and np.isfinite(off)):
             return self._refuse(atlas, chain, loop, seen, rig)
         before, atlas = atlas.pending, replace(atlas, pending=loop, confirmed=False)
         if self._config.agreeing > 1 and not (before is not None and self._agree(chain, before, loop)):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         atlas = replace(atlas, confirmed=True)
-        if atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
+        if off > limit:
+            atlas = replace(atlas, rows=atlas.rows.inflated(loop.first, loop.second, off / _DIMENSIONS))
+            chain = atlas.chain(rig, path())
+            graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
+        elif atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         graph = graph.with_loop(loop)
         if (graph.disagreement() > limit).any():

@@ -77,6 +77,12 @@ class KeyframeRows:
             rows[k] = value
         return KeyframeRows(k + 1, room)
 
+    def inflated(self, first: int, last: int, factor: float) -> KeyframeRows:
+        """A copy in which the motions after keyframe `first` up to `last` have covariances larger by a factor."""
+        steps = self.room[2].copy()
+        steps[first + 1 : last + 1] *= factor
+        return KeyframeRows(self.count, (*self.room[:2], steps, *self.room[3:]))
+
 
 def _with_room(rows: Array, count: int, shape: tuple[int, ...]) -> Array:
     """The first `count` rows in an array of twice the size; zero if the rows had another shape."""

@@ -13,7 +13,6 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.monocular import find_pose
 from slam.mapping.relocalizer import nowhere
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere
 from slam.tracking.localizer import Localizer
@@ -69,8 +68,7 @@ def verify(
     """
     points = keyframe.points.astype(float)
     landmarks = _rows(keyframe)
-    guess = None if features.has_stereo.any() else find_pose(rig, landmarks, points, features, localizer, seed)
-    prediction = nowhere(features.stamp, np.eye(4) if guess is None else guess)
+    prediction = nowhere(features.stamp, np.eye(4))
     found = localizer.match(prediction, landmarks, points, features, seed)
     if found.T_world_left is None or len(found) < config.inliers:
         return None

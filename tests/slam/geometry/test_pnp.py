@@ -56,6 +56,18 @@ def test_monocular_rows_count_by_their_left_pixel():
     assert found.inliers[1:].all()
 
 
+@pytest.mark.parametrize("right", [0, 2, 10])
+def test_left_pixels_alone_give_a_pose_far_from_the_guess(right):
+    points, z = measured_from(T_TRUE, noise=0.3)
+    z[right:, 2] = np.nan
+    wrong = np.arange(len(z)) % 2 == 1
+    z[wrong] = z[np.roll(np.flatnonzero(wrong), 7)]
+    guess = se3.exp(np.array([0.1, 0.3, -0.2, 1.0, 0.5, -0.5]))
+    found = find_consensus(RIG, points, z, guess, threshold=2.0, hypotheses=100, seed=0)
+    assert found.inliers[~wrong].mean() > 0.95
+    assert np.abs(se3.log(se3.inverse(T_TRUE) @ found.T_world_left)).max() < 0.02
+
+
 def test_the_same_seed_gives_the_same_answer():
     points, z = measured_from(T_TRUE, noise=0.5)
     z[::2] = z[::-2]

@@ -12,7 +12,8 @@ from slam.config import SystemConfig
 from slam.data import FrameStatus
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap
-from slam.mapping.monocular import find_pose, frame_covariance, two_view_depth
+from slam.mapping.monocular import frame_covariance, two_view_depth
+from slam.mapping.relocalizer import nowhere
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
@@ -94,11 +95,10 @@ def test_the_pose_in_a_map_from_left_pixels_alone():
     features, _ = cloud.features(T, 0.0, 0.3)
     localizer = Localizer(RIG, SystemConfig().association, EstimatorModels(pixel_sigma=0.5))
     left = replace(features, uv_right=features.uv_right * np.nan)
-    found = find_pose(RIG, known.rows, known.positions, left, localizer, seed=0)
-    # from three points alone; least squares on all follow elsewhere
-    assert np.linalg.norm(se3.log(se3.inverse(T) @ found)[3:]) < 0.15
+    found = localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, left, seed=0)
+    assert np.linalg.norm(se3.log(se3.inverse(T) @ found.T_world_left)[3:]) < 0.02
     other, _ = Cloud(120, seed=5).features(T, 0.0)
-    assert find_pose(RIG, known.rows, known.positions, other, localizer, seed=0) is None
+    assert not len(localizer.match(nowhere(0.0, np.eye(4)), known.rows, known.positions, other, seed=0))
 
 
 def map_of(cloud, rows=slice(None)):

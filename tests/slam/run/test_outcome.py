@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import exp
 from slam.models import MotionModel
-from slam.run.outcome import motion_doubt, nothing_tracked, outcome
+from slam.run.outcome import median_depth, motion_doubt, nothing_tracked, outcome
 from slam.run.summary import RunRecord
+from tests.slam.scene import RIG as SCENE_RIG
+from tests.slam.scene import Cloud
 
 RIG = StereoRig.rectified_pair(300.0, 160.0, 120.0, 0.12, 320, 240)
 
@@ -114,3 +118,43 @@ def test_frames_that_were_not_measured_do_not_count():
 def test_doubts_of_the_motion_are_a_cause_where_nothing_else_is():
     assert outcome(record(0), RIG, doubt="torn").endswith("likely cause: torn")
     assert "found in the right image" in outcome(record(0, features=(200, 3)), RIG, doubt="torn")
+
+
+def test_missing_right_images_are_the_cause_where_most_of_these_frames_have_none():
+    run = record(10, features=(200, 0))
+    run.without_right.extend(range(8, 13))
+    assert "likely cause: 10 of these 10 frames have no right image or follow such" in outcome(run, RIG)
+    assert "calibration" not in outcome(run, RIG)
+    run = record(10)
+    run.without_right.extend(range(5))
+    assert "no right image" not in outcome(run, RIG)
+
+
+def test_the_cause_names_baseline_depth_and_speed():
+    """A baseline in another unit, still below what is plausible: 7.5 for 7.5 cm."""
+    rig = StereoRig.rectified_pair(300.0, 160.0, 120.0, 7.5, 320, 240)
+    run = replace(moving(1.0, 21), statuses=record(0).statuses, features=record(0).features, depths=[160.0] * 20)
+    said = outcome(run, rig)
+    assert "by it the cameras are 7.5 m apart and what they see is 160 m away in the median" in said
+    assert "m/s and turned at up to" in said
+
+
+def test_the_median_depth_of_a_frame():
+    features, _ = Cloud(151).features(np.eye(4), 0.0)
+    depths = SCENE_RIG.triangulate(features.uv_left, features.uv_right)[:, 2]
+    assert median_depth(features, SCENE_RIG) == pytest.approx(np.median(depths), rel=0.05)
+    assert np.isnan(median_depth(replace(features, uv_right=features.uv_right * np.nan), SCENE_RIG))
+
+
+def test_a_vehicle_that_goes_sideways_is_doubted():
+    """A truck before a standing car took the camera along."""
+
+    def along(step):
+        poses = [exp(np.array([0, 0.002 * k, 0, *(k * np.array(step))])) for k in range(30)]
+        return RunRecord(stamps=(0.1 * np.arange(30)).tolist(), poses=poses, measured=[True] * 30)
+
+    said = motion_doubt(along((0.3, 0, 0.05)), MotionModel(), driving=True)
+    assert said.startswith("in 29 frames the camera moved sideways, at 3 m/s in the median, which no vehicle does")
+    assert motion_doubt(along((0.05, 0, 1.0)), MotionModel(), driving=True) == ""
+    assert motion_doubt(along((0.01, 0, 0.0)), MotionModel(), driving=True) == ""
+    assert motion_doubt(along((0.3, 0, 0.05)), MotionModel()) == ""

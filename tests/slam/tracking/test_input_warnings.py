@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -97,7 +98,7 @@ def test_rows_that_do_not_agree_are_told_with_how_much(shift):
 
 def test_a_turned_camera_is_found_by_its_rows():
     turn = cv2.getRotationMatrix2D((160, 120), 8.0, 1.0)
-    turned = [replace(f, right=cv2.warpAffine(f.right, turn, (320, 240))) for f in stamped([0.0])]
+    turned = [replace(f, right=cv2.warpAffine(f.right, turn, (320, 240))) for f in stamped([0.0, 0.1])]
     assert "rows of left and right" in lines(turned)[0]
 
 
@@ -172,7 +173,7 @@ def test_how_far_frames_may_be_apart_follows_from_view_and_motion():
 def test_frames_without_texture_are_named_once_and_single_ones_are_not():
     frames = stamped(0.05 * np.arange(12))
     (line,) = lines(frames, features=3)
-    assert "hardly anything to follow (3 features in frame 4)" in line
+    assert "hardly anything to follow (3 features in frame 4, grey values from " in line
     assert lines(frames[:4], features=3) == []
 
 
@@ -211,3 +212,54 @@ def test_a_calibration_for_images_of_another_size_is_suspected(times):
 def test_the_image_of_a_real_rig_is_not_suspected():
     rig = slam.StereoRig.rectified_pair(718.9, 607.2, 185.2, 0.54, 1241, 376)  # KITTI's
     assert lines(stamped([0.0]), rig=rig) == []
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_right_images_of_another_moment_are_named(late):
+    """Numbers off by one: as far as it goes, the run would be tracked, with another scale."""
+    frames = list(slam.open_sequence("synthetic:desk?frames=40"))[::4]
+    if late < 0:
+        pairs = [replace(a, right=b.right) for a, b in pairwise(frames)]
+    else:
+        pairs = [replace(b, right=a.right) for a, b in pairwise(frames)]
+    (line,) = lines(pairs)
+    assert "left and right image are not of one moment" in line
+    assert f"the right images are a frame too {'late' if late > 0 else 'early'}" in line
+    assert lines(frames) == []
+
+
+def distorted():
+    left = PinholeCamera(250.0, 251.0, 170.0, 110.0, 320, 240, "radtan", (-0.25, 0.08, 0.001, 0.0))
+    right = PinholeCamera(255.0, 256.0, 150.0, 130.0, 320, 240, "radtan", (-0.26, 0.08, 0.0, 0.001))
+    turn = cv2.Rodrigues(np.array([0.01, 0.02, -0.01]))[0]
+    return slam.StereoRig(left, right, turn, turn.T @ np.array([-0.12, 0.004, 0.002]))
+
+
+def test_images_rectified_twice_are_named():
+    (line,) = lines(stamped([0.0, 0.1]), rig=distorted())  # of a rectified camera
+    assert "rows of left and right image do not agree" in line
+    assert "they were rectified before, and the calibration rectifies them again" in line
+
+
+def test_images_never_rectified_are_named():
+    turn = cv2.Rodrigues(np.array([0.03, 0.0, -0.02]))[0]
+    H = RIG.left.K @ turn @ np.linalg.inv(RIG.left.K)
+    raw = [replace(f, right=cv2.warpPerspective(f.right, H, (320, 240))) for f in stamped([0.0, 0.1])]
+    (line,) = lines(raw)
+    assert "were the images rectified, as this calibration says" in line
+
+
+def test_a_repeated_pattern_is_named_as_the_reason():
+    rng = np.random.default_rng(0)
+    one = rng.normal(size=(2, 64))
+    descriptors = (one / np.linalg.norm(one, axis=1, keepdims=True))[np.arange(200) % 2]
+    uv = np.column_stack([10 + 15.0 * (np.arange(200) % 20), 10 + 20.0 * (np.arange(200) // 20)])
+    column = np.ones(200)
+    found = StereoFeatures(
+        0.0, uv, uv * np.nan, 8 * column, 0 * column, column, np.ones(200, np.int8), descriptors.astype(np.float32)
+    )
+    watch = InputWarnings(RIG, models_for("handheld"), 1.5)
+    for frame in stamped(0.05 * np.arange(6)):
+        watch.look(frame, replace(found, stamp=frame.stamp))
+    (line,) = watch.lines
+    assert "only 0 of 200 features" in line and "the view is a repeated pattern: 200 of them have a look-alike" in line

@@ -111,12 +111,25 @@ def test_a_carried_camera_is_believed_when_three_frames_agree(backend):
     system, results, points = run(backend, poses)
     needed = CONFIG.association.kidnapped_after - 1
     assert states(results) == [("started", 1), ("tracked", 24), ("predicted", needed), ("tracked", 35 - needed)]
+    assert results[25].reason.endswith("landmarks agree on a pose too far from the prediction to be believed at once")
     errors = np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1)
     assert len(errors) == 60
     assert errors[25 + needed :].max() < 0.02  # as before
     steps = np.diff([r.estimate.T_world_left[:3, 3] for r in results[25 + needed :]], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.03  # the jump has left no velocity behind
     assert right_share(results, points) == 1
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_shaken_camera_with_sharp_images_is_tracked(backend):
+    """Each frame is far beyond what the prediction allows, but most of what is in view agrees."""
+    rng = np.random.default_rng(0)
+    shake = lambda k: se3.exp(0.02 * (k > 20) * rng.normal(size=6) * (1, 1.5, 1, 0.5, 0.5, 0.5))  # noqa: E731
+    poses = [T @ shake(k) for k, T in enumerate(path(60))]
+    system, results, points = run(backend, poses)
+    assert states(results) == [("started", 1), ("tracked", 59)]
+    assert right_share(results, points) == 1
+    assert np.linalg.norm(system.trajectory().positions - np.array(poses)[:, :3, 3], axis=1).max() < 0.03
 
 
 def test_poses_that_do_not_agree_with_each_other_prove_nothing():
