@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from backends.window.config import WindowConfig
-from backends.window.history import Call, History, moved
+from backends.window.history import Call, History, state_corrected
 from backends.window.state import State
 from backends.window.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_stamp
@@ -53,6 +53,8 @@ class WindowBackend:
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
         self._history = History()
+        self._revised = False  # whether the history's measurements are not those that the states come from
+        self._path: tuple[State, Trajectory] | None = None  # the last answer, and the state that it is of
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
@@ -115,11 +117,21 @@ class WindowBackend:
         return marks.position[marks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final."""
-        poses = np.array(self._final).reshape(-1, 4, 4)
-        for frame, T in self._state.revised_poses().items():
-            poses[frame] = T
-        return Trajectory(np.array(self._stamps), poses)
+        """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final.
+
+        After a revision of the measurements, the last frames are gone through again for it. The newest pose stays where
+        it is and the path before it moves, but where landmarks are known in the world.
+        """
+        if self._path is None or self._path[0] is not self._state:
+            s, final, M = self._state, self._final, np.eye(4)
+            if self._revised:
+                s, final = self._history.repeated(self._steps, final)
+                M = M if self._history.anchored else self._state.poses[-1] @ inverse(s.poses[-1])
+            poses = np.array(final).reshape(-1, 4, 4)
+            for frame, T in s.revised_poses().items():
+                poses[frame] = T
+            self._path = self._state, Trajectory(np.array(self._stamps), M @ poses)
+        return Trajectory(self._path[1].stamps.copy(), self._path[1].poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -152,18 +164,15 @@ class WindowBackend:
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: the last frames are gone through again.
+        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
 
-        The newest pose stays where it was and the path before it moves, but for landmarks that are known in the world.
+        Measurements of the window are corrected, and landmarks move to where the newest camera sees them corrected. The
+        path is found anew when it is asked for.
         """
-        if not len(self._state.frames):
-            return
-        before, history = self._state.poses[-1], self._history.corrected(self._steps.stereo, correct)
-        s, final = history.repeated(self._steps, self._final)
-        if not history.anchored:
-            M = before @ inverse(s.poses[-1])
-            s, history, final = moved(s, M), history.moved(M), [M @ T for T in final]
-        self._state, self._history, self._final = replace(s, measured=True), history, final
+        if len(self._state.frames):
+            s = state_corrected(self._state, self._steps.stereo, correct)
+            self._history = self._history.corrected(self._steps.stereo, correct)
+            self._state, self._revised = replace(s, measured=True), True
 
     # --- parts ---
 

@@ -11,7 +11,7 @@ import numpy as np
 from backends.window.state import State
 from backends.window.steps import Steps
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array
 from slam.window import kernels
 from slam.window.stereo import RectifiedStereo
 
@@ -47,7 +47,7 @@ class History:
 
     Attributes:
         parts: at least one.
-        anchored: whether landmarks were ever known in the world: then nothing may be moved in it.
+        anchored: whether landmarks were ever known in the world: then the path may not be moved in it.
     """
 
     parts: tuple[Part, ...] = field(default_factory=lambda: (Part(State.empty()),))
@@ -76,7 +76,7 @@ class History:
             MeasurementError: a corrected measurement is not finite.
         """
         parts = [replace(part, calls=tuple(call.corrected(correct) for call in part.calls)) for part in self.parts]
-        return replace(self, parts=(replace(parts[0], state=_state_corrected(self.start, stereo, correct)), *parts[1:]))
+        return replace(self, parts=(replace(parts[0], state=state_corrected(self.start, stereo, correct)), *parts[1:]))
 
     def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[State, list[Array]]:
         """The state after all calls, and all frames' final poses."""
@@ -94,17 +94,6 @@ class History:
                     final[frame] = T
         return s, final
 
-    def moved(self, M: Array) -> History:
-        """With everything moved by a rigid motion of the world (4, 4)."""
-        return replace(self, parts=tuple(replace(part, state=moved(part.state, M)) for part in self.parts))
-
-
-def moved(s: State, M: Array) -> State:
-    """A state moved by a rigid motion of the world (4, 4)."""
-    R, marks = M[:3, :3], s.landmarks
-    marks = replace(marks, position=transform(M, marks.position), world=R @ marks.world @ R.T)
-    return replace(s, poses=M @ s.poses, landmarks=marks, prior=replace(s.prior, T=M @ s.prior.T), past=s.past.moved(M))
-
 
 def _corrected(z: Array, correct: Callable[[Array], Array]) -> Array:
     """Measurements (M, 3) as they are corrected; a missing right pixel stays NaN."""
@@ -114,7 +103,7 @@ def _corrected(z: Array, correct: Callable[[Array], Array]) -> Array:
     return out
 
 
-def _state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> State:
+def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array], Array]) -> State:
     """A state whose measurements are corrected, and whose landmarks are where the newest camera sees them corrected."""
     if not len(s.frames):
         return s

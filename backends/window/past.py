@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.data import IdArray, IndexArray
-from slam.geometry.se3 import Array, exp, inverse, log, transform
+from slam.geometry.se3 import Array, exp, inverse, log
 from slam.window.marginal import Conditional
 
 
@@ -34,13 +34,6 @@ class Left:
     positions: Array
     conditional: Conditional
 
-    def moved(self, M: Array) -> Left:
-        """Moved by a rigid motion of the world (4, 4)."""
-        return replace(
-            self, pose=M @ self.pose, points=transform(M, self.points), poses=M @ self.poses,
-            positions=transform(M, self.positions), conditional=self.conditional.turned(M[:3, :3]),
-        )  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class Past:
@@ -58,10 +51,6 @@ class Past:
     def without(self, count: int) -> Past:
         """Without the oldest ones."""
         return replace(self, left=self.left[count:])
-
-    def moved(self, M: Array) -> Past:
-        """Moved by a rigid motion of the world (4, 4)."""
-        return Past(tuple(one.moved(M) for one in self.left))
 
     def displaced(self, serials: IdArray, displacement: Array) -> Past:
         """With landmarks by serial number (S,), ascending, displaced (S, 3), as if they had stood there before."""

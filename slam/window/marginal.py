@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,10 +36,6 @@ class Conditional:
         y = np.linalg.solve(self.stayed, stayed[:, :, None])
         x = self.mean - self.gain @ np.concatenate([y.ravel(), poses.ravel()])
         return (self.left @ x[:-6].reshape(-1, 3, 1))[:, :, 0], x[-6:]
-
-    def turned(self, R: Array) -> Conditional:
-        """In a world turned by R (3, 3)."""
-        return replace(self, left=R @ self.left, stayed=R @ self.stayed)
 
 
 def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrior, Conditional, float]:
