@@ -102,6 +102,18 @@ class PinholeCamera:
         distortion = () if model == "none" else tuple(values)
         return cls(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, model, distortion)
 
+    def turned(self, turns: int) -> PinholeCamera:
+        """The camera of images that are turned so many quarters anticlockwise, as ``numpy.rot90`` does."""
+        if turns % 4 == 0:
+            return self
+        D = list(self.distortion)
+        if self.model == "radtan":
+            D[2:4] = -D[3], D[2]
+        once = PinholeCamera(
+            self.fv, self.fu, self.v0, self.width - 1 - self.u0, self.height, self.width, self.model, tuple(D)
+        )
+        return once.turned(turns % 4 - 1)
+
     @property
     def K(self) -> Array:
         """Camera matrix (3, 3)."""

@@ -66,10 +66,11 @@ class CameraInfo:
         return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
 
 
-def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool) -> StereoRig:
+def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool, unit: float = 1.0) -> StereoRig:
     """The rig of the rectified or of the raw images.
 
-    For the raw ones ``h_rectified = R h`` in each camera, and the rectified cameras differ by the baseline in ``P``.
+    For the raw ones ``h_rectified = R h`` in each camera, and the rectified cameras differ by the baseline in ``P``,
+    which is in units of so many metres.
 
     Raises:
         CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
@@ -81,9 +82,10 @@ def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool) 
         raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
     if left.size != right.size:
         raise CalibrationError("the images of the two cameras differ in size")
+    scale = np.array([1, 1, 1, unit])
     if rectified:
-        return rig_from_projections(left.P, right.P, left.size)
-    offset = projection_offset(right.P) - projection_offset(left.P)
+        return rig_from_projections(left.P * scale, right.P * scale, left.size)
+    offset = unit * (projection_offset(right.P) - projection_offset(left.P))
     T_right_left = pose(right.R.T @ left.R, right.R.T @ offset)
     return rig_from_transform(_camera(left), _camera(right), T_right_left)
 

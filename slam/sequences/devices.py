@@ -10,8 +10,8 @@ import numpy as np
 
 from slam.errors import ConfigurationError, SequenceError
 from slam.files import note_input
+from slam.sequences.given import FASTEST, SLOWEST
 from slam.sequences.quiet import quiet_libraries
-from slam.sequences.videos import FASTEST, SLOWEST
 
 _TIMEOUT = 5000  # [ms] for an answer from the network
 
