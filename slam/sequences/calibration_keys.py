@@ -55,6 +55,7 @@ _SPELLINGS: dict[str, tuple[str, ...]] = {
 _FISHEYE = ("equidistant", "fisheye", "kannalabrandt8", "kannalabrandt")
 _PINHOLE = ("", "none", "radialtangential", "radtan", "plumbbob", "rationalpolynomial", "pinhole", "perspective",
             "rectified")  # fmt: skip
+_OF_ONE = ("tbs", "cameramatrix", "projectionmatrix")  # names that a file of one camera has
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLAIN = ("fx", "fy", "cx", "cy")
 _ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "SVGA": (960, 600),
@@ -78,30 +79,24 @@ class Entries:
     """The entries of calibration files by their names in lower case, letters and digits only.
 
     Args:
-        paths: one file or several; of two files of one camera each the first is the left one's.
-        images: width and height of the images, which choose one of several resolutions; None where not known.
+        files: name to name as written, and value; of two files of one camera each the first is the left one's.
+        form: whose form it is, as ``"Kalibr's"``; empty where the entries themselves are to tell.
 
     Attributes:
-        form: whose form it is, as ``"Kalibr's"``; empty for OpenCV's, and for plain numbers.
+        form: whose form it is; empty for OpenCV's, and for plain numbers.
         options: that mean something for this form.
-
-    Raises:
-        CalibrationError: a file is missing or unreadable.
     """
 
-    def __init__(self, paths: Sequence[Path], images: Size | None) -> None:
-        self.form = ""
-        self.options: tuple[str, ...] = ("unit", "rectified", "fisheye")
+    def __init__(self, files: Sequence[Mapping[str, tuple[str, Any]]], form: str = "") -> None:
+        self.form = form
+        self.options: tuple[str, ...] = () if form else ("unit", "rectified", "fisheye")
         self._values: dict[str, tuple[str, Any]] = {}
-        files = [dict(self._read(path, images)) for path in paths]
-        single = len(files) == 2 and any(
-            all(n in f for f in files) for n in ("tbs", "cameramatrix", "projectionmatrix")
-        )
+        single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
         for side, file in zip(("left", "right"), files):
             self._values |= {(side + name if single else name): entry for name, entry in file.items()}
-        for form, names, options in _FORMS:
+        for known, names, options in _FORMS:
             if not self.form and any(name in self._values for name in names):
-                self.form, self.options = form, options
+                self.form, self.options = known, options
         zero = any(name in self._values for name in ("k0", "m0", "d0", "cameramatrix0", "camera0fx"))
         counts = ("0", "1") if zero else ("1", "2")
         self._sides = [
@@ -127,26 +122,37 @@ class Entries:
         """All entries as they are written."""
         return ", ".join(sorted(name for name, _ in self._values.values())) or "nothing"
 
-    def _read(self, path: Path, images: Size | None) -> Iterator[tuple[str, tuple[str, Any]]]:
-        """Entries of one file; it is read by the XML, INI and YAML libraries: OpenCV's reader can crash."""
-        text = read_calibration(path).strip()
-        root: Mapping[str, Any]
-        if text.startswith("<"):
-            root = _read_xml(path, text)
-        elif text.startswith("[") and "[STEREO]" in text.upper():
-            self.form, self.options = "ZED's", ()
-            root = _read_zed(path, text, images)
-        else:
-            root = read_yaml(path)
-            if "residual_scale" in root or "self_calibration" in root:
-                raise CalibrationError(
-                    f"{path}: errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
-                )
-            if "cameraData" in root:
-                self.form, self.options = "depthai's", ()
-                with naming(path):
-                    root = _read_depthai(root)
-        return _flat(root, "", "")
+
+def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
+    """The entries of calibration files, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
+
+    Args:
+        paths: one file or several.
+        images: width and height of the images, which choose one of several resolutions; None where not known.
+
+    Raises:
+        CalibrationError: a file is missing or unreadable.
+    """
+    read = [_read(path, images) for path in paths]
+    return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
+
+
+def _read(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
+    """What a file holds, and whose form it is where its entries do not tell."""
+    text = read_calibration(path).strip()
+    if text.startswith("<"):
+        return _read_xml(path, text), ""
+    if text.startswith("[") and "[STEREO]" in text.upper():
+        return _read_zed(path, text, images), "ZED's"
+    root = read_yaml(path)
+    if "residual_scale" in root or "self_calibration" in root:
+        raise CalibrationError(
+            f"{path}: errors of a rig, as `slam calibrate` or a run found them, not a rig: see --calibration"
+        )
+    if "cameraData" not in root:
+        return root, ""
+    with naming(path):
+        return _read_depthai(root), "depthai's"
 
 
 def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, fisheye: bool) -> StereoRig:
@@ -234,10 +240,7 @@ def _rectified_offset(entries: Entries, unit: float) -> Array | None:
     """Where the rectified left camera is in the rectified right one's axes (3,) [m]; None where nothing says it."""
     if all(entries.find("P", side) is not None for side in (0, 1)):
         left, right = _projections(entries, unit)
-        offset = projection_offset(right) - projection_offset(left)
-        if not offset.any():
-            raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
-        return offset
+        return projection_offset(right) - projection_offset(left)
     baseline = _baseline(entries, unit)
     return None if baseline is None else np.array([-baseline, 0.0, 0.0])
 
@@ -246,6 +249,8 @@ def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
     """Both projections (3, 4), their last column for metres."""
     left, right = (entries.numbers("P", side, (3, 4)) for side in (0, 1))
     assert left is not None and right is not None
+    if left[0, 3] == right[0, 3] and left[1, 3] == right[1, 3]:
+        raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
     scale = np.array([1, 1, 1, unit])
     return left * scale, right * scale
 

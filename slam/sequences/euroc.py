@@ -13,7 +13,7 @@ from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import naming
-from slam.sequences.calibration_keys import Entries, body_pose
+from slam.sequences.calibration_keys import body_pose, read_entries
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import Given
 from slam.sequences.rigs import calibration_files, read_rig
@@ -56,8 +56,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
     with FaultLog(warnings) as faults:
         left, right = _listings(root, faults)
         path = times_file(folder, options)
-        times = read_times(path, faults)
-        _, source = pair_up(left, right, options, faults, None if path is None or times is None else (path, times))
+        _, source = pair_up(left, right, options, faults, read_times(path, faults))
         own, size = _calibration(root), source.first_size()
         named = "calibration" in options or not own
         rig = read_rig(_named(folder, root, options) if named else own, size, options)
@@ -126,7 +125,7 @@ def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Traj
                 if not calibration:
                     raise SequenceError(f"{path}: no sensor.yaml says where the camera is on the body")
                 with naming(calibration[0]):
-                    T_body_camera = body_pose(Entries(calibration, None), 0)
+                    T_body_camera = body_pose(read_entries(calibration, None), 0)
                 return _camera_path(path, T_body_camera, faults)
             except (TrajectoryError, SequenceError, CalibrationError) as error:
                 faults.report("ground truth", f"{error}; there is no ground truth")

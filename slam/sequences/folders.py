@@ -56,10 +56,9 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
             size = source.size
         else:
             path = times_file(home, options, *(home / name for name in _TIMES))
-            times = read_times(path, faults)
             listings = by_names([s.path for s in sides], [s.names or [] for s in sides], faults)
-            known = None if path is None or times is None else (path, times)
-            _, source = pair_up(listings[0], listings[1] if right else None, options, faults, known)
+            times = read_times(path, faults)
+            _, source = pair_up(listings[0], listings[1] if right else None, options, faults, times)
             size = source.first_size()
             source = replace(source, size=size)
         rig = read_rig(calibration_files(home, options), size, options)

@@ -62,11 +62,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
         data = next((name for name in _DATA if (folder / f"image_{cameras[0]}" / name).exists()), _DATA[0])
         left_all, right_all = (numbered(folder / f"image_{c}" / data, faults) for c in cameras)
         path = times_file(folder, options, left_all.folder.parent / "timestamps.txt")
-        if "times" in options:
-            origin, times = None, read_times(path, faults)
-        else:
-            origin, times = _times(path, faults)
-        known = None if path is None or times is None else (path, times)
+        origin, known = (None, read_times(path, faults)) if "times" in options else _times(path, faults)
         left, source = pair_up(left_all, right_all, options, faults, known, by_number=True)
         stamps, size = source.stamps, source.first_size()
         calibration = _calibration(folder)
@@ -80,7 +76,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
         if named is not None:
             rig = read_rig(named, size, options)
         assert rig is not None  # one of the two is there
-        gps = _gps(folder / "ego_gps_m.txt", times, faults)
+        gps = _gps(folder / "ego_gps_m.txt", None if known is None else known[1], faults)
         truth = _ground_truth(folder, calibration.parent, origin, T_left_reference, left, stamps, faults)
     kind = options.get("kind", "driving")
     time = 0.0 if (folder / "oxts").is_dir() else _OXTS_TIME
@@ -98,13 +94,13 @@ def _calibration(folder: Path) -> Path:
     return next((path for path in places if path.exists()), folder.parent / usual.name)
 
 
-def _times(path: Path | None, faults: FaultLog) -> tuple[int | None, Array | None]:
+def _times(path: Path | None, faults: FaultLog) -> tuple[int | None, tuple[Path, Array] | None]:
     """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on; None without file."""
     if path is None:
         return None, None
     rows = read_rows(path, date_time, faults)
     origin = next(row for row in rows if row is not None)
-    return origin, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows])
+    return origin, (path, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows]))
 
 
 def _rig(path: Path, cameras: tuple[str, str], size: Size) -> tuple[StereoRig, Array]:

@@ -11,7 +11,7 @@ from slam.errors import CalibrationError, ConfigurationError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.sequences.calibration import kitti_matrix, naming, read_kitti, rig_from_projections
-from slam.sequences.calibration_keys import Entries, rig_of
+from slam.sequences.calibration_keys import read_entries, rig_of
 from slam.sequences.given import flag
 from slam.sequences.images import Size
 from slam.sequences.source import require_size
@@ -86,7 +86,7 @@ def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str
     form = "KITTI's"
     allowed: tuple[str, ...] = ()
     kitti = re.search(r"^(P|P_rect_0)0[: ]", read_calibration(paths[0]), re.MULTILINE) if len(paths) == 1 else None
-    entries = None if kitti else Entries(paths, size)
+    entries = None if kitti else read_entries(paths, size)
     if entries is not None:
         form, allowed = entries.form, entries.options
     rectified, fisheye = flag(options, "rectified"), flag(options, "fisheye")

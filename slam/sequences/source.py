@@ -222,11 +222,11 @@ def times_file(folder: Path, options: Given, *usual: Path) -> Path | None:
     return None if "fps" in options else next((path for path in usual if path.is_file()), None)
 
 
-def read_times(path: Path | None, faults: FaultLog) -> Array | None:
-    """Times by row [s], NaN for unreadable ones; None where there is no file."""
+def read_times(path: Path | None, faults: FaultLog) -> tuple[Path, Array] | None:
+    """A file and the times in it by row [s], NaN for unreadable ones; None where there is no file."""
     if path is None:
         return None
-    return np.array([np.nan if row is None else row for row in read_rows(path, seconds, faults)])
+    return path, np.array([np.nan if row is None else row for row in read_rows(path, seconds, faults)])
 
 
 def pair_up(

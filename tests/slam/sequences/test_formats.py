@@ -257,7 +257,7 @@ def test_kitti_without_times_runs_at_ten_hertz_and_says_so(kitti: Path) -> None:
     (kitti / "times.txt").unlink()
     sequence = open_sequence(kitti)
     assert np.allclose(sequence.stamps, 0.1 * np.arange(6))
-    assert sequence.warnings == [f"{kitti / 'times.txt'} is missing: 10 frames per second assumed"]
+    assert sequence.warnings == [f"{kitti / 'image_0'}: no times, 10 frames per second assumed (see fps=…)"]
 
 
 # ------------------------------------------------------------------------------------------------ KITTI raw

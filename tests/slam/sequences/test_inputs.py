@@ -404,7 +404,8 @@ ZED = (
 )
 OAK_CAMERA = (
     '[{socket}, {{"cameraType": 0, "width": 64, "height": 48, "distortionCoeff": [0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, '
-    '0, 0, 0, 0], "intrinsicMatrix": [[45, 0, 31], [0, 45, 23], [0, 0, 1]], "extrinsics": {{"rotationMatrix": [[1, 0, 0], '
+    '0, 0, 0, 0], "intrinsicMatrix": [[45, 0, 31], [0, 45, 23], [0, 0, 1]], '
+    '"extrinsics": {{"rotationMatrix": [[1, 0, 0], '
     '[0, 1, 0], [0, 0, 1]], "toCameraSocket": {to}, "translation": {{"x": {x}, "y": 0, "z": 0}}}}}}]'
 )
 OAK = '{"cameraData": [' + OAK_CAMERA.format(socket=1, to=2, x=-20) + ", " + OAK_CAMERA.format(socket=2, to=0, x=3)
