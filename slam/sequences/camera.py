@@ -71,22 +71,14 @@ class CameraSequence:
             paths = self._calibration_files(options)
             _, left, _ = self._first(self._cameras)
             self.rig: StereoRig = self._rig(paths, (left.shape[1], left.shape[0]), options)
-            self._masks = read_masks(options.get("mask"), self._folder(), self.rig)
+            self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
         except BaseException:
             self._cameras.release()
             raise
-        if self._cameras.have_an_end:  # a file is played from its first image; what a device has given is over
-            self._cameras.release()
-            self._cameras = None
-
-    def _folder(self) -> Path:
-        """That file names are relative to: of a file that is played its own, else the working folder."""
-        first = self._addresses[0]
-        return Path(first).absolute().parent if devices.plays_a_file(first) else Path.cwd()
 
     def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
-        """Those that are named, or that lie beside a file that is played, or in the working folder."""
-        folder = self._folder()
+        """Those that are named, or that lie in the working folder."""
+        folder = Path.cwd()
         try:
             return rigs.calibration_files(folder, options)
         except CalibrationError:
@@ -115,8 +107,6 @@ class CameraSequence:
             while stop is None or index < stop:
                 pair = cameras.read()
                 if pair is None:
-                    if cameras.have_an_end:
-                        return
                     cameras.release()
                     cameras, pair = self._again(faults)
                 self._require_size(pair[1])
@@ -175,7 +165,7 @@ class CameraSequence:
             pair = cameras.read()
             if pair is not None:
                 return pair
-            if cameras.have_an_end or time.monotonic() - began >= self._wait:
+            if time.monotonic() - began >= self._wait:
                 raise SequenceError(f"{self.name}: it is open, but gives no images")
             time.sleep(_AGAIN)
 
@@ -210,7 +200,6 @@ class _Cameras:
             origin,
             "camera:" + ",".join(map(devices.without_password, addresses)),
         )
-        self.have_an_end = any(devices.plays_a_file(a) for a in addresses)
         self.last_read = time.monotonic()
         self._devices: list[devices.Device] = []
         try:
