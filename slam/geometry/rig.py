@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera
+from slam.geometry.camera import PinholeCamera, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _LONGEST = 1e6  # guard: baseline [m]
@@ -368,16 +368,11 @@ def rectify(rig: StereoRig) -> RectifiedRig:
         P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
         P_right[0, 2] = P_left[0, 2]
     if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * rig.left.fu < f < 20 * rig.left.fu):
-        raise CalibrationError("stereo rig cannot be rectified: the two cameras share no usable view")
-    rectified_rig = StereoRig.rectified_pair(
-        f,
-        float(P_left[0, 2]),
-        float(P_left[1, 2]),
-        rig.baseline,
-        rig.width,
-        rig.height,
-        float(P_right[0, 2] - P_left[0, 2]),
-    )
+        doubt = size_doubt(rig.left, rig.right)
+        reason = doubt or "the two cameras share no usable view"
+        raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
+    u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
+    rectified_rig = StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs)
     return RectifiedRig(rig, rectified_rig, R_left, R_right)
 
 

@@ -455,6 +455,14 @@ def test_what_is_recognised_but_cannot_be_read_is_named(tmp_path: Path) -> None:
         slam.load_rig(tmp_path / "0.yaml", tmp_path / "1.yaml")
 
 
+def test_a_calibration_for_other_images_is_said_before_what_fails(two_folders: Path, build: SimpleNamespace) -> None:
+    K, D = np.array([[12.0, 0, 7], [0, 12, 5], [0, 0, 1]]), np.array([[-0.35, 0.15, 0, 0]])
+    entries = {"K1": K, "K2": K, "D1": D, "D2": D, "R": np.eye(3), "T": np.array([[-0.12], [0], [0]])}
+    build.write_storage(two_folders / "calibration.yaml", entries)
+    with pytest.raises(CalibrationError, match=r"\(7, 5\) px, .*is the calibration for images of another size\?"):
+        slam.StereoSlam(open_sequence(f"{two_folders}?fps=10").rig)
+
+
 def test_the_errors_of_a_rig_are_no_rig(tmp_path: Path) -> None:
     (tmp_path / "calibration.json").write_text('{"rig": {}, "residual_scale": 1, "parameters": []}')
     with pytest.raises(CalibrationError, match=r"errors of a rig, .* not a rig: see --calibration"):
