@@ -260,7 +260,7 @@ def pair_up(
     if right is not None:
         told = bool(times or rate)
         wanted = options.tolerance() if left.stamped else 0
-        tolerance = _tolerance(left, told) if wanted is None else wanted
+        tolerance = hardware_tolerance(left, told) if wanted is None else wanted
         kept, partners = pair_listings(left, right, tolerance, faults)
     position = np.searchsorted(left.keys, kept.keys)
     if times is not None:
@@ -278,13 +278,6 @@ def pair_up(
         stamps = numbers / (rate or RATE)
     folder = left.folder if right is None else right.folder
     return kept, ImagePairs(stamps, left.folder, kept.names, folder, partners, halves=right is None)
-
-
-def _tolerance(listing: Listing, told: bool) -> int:
-    """How far stamps of a pair may be apart [ns]: of cameras whose rate is told nearly half a frame."""
-    if not told or len(listing) < 2:
-        return hardware_tolerance(listing)
-    return int(0.49 * np.median(np.diff(listing.keys)))
 
 
 def in_seconds(
@@ -336,11 +329,12 @@ def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
     return replace(listing, names=names).select(found_rows)
 
 
-def hardware_tolerance(listing: Listing) -> int:
-    """How far two stamps of a pair may be apart [ns]: less than half a frame, and never more than `TOLERANCE`."""
+def hardware_tolerance(listing: Listing, told: bool = False) -> int:
+    """How far stamps of a pair may be apart [ns]: half a frame, and `TOLERANCE` at most, unless the rate is told."""
     if len(listing) < 2:
         return TOLERANCE
-    return int(min(TOLERANCE, np.median(np.diff(listing.keys)) / 2))
+    half = np.median(np.diff(listing.keys)) / 2
+    return int(0.98 * half if told else min(TOLERANCE, half))
 
 
 def stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
