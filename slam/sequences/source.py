@@ -276,8 +276,7 @@ def pair_up(
         if rate is None:
             faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
         stamps = numbers / (rate or RATE)
-    folder = left.folder if right is None else right.folder
-    return kept, ImagePairs(stamps, left.folder, kept.names, folder, partners, halves=right is None)
+    return kept, ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
 
 
 def in_seconds(
@@ -315,18 +314,16 @@ def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
     Raises:
         SequenceError: none exists; or see `image_names`.
     """
-    there = image_names(listing.folder)
-    known = set(there)
-    by_stem = {stem(name): name for name in there}
-    names = [n if n in known else by_stem.get(stem(n), "") for n in listing.names]
+    known = {name: name for name in image_names(listing.folder)}
+    by_stem = {stem(name): name for name in known}
+    names = [known.get(n) or by_stem.get(stem(n), "") for n in listing.names]
     missing = [wanted for wanted, found in zip(listing.names, names) if not found]
     if len(missing) == len(names):
         raise SequenceError(f"{listing.folder}: none of the {len(names)} images listed in {what} is there")
     if missing:
         line = f"{what}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
         faults.report("listed images", line)
-    found_rows = np.flatnonzero([bool(n) for n in names])
-    return replace(listing, names=names).select(found_rows)
+    return replace(listing, names=names).select(np.flatnonzero([bool(n) for n in names]))
 
 
 def hardware_tolerance(listing: Listing, told: bool = False) -> int:
