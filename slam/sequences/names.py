@@ -24,6 +24,7 @@ _DATE = re.compile(
     re.ASCII,
 )
 _STAMP = re.compile(r"(?<!\d)(?:(\d{9,10})[._](\d{1,9})|(\d{18,19})|(\d{16})|(\d{13}))(?!\d)", re.ASCII)
+_SECONDS = re.compile(r"\d{1,10}\.\d{1,9}", re.ASCII)  # a whole name, perhaps since a start
 _NUMBER = re.compile(r"\d+", re.ASCII)
 
 
@@ -76,12 +77,13 @@ def keys_of(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str] 
 
 def _is_stamp(text: str) -> bool:
     """Whether a whole name is a stamp: nothing is guessed then."""
-    return _STAMP.fullmatch(text) is not None
+    return (_STAMP.fullmatch(text) or _SECONDS.fullmatch(text)) is not None
 
 
 def _stamps(names: Sequence[str]) -> IntArray | None:
     """A stamp [ns] that every name has and that tells the names apart."""
-    rows = [_STAMP.findall(stem(name)) for name in names]
+    since_start = all(_SECONDS.fullmatch(stem(name)) for name in names)
+    rows = [[(*stem(n).split("."), "", "", "")] if since_start else _STAMP.findall(stem(n)) for n in names]
     for column in range(min(map(len, rows), default=0)):
         parts = [row[column] for row in rows]
         fractions = [part[1] for part in parts if part[1]]

@@ -52,6 +52,7 @@ def in_order(sequence) -> bool:
             lambda i: f"cam-{1_700_000_000}.{97000 + 1500 * i}.png",
             1.7e9 + 0.097 + 0.0015 * np.arange(6),
         ),
+        (lambda i: f"{9.95 + 0.05 * i:.3f}.png", lambda i: f"{9.951 + 0.05 * i:.3f}.png", 9.95 + 0.05 * np.arange(6)),
         (
             lambda i: f"20230405_120000_{90 * i:03d}.png",
             lambda i: f"20230405_120000_{90 * i:03d}.png",
@@ -63,7 +64,17 @@ def in_order(sequence) -> bool:
             0.1 * np.arange(6),
         ),
     ],
-    ids=["unpadded", "size-in-name", "two-numbers", "malaga", "inside", "unpadded-usec", "date", "date-and-count"],
+    ids=[
+        "unpadded",
+        "size-in-name",
+        "two-numbers",
+        "malaga",
+        "inside",
+        "unpadded-usec",
+        "since-a-start",
+        "date",
+        "date-and-count",
+    ],
 )
 def test_names_are_read_as_numbers_and_stamps(two_folders: Path, left, right, stamps) -> None:
     for side, name in (("left", left), ("right", right)):
