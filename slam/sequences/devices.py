@@ -57,7 +57,6 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
             capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
         else:
-            note_input(address)
             capture = cv2.VideoCapture(address)
         if not capture.isOpened():
             raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
