@@ -9,7 +9,7 @@ times seconds. Pose covariances are (6, 6), order [rotation, translation], of a 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import numpy as np
@@ -34,12 +34,16 @@ class StereoFrame:
         index: number of the frame in its sequence.
         stamp: time [s].
         left, right: images (H, W) or (H, W, 3|4), uint8 or uint16; `right` is None where it is missing.
+        left_mask, right_mask: (H, W) bool, False where a camera sees its own car or lens: features there are not used.
+            None for the whole image.
     """
 
     index: int
     stamp: float
     left: np.ndarray
     right: np.ndarray | None
+    left_mask: BoolArray | None = None
+    right_mask: BoolArray | None = None
 
     def __repr__(self) -> str:
         height, width = self.left.shape[:2]
@@ -96,6 +100,15 @@ class Patches:
         return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(Patches)))
 
 
+def _at(mask: BoolArray, uv: Array) -> BoolArray:
+    """The mask (H, W) at pixels (N, 2); True beyond its border and where a pixel is NaN."""
+    there = np.isfinite(uv).all(axis=1)
+    out = np.ones(len(uv), bool)
+    column, row = np.rint(uv[there]).astype(int).T.clip(0, np.array([mask.shape[1] - 1, mask.shape[0] - 1])[:, None])
+    out[there] = mask[row, column]
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class StereoFeatures:
     """Features of one stereo frame, a row each.
@@ -146,6 +159,16 @@ class StereoFeatures:
     def has_stereo(self) -> BoolArray:
         """Which features have a right pixel (N,)."""
         return np.asarray(np.isfinite(self.uv_right).all(axis=1))
+
+    def outside(self, left_mask: BoolArray | None, right_mask: BoolArray | None) -> StereoFeatures:
+        """Those where the masks (H, W) of a frame are True; under the right camera's only the right pixel goes."""
+        if left_mask is not None:
+            rows = np.flatnonzero(_at(left_mask, self.uv_left))
+            names = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
+            return replace(self, **{name: getattr(self, name)[rows] for name in names}).outside(None, right_mask)
+        if right_mask is None:
+            return self
+        return replace(self, uv_right=np.where(_at(right_mask, self.uv_right)[:, None], self.uv_right, np.nan))
 
     @classmethod
     def empty(cls, stamp: float, dimensions: int = 64, threshold: float = float("nan")) -> StereoFeatures:

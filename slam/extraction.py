@@ -71,5 +71,7 @@ class Extractor:
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
             features = frontend.extract(frame)
+            if not (frame.left_mask is None and frame.right_mask is None):
+                features = features.outside(frame.left_mask, frame.right_mask)
         self._warnings.look(frame, features)
         return frame, features, stages.milliseconds

@@ -152,7 +152,7 @@ def test_the_webcam_in_15_lines_writes_a_path(tmp_path, monkeypatch, capsys):
         video.write(cv2.cvtColor(np.hstack([frame.left, frame.right]), cv2.COLOR_GRAY2BGR))
     video.release()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["webcam.py", "camera:both.avi"])
+    monkeypatch.setattr(sys, "argv", ["webcam.py", "both.avi?layout=sbs"])
     exec(compile(text, "webcam.py", "exec"), {})
     poses = len((tmp_path / "path.txt").read_text().splitlines())
     assert 1 <= poses <= 8

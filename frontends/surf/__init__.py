@@ -7,4 +7,7 @@ from frontends.surf.frontend import SurfFrontend
 from frontends.surf.keypoints import Keypoints
 from frontends.surf.surf import Surf
 
-__all__ = ["Keypoints", "Surf", "SurfConfig", "SurfFrontend"]
+#: As ``cv2.xfeatures2d.SURF_create``, see `Surf.create`.
+create = Surf.create
+
+__all__ = ["Keypoints", "Surf", "SurfConfig", "SurfFrontend", "create"]

@@ -64,6 +64,8 @@ class SurfFrontend:
         self._white = FullScale()
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
+        self._own_mask = self._mask
+        self._last_mask: NDArray | None = None  # of a frame, rectified in `_mask`
 
     @property
     def threshold(self) -> float:
@@ -79,6 +81,7 @@ class SurfFrontend:
         """Features of one stereo frame, see `slam.interfaces.Frontend`."""
         if not isinstance(frame, StereoFrame):
             raise SequenceError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
+        self._take_mask(frame.left_mask)
         given = [frame.left] if frame.right is None else [frame.left, frame.right]
         given = [self._checked(frame, image, side) for side, image in enumerate(given)]
         white, paired = self._white.of(given[0]), len(given) > 1
@@ -145,6 +148,15 @@ class SurfFrontend:
             size = "x".join(str(n) for n in mask.shape[::-1])
             raise ConfigurationError(f"mask: {size}, but the images are {self.rig.width}x{self.rig.height}")
         return (self._rectify((mask != 0).astype(np.uint8), 0) != 0).astype(np.uint8)
+
+    def _take_mask(self, mask: NDArray | None) -> None:
+        """Use the mask of a frame, beside the front end's own one; it is the same array in all frames of a sequence."""
+        if mask is self._last_mask:
+            return
+        self._last_mask = mask
+        rectified = None if mask is None else self._rectified_mask(mask)
+        masks = [m for m in (self._own_mask, rectified) if m is not None]
+        self._mask = np.minimum.reduce(masks) if masks else None
 
     def _detect(self, white: float, integral: NDArray[np.int32]) -> tuple[Keypoints, float]:
         """Features, and the D_threshold that found them (paper A, III.A).

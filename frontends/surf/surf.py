@@ -52,23 +52,46 @@ class Surf:
         upright: bool = True,
         threads: int = 1,
     ) -> None:
-        if not (np.isfinite(threshold) and threshold >= 0):
-            raise ConfigurationError(f"threshold: must be a number of at least 0, not {threshold}")
-        if octaves not in (1, 2, 3, 4):
-            raise ConfigurationError(f"octaves: must be 1 to 4, not {octaves}")
-        if layers not in (2, 3):
-            raise ConfigurationError(f"layers: must be 2 or 3, not {layers}")
+        self.setHessianThreshold(threshold)
+        self.setNOctaves(octaves)
+        self.setNOctaveLayers(layers)
         if descriptor not in (16, 64):
             raise ConfigurationError(f"descriptor: must be 16 or 64, not {descriptor}")
         if not isinstance(threads, int) or threads < 1:
             raise ConfigurationError(f"threads: must be a whole number of at least 1, not {threads}")
-        self.threshold = float(threshold)
-        self.octaves = octaves
-        self.layers = layers
         self.descriptor = descriptor
-        self.upright = bool(upright)
+        self.setUpright(upright)
         self.workers = Workers(threads)
         self._weights = gaussian_weights(4 if descriptor == 64 else 2)
+
+    @classmethod
+    def create(
+        cls,
+        hessianThreshold: float = 100.0,
+        nOctaves: int = 4,
+        nOctaveLayers: int = 3,
+        extended: bool = False,
+        upright: bool = False,
+    ) -> Surf:
+        """As ``cv2.xfeatures2d.SURF_create``: the same arguments in the same order, with the same defaults.
+
+        Args:
+            hessianThreshold: least determinant of the Hessian.
+            nOctaves: 1 to 4.
+            nOctaveLayers: 2 or 3.
+            extended: 128 numbers in a descriptor, which this SURF does not have; only False is taken.
+            upright: leave the orientation out.
+
+        Raises:
+            ConfigurationError: a value is out of its range.
+
+        Examples:
+            >>> Surf.create(400).getNOctaves()
+            4
+        """
+        surf = cls(hessianThreshold, nOctaves, nOctaveLayers, 64, upright)
+        surf.setExtended(extended)
+        return surf
 
     def detect(self, image: NDArray, mask: NDArray | None = None, threshold: float | None = None) -> Keypoints:
         """Features of an image (H, W) or (H, W, 3|4), uint8 or uint16, by falling response; no angle yet.
@@ -141,6 +164,53 @@ class Surf:
         """The same as OpenCV's method of this name: ``cv2.KeyPoint`` objects and descriptors (N, 16 or 64)."""
         keypoints, descriptors = self.detect_and_describe(image, mask)
         return keypoints.to_cv2(), descriptors
+
+    def getHessianThreshold(self) -> float:
+        """Least determinant of the Hessian."""
+        return self.threshold
+
+    def setHessianThreshold(self, hessianThreshold: float) -> None:
+        """Set it; raises ConfigurationError below 0."""
+        if not (np.isfinite(hessianThreshold) and hessianThreshold >= 0):
+            raise ConfigurationError(f"threshold: must be a number of at least 0, not {hessianThreshold}")
+        self.threshold = float(hessianThreshold)
+
+    def getNOctaves(self) -> int:
+        """Number of octaves."""
+        return self.octaves
+
+    def setNOctaves(self, nOctaves: int) -> None:
+        """Set it; raises ConfigurationError outside 1 to 4."""
+        if nOctaves not in (1, 2, 3, 4):
+            raise ConfigurationError(f"octaves: must be 1 to 4, not {nOctaves}")
+        self.octaves = int(nOctaves)
+
+    def getNOctaveLayers(self) -> int:
+        """Layers searched for maxima in each octave."""
+        return self.layers
+
+    def setNOctaveLayers(self, nOctaveLayers: int) -> None:
+        """Set it; raises ConfigurationError outside 2 to 3."""
+        if nOctaveLayers not in (2, 3):
+            raise ConfigurationError(f"layers: must be 2 or 3, not {nOctaveLayers}")
+        self.layers = int(nOctaveLayers)
+
+    def getExtended(self) -> bool:
+        """Whether descriptors have 128 numbers: never."""
+        return False
+
+    def setExtended(self, extended: bool) -> None:
+        """Raises ConfigurationError for True."""
+        if extended:
+            raise ConfigurationError("extended: there are no descriptors of 128 numbers; extended=False gives 64")
+
+    def getUpright(self) -> bool:
+        """Whether the orientation is left out."""
+        return self.upright
+
+    def setUpright(self, upright: bool) -> None:
+        """Set it."""
+        self.upright = bool(upright)
 
     def descriptorSize(self) -> int:
         """Numbers in a descriptor."""

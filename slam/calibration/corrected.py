@@ -50,7 +50,7 @@ def corrected_rig(model: RigModel, parameters: Array) -> CorrectedRig:
     R = rectified.R_right.T @ so3_exp(-np.array([pitch, yaw, roll])) @ rectified.R_left
     centre = np.array([1.0, down, forward])
     b = -rig.baseline * (rectified.R_left.T @ centre) / np.linalg.norm(centre)
-    return CorrectedRig(StereoRig(left, right, R, b), left_off, right_off)
+    return CorrectedRig(StereoRig(left, right, R, b, rig.turns), left_off, right_off)
 
 
 def _camera(

@@ -27,6 +27,7 @@ from slam.commands.options import (
     KindOption,
     LiveOption,
     MapOption,
+    MaskOption,
     MonoOption,
     OptionalSequence,
     OutOption,
@@ -106,6 +107,7 @@ def run_command(
     save_map: SaveMapOption = None,
     mono: MonoOption = False,
     calibration: CalibrationOption = None,
+    mask: MaskOption = None,
     viewer: ViewerOption = None,
     draw: DrawOption = None,
     overlap: OverlapOption = True,
@@ -119,11 +121,15 @@ def run_command(
     from slam.commands.display import Progress
     from slam.commands.folders import run_folder
     from slam.commands.run import Wanted, prepare, shown
+    from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
     from slam.run.runner import run
-    from slam.sequences import is_live
+    from slam.sequences import is_live, with_mask
 
+    sequence = None if sequence is None else with_mask(sequence, mask)
+    if sequence is None and mask is not None:
+        raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
     wanted = Wanted(
         sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
     )
@@ -259,6 +265,7 @@ def compare_command(
         typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:..."),
     ] = None,
     settings: SetOption = None,
+    mask: MaskOption = None,
     trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 1,
     frames: FramesOption = None,
     replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
@@ -272,7 +279,9 @@ def compare_command(
     from slam.commands import compare as command
     from slam.compare.plan import Plan
     from slam.run.runner import parse_frames
+    from slam.sequences import with_mask
 
+    sequences = [with_mask(text, mask) for text in sequences]
     names = [[word for word in text.split(",") if word] for text in (backends, frontends)]
     variants = command.variants_of(names[1], variant or [], settings or [])
     plan = Plan(tuple(sequences), tuple(names[0]), variants, trials, *parse_frames(frames), replay)
@@ -289,7 +298,7 @@ def calibrate_command(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
-        "calibration.json"
+        "rig_errors.json"
     ),
     opencv: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="The corrected calibration in OpenCV's form.")
@@ -300,6 +309,7 @@ def calibrate_command(
     settings: SetOption = None,
     frames: FramesOption = None,
     format: FormatOption = None,
+    mask: MaskOption = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -307,7 +317,9 @@ def calibrate_command(
     from slam.commands.calibrate import calibrate
     from slam.run.calibrating import Targets
     from slam.run.runner import parse_frames
+    from slam.sequences import with_mask
 
+    sequences = [with_mask(text, mask) for text in sequences]
     targets = Targets(out, opencv, kalibr, overwrite)
     with leaving("nothing is written"):
         calibrate(sequences, targets, settings or [], parse_frames(frames), format, quiet)

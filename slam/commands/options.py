@@ -77,6 +77,10 @@ RecordOption = Annotated[
 MapOption = Annotated[Path | None, typer.Option("--map", metavar="FILE", help="Start in the map of an earlier run.")]
 SaveMapOption = Annotated[Path | None, typer.Option("--save-map", metavar="FILE", help="Keep the map.")]
 MonoOption = Annotated[bool, typer.Option("--mono", help="Left images alone, in a prior map.")]
+MaskOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE[,FILE]", help="Image that is black where a camera sees its own car; left, right."),
+]
 CalibrationOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="What is known of the rig: from `slam calibrate`, or an earlier run."),

@@ -18,6 +18,10 @@ DISTORTION_MODELS = {"none": (0,), "radtan": (4, 5, 8), "equidistant": (4,)}
 _MOST = 1e9  # guard: of a calibration's numbers
 _WIDEST = 100_000  # guard: width or height [px]
 
+#: guard: largest distance of a principal point from the middle of an image, as a share of its width or height. That
+#: of a calibration for images half or twice as large is off by a quarter or a half.
+_OFF_MIDDLE = 0.2
+
 _UNDISTORT_ITERATIONS = 50  # numerics: of the fixed point at most; usual lenses need fewer than ten
 _UNDISTORT_TOLERANCE = 1e-13  # numerics: in normalised coordinates: 1e-10 px at any usual focal length
 
@@ -101,6 +105,18 @@ class PinholeCamera:
             values = [0.0] * 4
         distortion = () if model == "none" else tuple(values)
         return cls(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size, model, distortion)
+
+    def turned(self, turns: int) -> PinholeCamera:
+        """The camera of images that are turned so many quarters anticlockwise, as ``numpy.rot90`` does."""
+        if turns % 4 == 0:
+            return self
+        D = list(self.distortion)
+        if self.model == "radtan":
+            D[2:4] = -D[3], D[2]
+        once = PinholeCamera(
+            self.fv, self.fu, self.v0, self.width - 1 - self.u0, self.height, self.width, self.model, tuple(D)
+        )
+        return once.turned(turns % 4 - 1)
 
     @property
     def K(self) -> Array:
@@ -192,6 +208,19 @@ class PinholeCamera:
         from slam.geometry import lens_kernels
 
         return np.asarray(lens_kernels.undistort(np.ascontiguousarray(target), self._coefficients, self._radius_limit))
+
+
+def size_doubt(left: PinholeCamera, right: PinholeCamera) -> str:
+    """What is wrong with a principal point far from the middle of the images; empty if it is near."""
+    for side, camera in (("left", left), ("right", right)):
+        point, middle = np.array([camera.u0, camera.v0]), np.array([camera.width, camera.height]) / 2
+        if (np.abs(point - middle) > 2 * _OFF_MIDDLE * middle).any():
+            return (
+                f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
+                f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
+                "another size?"
+            )
+    return ""
 
 
 def _floats(what: str, values: ArrayLike) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera
+from slam.geometry.camera import PinholeCamera, size_doubt
 from slam.geometry.se3 import Array, nearest_rotation
 
 _LONGEST = 1e6  # guard: baseline [m]
@@ -18,6 +18,11 @@ _LONGEST = 1e6  # guard: baseline [m]
 _ZERO_DISPARITY = 1024  # fixed: OpenCV's CALIB_ZERO_DISPARITY, whose module differs between its versions
 
 _FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 / 0.7 · width / fu) of view
+
+
+def quarter_turn(turns: int) -> Array:
+    """Rotation (3, 3) that takes camera axes to those of an image turned so many quarters anticlockwise."""
+    return np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns % 4)
 
 
 class RectificationMaps(NamedTuple):
@@ -38,6 +43,8 @@ class StereoRig:
         left, right: the cameras, with images of the same size.
         R: rotation (3, 3) from left-camera to right-camera axes.
         b: translation (3,) [m].
+        turns: by how many quarter turns, anticlockwise, images as recorded are turned to be those of this rig, see
+            `side_by_side`.
 
     Raises:
         CalibrationError: R is no rotation, the baseline is zero or not finite, the image sizes differ, or the
@@ -48,6 +55,7 @@ class StereoRig:
     right: PinholeCamera
     R: Array
     b: Array
+    turns: int = 0
 
     def __post_init__(self) -> None:
         if not (isinstance(self.left, PinholeCamera) and isinstance(self.right, PinholeCamera)):
@@ -70,13 +78,16 @@ class StereoRig:
         baseline = float(np.linalg.norm(b))
         if baseline < 1e-6:
             raise CalibrationError("stereo baseline is zero: depth cannot be measured")
+        if abs(b[0]) < 0.5 * baseline:
+            raise CalibrationError(
+                "the cameras do not stand side by side: the baseline is not along image rows. Of cameras above each "
+                "other turn both images by 90 degrees; recordings with such a calibration are turned when they are read"
+            )
         if -b[0] < 0:
             raise CalibrationError(
                 f"the right camera stands {b[0]:.4f} m to the left of the left one: "
                 "are the cameras swapped, or is the sign of T (or of P2) wrong? T is about (-baseline, 0, 0)"
             )
-        if -b[0] < 0.5 * baseline:
-            raise CalibrationError("the cameras do not stand side by side: the baseline is not along image rows")
         R = nearest_rotation(R)
         R.flags.writeable = b.flags.writeable = False
         object.__setattr__(self, "R", R)
@@ -90,6 +101,27 @@ class StereoRig:
         left = PinholeCamera(f, f, u0, v0, width, height)
         right = PinholeCamera(f, f, u0 + doffs, v0, width, height)
         return cls(left, right, np.eye(3), np.array([-baseline, 0, 0]))
+
+    @classmethod
+    def side_by_side(cls, left: PinholeCamera, right: PinholeCamera, R: Array, b: Array) -> StereoRig:
+        """A rig of cameras as they are, turned by a quarter where they stand above each other, so that `b` is along x.
+
+        Raises:
+            CalibrationError: see the class.
+        """
+        across, along = np.abs(np.asarray(b, float)[:2])
+        if not along > 2 * across:
+            return cls(left, right, R, b)
+        turns = 1 if b[1] < 0 else -1  # the second camera stands below the first, or above it
+        Q = quarter_turn(turns)
+        return cls(left.turned(turns), right.turned(turns), Q @ R @ Q.T, Q @ b, turns)
+
+    @property
+    def as_recorded(self) -> tuple[PinholeCamera, PinholeCamera, Array, Array]:
+        """Cameras, rotation and b of the images before they were turned: the inverse of `side_by_side`."""
+        Q = quarter_turn(-self.turns)
+        left, right = self.left.turned(-self.turns), self.right.turned(-self.turns)
+        return left, right, Q @ self.R @ Q.T, Q @ self.b
 
     @classmethod
     def from_pinhole(
@@ -336,16 +368,11 @@ def rectify(rig: StereoRig) -> RectifiedRig:
         P_left[0, 2], P_left[1, 2] = (rig.width - 1) / 2, (rig.height - 1) / 2
         P_right[0, 2] = P_left[0, 2]
     if not (np.isfinite(P_left).all() and np.isfinite(P_right).all() and 0.05 * rig.left.fu < f < 20 * rig.left.fu):
-        raise CalibrationError("stereo rig cannot be rectified: the two cameras share no usable view")
-    rectified_rig = StereoRig.rectified_pair(
-        f,
-        float(P_left[0, 2]),
-        float(P_left[1, 2]),
-        rig.baseline,
-        rig.width,
-        rig.height,
-        float(P_right[0, 2] - P_left[0, 2]),
-    )
+        doubt = size_doubt(rig.left, rig.right)
+        reason = doubt or "the two cameras share no usable view"
+        raise CalibrationError(f"stereo rig cannot be rectified: {reason}")
+    u0, v0, doffs = float(P_left[0, 2]), float(P_left[1, 2]), float(P_right[0, 2] - P_left[0, 2])
+    rectified_rig = StereoRig.rectified_pair(f, u0, v0, rig.baseline, rig.width, rig.height, doffs)
     return RectifiedRig(rig, rectified_rig, R_left, R_right)
 
 

@@ -6,19 +6,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, quote
 
 from slam.errors import ConfigurationError, SequenceError, UnknownNameError
 from slam.files import expanded, note_input, reason
 from slam.naming import nearest, suggestion, unknown
 from slam.sequences.base import RecordedSequence, Sequence, is_live
+from slam.sequences.door import read_masks
+from slam.sequences.given import OPTIONS, Given
 
-__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence"]
+__all__ = ["RecordedSequence", "Sequence", "formats", "is_live", "open_sequence", "with_mask"]
 
 _SYNTHETIC = "synthetic:"
 _CAMERA = "camera:"
@@ -30,12 +32,15 @@ _FORMATS = {
     "kitti-raw": ("slam.sequences.kitti_raw", "KITTI raw drives: image_00/data, image_01/data"),
     "kitti": ("slam.sequences.kitti", "KITTI odometry sequences: image_0, image_1, calib.txt"),
     "ros": ("slam.sequences.ros", "ROS 1 and 2: .bag, .mcap and .db3 files, and the folders of ROS 2"),
-    "folders": ("slam.sequences.folders", "two folders or videos (left, right) with an OpenCV or Kalibr calibration"),
+    "folders": (
+        "slam.sequences.folders",
+        "two folders or videos (left, right), or one with both (layout=sbs), and a calibration",
+    ),
 }
 _MOST_OPTIONS = 100
 _LOOKED_AT = 1000  # files and folders below one that is no sequence
 _LEVELS_ABOVE = 3  # folders above one that is no sequence: mav0/cam0/data
-_COMMON_OPTIONS = frozenset({"kind"})
+_CAMERA_OPTIONS = frozenset({"kind", "mask"})
 
 
 def formats() -> dict[str, str]:
@@ -80,20 +85,39 @@ def open_sequence(path: str | Path, format: str | None = None) -> Sequence:
 def _open_folder(text: str, format: str | None) -> RecordedSequence:
     """A sequence on disk."""
     folder, options = _split(text)
-    _require_recording(folder, text)
+    if not (folder.is_file() and "layout" in options):
+        _require_recording(folder, text)
     name = _detect(folder, options) if format is None else _known(format)
     module = import_module(_FORMATS[name][0])
-    _check_options(name, options, getattr(module, "OPTIONS", frozenset()))
-    open_folder: Callable[[Path, dict[str, str]], RecordedSequence] = module.open_folder
+    _check_options(name, options, OPTIONS | getattr(module, "OPTIONS", frozenset()))
     note_input(folder)
-    return open_folder(folder, options)
+    given = Given(options)
+    opened: RecordedSequence = module.open_folder(folder, given)
+    masks = read_masks(given.get("mask"), folder if folder.is_dir() else folder.parent, opened.rig)
+    given.require_read(f"{folder} is read as {name}")
+    return replace(opened, masks=masks)
 
 
 def _open_world(text: str) -> Sequence:
     """A synthetic world by its text, ``synthetic:`` in front."""
     from slam.worlds import open_world
 
-    return open_world(text)
+    name, mark, query = text.partition("?")
+    masks = [part for part in query.split("&") if part.startswith("mask=")]
+    opened = open_world(name + mark + "&".join(part for part in query.split("&") if part not in masks))
+    if masks:
+        opened.masks = read_masks(_options(masks[-1])["mask"], Path.cwd(), opened.rig)
+        opened.name = text.removeprefix(_SYNTHETIC)
+    return opened
+
+
+def with_mask(text: str, mask: str | None) -> str:
+    """A sequence's text with the option ``mask`` added, names relative to the working folder; as it is for None."""
+    if mask is None:
+        return text
+    names = ",".join(str(expanded(name).absolute()) if name else "" for name in mask.split(","))
+    mark = "&" if "?" in text and not _exists(text) else "?"
+    return f"{text}{mark}mask={quote(names, safe='/,')}"
 
 
 def _open_camera(text: str) -> Sequence:
@@ -101,11 +125,11 @@ def _open_camera(text: str) -> Sequence:
     from slam.sequences import camera
 
     name, mark, query = text.rpartition("?")
-    known = camera.OPTIONS | _COMMON_OPTIONS
+    known = camera.OPTIONS | _CAMERA_OPTIONS
     options = _options(query) if mark else {}
     if not mark or ("://" in name and not set(options) <= known):
         name, options = text, {}
-    _check_options("camera", options, camera.OPTIONS)
+    _check_options("camera", options, known)
     return camera.open_camera(name, options)
 
 
@@ -160,7 +184,7 @@ def _video_meant(file: Path) -> str:
 
     if file.suffix.lower() not in VIDEO_SUFFIXES:
         return ""
-    return f"; a video with both images side by side is camera:{file}, two videos are {file.parent}?left=…&right=…"
+    return f"; a video with both images side by side is {file}?layout=sbs, two videos are {file.parent}?left=…&right=…"
 
 
 def _world_meant(text: str) -> str:
@@ -199,7 +223,7 @@ def _detect(folder: Path, options: dict[str, str]) -> str:
     """The first format that the folder looks like; told where left and right are, it needs not look."""
     if _is_ros(folder):
         return "ros"
-    if "left" in options or "right" in options:
+    if options.keys() & {"left", "right", "layout"}:
         return "folders"
     name = _format_of(folder)
     if name is None:
@@ -253,9 +277,8 @@ def _known(format: str) -> str:
     return format
 
 
-def _check_options(name: str, options: dict[str, str], own: frozenset[str]) -> None:
+def _check_options(name: str, options: dict[str, str], known: frozenset[str]) -> None:
     """Refuse unknown options, and kinds of motion that do not exist."""
-    known = own | _COMMON_OPTIONS
     strange = sorted(set(options) - known)
     if strange:
         hint = f"{suggestion(strange[0], known)}; known: {', '.join(sorted(known))}"

@@ -6,11 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from slam.data import StereoFrame
-from slam.geometry.rig import StereoRig
+from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory, TruthNoise
+from slam.sequences.door import Masks, at_the_door
 from slam.sequences.faults import FaultLog
 from slam.showing import sequence_html, sequence_line
 
@@ -96,6 +99,7 @@ class RecordedSequence:
         gps: a positions-only track (N, 4) of rows ``stamp [s], forward, right, third [m]``, good in the plane only;
             None where there is none. It is no pose and in no camera's axes: compare positions after alignment.
         truth_noise: how well the ground truth is known.
+        masks: of both cameras, where their images may be used; see `slam.sequences.door`.
     """
 
     name: str
@@ -107,6 +111,13 @@ class RecordedSequence:
     gps: Array | None = None
     warnings: list[str] = field(default_factory=list)
     truth_noise: TruthNoise = field(default_factory=TruthNoise)
+    masks: Masks = (None, None)
+
+    def __post_init__(self) -> None:
+        if self.ground_truth is not None and self.rig.turns:
+            truth, Q = self.ground_truth, np.eye(4)
+            Q[:3, :3] = quarter_turn(-self.rig.turns)
+            object.__setattr__(self, "ground_truth", Trajectory(truth.stamps, truth.poses @ Q))
 
     @property
     def stamps(self) -> Array:
@@ -130,4 +141,5 @@ class RecordedSequence:
     def _read(self, start: int, stop: int) -> Iterator[StereoFrame]:
         """Decode lazily and sum up repeated faults at the end, also where the caller stops early."""
         with FaultLog(self.warnings) as faults:
-            yield from self.source.read(start, stop, faults)
+            for frame in self.source.read(start, stop, faults):
+                yield at_the_door(frame, self.rig, self.masks)

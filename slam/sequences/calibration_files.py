@@ -8,6 +8,7 @@ from slam.errors import CalibrationError
 from slam.files import write_text
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import pose
 
 _FISHEYE = "equidistant"
 
@@ -21,16 +22,17 @@ def write_opencv(path: Path, rig: StereoRig) -> None:
     import cv2
     import numpy as np
 
+    left, right, R, b = rig.as_recorded
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    storage.write("image_width", rig.width)
-    storage.write("image_height", rig.height)
+    storage.write("image_width", left.width)
+    storage.write("image_height", left.height)
     if rig.left.model == _FISHEYE:
         storage.write("distortion_model", _FISHEYE)
-    for number, camera in enumerate((rig.left, rig.right), 1):
+    for number, camera in enumerate((left, right), 1):
         storage.write(f"K{number}", camera.K)
         storage.write(f"D{number}", np.array([camera.distortion or (0.0,) * 4]))
-    storage.write("R", rig.R)
-    storage.write("T", (rig.R @ rig.b).reshape(3, 1))
+    storage.write("R", R)
+    storage.write("T", (R @ b).reshape(3, 1))
     write_text(path, storage.releaseAndGetString())
 
 
@@ -44,8 +46,9 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
     import yaml
 
     require_kalibr(path, rig)
-    left, right = _kalibr_camera(rig.left), _kalibr_camera(rig.right)
-    right["T_cn_cnm1"] = rig.T_right_left.tolist()
+    cameras = rig.as_recorded
+    left, right = (_kalibr_camera(camera) for camera in cameras[:2])
+    right["T_cn_cnm1"] = pose(cameras[2], cameras[2] @ cameras[3]).tolist()
     write_text(path, yaml.safe_dump({"cam0": left, "cam1": right}, default_flow_style=None, sort_keys=False))
 
 

@@ -16,8 +16,10 @@ from slam.files import expanded
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import devices, rigs
+from slam.sequences.door import at_the_door, read_masks
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import size_text
+from slam.sequences.given import flag, number
+from slam.sequences.images import halves, size_text
 
 #: Options besides ``kind``.
 OPTIONS = frozenset({"left", "right", "swap", "width", "height", "fps", "wait"}) | rigs.OPTIONS
@@ -59,27 +61,24 @@ class CameraSequence:
         self.warnings: list[str] = []
         self._addresses = addresses
         self._size_wanted = tuple(_whole(options, name) for name in ("width", "height"))
-        self._fps = _number(options, "fps", 1e-3, 1e5)
-        wait = _number(options, "wait", 0.0, _LONGEST_WAIT)
+        self._fps = number(options, "fps", 1e-3, 1e5)
+        wait = number(options, "wait", 0.0, _LONGEST_WAIT)
         self._wait = WAIT if wait is None else wait
-        self._swap = rigs.flag(options, "swap")
+        self._swap = flag(options, "swap")
         self._origin = time.time() - time.monotonic()
         self._cameras: _Cameras | None = self._open()
         try:
             paths = self._calibration_files(options)
             _, left, _ = self._first(self._cameras)
             self.rig: StereoRig = self._rig(paths, (left.shape[1], left.shape[0]), options)
+            self._masks = read_masks(options.get("mask"), Path.cwd(), self.rig)
         except BaseException:
             self._cameras.release()
             raise
-        if self._cameras.have_an_end:  # a file is played from its first image; what a device has given is over
-            self._cameras.release()
-            self._cameras = None
 
     def _calibration_files(self, options: Mapping[str, str]) -> list[Path]:
-        """Those that are named, or that lie beside a file that is played, or in the working folder."""
-        first = Path(self._addresses[0])
-        folder = first.absolute().parent if devices.plays_a_file(self._addresses[0]) else Path.cwd()
+        """Those that are named, or that lie in the working folder."""
+        folder = Path.cwd()
         try:
             return rigs.calibration_files(folder, options)
         except CalibrationError:
@@ -108,15 +107,13 @@ class CameraSequence:
             while stop is None or index < stop:
                 pair = cameras.read()
                 if pair is None:
-                    if cameras.have_an_end:
-                        return
                     cameras.release()
                     cameras, pair = self._again(faults)
                 self._require_size(pair[1])
                 if pair[0] > last:  # the clock of the machine may have been set back
                     last = pair[0]
                     if index >= start:
-                        yield StereoFrame(index, *pair)
+                        yield at_the_door(StereoFrame(index, *pair), self.rig, self._masks)
                     index += 1
 
     def _fresh(self) -> _Cameras:
@@ -130,7 +127,7 @@ class CameraSequence:
     def _require_size(self, image: np.ndarray) -> None:
         """Raise where a camera has changed the size of its images, as one may that was opened again."""
         size, expected = image.shape[::-1], (self.rig.width, self.rig.height)
-        if size != expected:
+        if size != (expected[::-1] if self.rig.turns % 2 else expected):
             raise SequenceError(
                 f"{self.name}: images are {size_text(size)} now; they were {size_text(expected)}, as in the calibration"
             )
@@ -168,7 +165,7 @@ class CameraSequence:
             pair = cameras.read()
             if pair is not None:
                 return pair
-            if cameras.have_an_end or time.monotonic() - began >= self._wait:
+            if time.monotonic() - began >= self._wait:
                 raise SequenceError(f"{self.name}: it is open, but gives no images")
             time.sleep(_AGAIN)
 
@@ -203,7 +200,6 @@ class _Cameras:
             origin,
             "camera:" + ",".join(map(devices.without_password, addresses)),
         )
-        self.have_an_end = any(devices.plays_a_file(a) for a in addresses)
         self.last_read = time.monotonic()
         self._devices: list[devices.Device] = []
         try:
@@ -228,18 +224,11 @@ class _Cameras:
         images = [image for device in self._devices if (image := devices.read_image(device)) is not None]
         if len(images) < len(self._devices):
             return None
-        left, right = self._halves(images[0]) if len(images) == 1 else (images[0], images[1])
+        left, right = halves(images[0], self._name) if len(images) == 1 else (images[0], images[1])
         if left.shape != right.shape:
             sizes = " and ".join(size_text(image.shape[::-1]) for image in (left, right))
             raise SequenceError(f"{self._name}: left and right images differ in size: {sizes}")
         return (stamp, right, left) if self._swap else (stamp, left, right)
-
-    def _halves(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        width = image.shape[1]
-        if width % 2 or width < 2:
-            size = size_text(image.shape[1::-1])
-            raise SequenceError(f"{self._name}: an image of {size} cannot hold two side by side")
-        return image[:, : width // 2], image[:, width // 2 :]
 
     def release(self) -> None:
         """Close them."""
@@ -272,19 +261,6 @@ def open_camera(text: str, options: Mapping[str, str]) -> CameraSequence:
     return CameraSequence(plain, options)
 
 
-def _number(options: Mapping[str, str], name: str, low: float, high: float) -> float | None:
-    """An option that is a number; None where it is not given."""
-    if name not in options:
-        return None
-    try:
-        value = float(options[name])
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise ConfigurationError(f"{name} must be a number from {low:g} to {high:g}, got {options[name]!r}")
-    return value
-
-
 def _whole(options: Mapping[str, str], name: str) -> int | None:
-    value = _number(options, name, 1, _WIDEST)
+    value = number(options, name, 1, _WIDEST)
     return None if value is None else int(value)

@@ -8,20 +8,10 @@ from typing import Any
 import numpy as np
 
 from slam.errors import CalibrationError
-from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, pose
-from slam.sequences.calibration import (
-    NO_NUMBERS,
-    projection_offset,
-    require_possible,
-    rig_from_projections,
-    rig_from_transform,
-)
-
-_MODELS = {
-    "": False, "none": False, "plumb_bob": False, "rational_polynomial": False, "equidistant": True, "fisheye": True,
-}  # fmt: skip
+from slam.geometry.se3 import Array
+from slam.sequences.calibration import NO_NUMBERS, require_possible
+from slam.sequences.calibration_keys import Entries, rig_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +56,8 @@ class CameraInfo:
         return float(-self.P[0, 3] / self.P[0, 0]) if self.P[0, 0] > 0 else float("nan")
 
 
-def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool) -> StereoRig:
-    """The rig of the rectified or of the raw images.
-
-    For the raw ones ``h_rectified = R h`` in each camera, and the rectified cameras differ by the baseline in ``P``.
+def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool, unit: float = 1.0) -> StereoRig:
+    """The rig of the rectified or of the raw images; the baseline in ``P`` is in units of so many metres.
 
     Raises:
         CalibrationError: a camera is not calibrated, or not as one of a pair; or the rig is impossible.
@@ -77,22 +65,14 @@ def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool) 
     for side, info in (("left", left), ("right", right)):
         if not (info.P[0, 0] > 0 and info.K[0, 0] > 0):
             raise CalibrationError(f"the {side} camera is not calibrated: K or P is zero")
-    if right.P[0, 3] == left.P[0, 3]:
-        raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
     if left.size != right.size:
         raise CalibrationError("the images of the two cameras differ in size")
-    if rectified:
-        return rig_from_projections(left.P, right.P, left.size)
-    offset = projection_offset(right.P) - projection_offset(left.P)
-    T_right_left = pose(right.R.T @ left.R, right.R.T @ offset)
-    return rig_from_transform(_camera(left), _camera(right), T_right_left)
-
-
-def _camera(info: CameraInfo) -> PinholeCamera:
-    model = info.model.lower()
-    if model not in _MODELS:
-        raise CalibrationError(f"distortion model {info.model!r} is not supported")
-    return PinholeCamera.from_matrix(info.K, info.D, info.size, fisheye=_MODELS[model])
+    names = "cameramatrix", "distcoeffs", "rectificationmatrix", "projectionmatrix", "distortionmodel", "size"
+    files = [
+        {name: (name, value) for name, value in zip(names, (i.K, i.D, i.R, i.P, i.model, i.size))}
+        for i in (left, right)
+    ]
+    return rig_of(Entries(files), left.size, unit, rectified, False)
 
 
 def _matrix(message: Any, name: str, shape: tuple[int, ...]) -> Array:

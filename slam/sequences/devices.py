@@ -1,17 +1,15 @@
-"""Cameras as OpenCV opens them: by number, by a GStreamer pipeline, by an address in a network, or a file played."""
+"""Cameras as OpenCV opens them: by number, by a GStreamer pipeline, or by an address in a network."""
 
 from __future__ import annotations
 
-import time
+import os
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from slam.errors import ConfigurationError, SequenceError
-from slam.files import note_input
+from slam.errors import SequenceError
 from slam.sequences.quiet import quiet_libraries
-from slam.sequences.videos import FASTEST, SLOWEST
 
 _TIMEOUT = 5000  # [ms] for an answer from the network
 
@@ -32,55 +30,24 @@ class Device(Protocol):
         ...
 
 
-class PlayedFile:
-    """A video file in a device's part.
-
-    Args:
-        capture: the file, a ``cv2.VideoCapture``.
-        fps: its images come so many a second; None for the rate of the file.
-    """
-
-    def __init__(self, capture: Any, fps: float | None = None) -> None:
-        import cv2
-
-        self._capture = capture
-        rate = float(capture.get(cv2.CAP_PROP_FPS)) if fps is None else fps
-        self._period = 1 / rate if SLOWEST <= rate <= FASTEST else 0.0
-        self._due = time.monotonic()
-
-    def grab(self) -> bool:
-        """The next image, when it is due."""
-        time.sleep(max(0.0, self._due - time.monotonic()))
-        self._due = max(self._due, time.monotonic()) + self._period
-        with quiet_libraries():  # a file is decoded here
-            return bool(self._capture.grab())
-
-    def retrieve(self) -> tuple[bool, Any]:
-        """The grabbed image."""
-        good, image = self._capture.retrieve()
-        return bool(good), image
-
-    def release(self) -> None:
-        """Close the file."""
-        self._capture.release()
-
-
 def open_device(address: str, width: int | None = None, height: int | None = None, fps: float | None = None) -> Device:
     """Open a camera.
 
     Args:
-        address: a number; a GStreamer pipeline that ends in ``appsink``; ``rtsp://…`` or another address of a
-            network; or a video file, which is played.
+        address: a number; a GStreamer pipeline that ends in ``appsink``; or ``rtsp://…`` or another address
+            of a network.
         width: asked of the camera [px]; None for its own choice.
         height: the same.
-        fps: the same [1/s]; of a file, how fast it is played.
+        fps: the same [1/s].
 
     Raises:
-        SequenceError: it cannot be opened.
-        ConfigurationError: width or height is asked of a file.
+        SequenceError: it cannot be opened, or is a file.
     """
     import cv2
 
+    if "!" not in address and "://" not in address and os.path.isfile(address):  # noqa: PTH113 unlike Path's, no errors
+        hint = f"with both images side by side it is run as '{address}?layout=sbs', at its own rate with --live"
+        raise SequenceError(f"camera:{address}: a file, not a camera; {hint}")
     with quiet_libraries():
         if address.isdecimal() and len(address) < 4:
             capture = cv2.VideoCapture(int(address))
@@ -90,29 +57,15 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
             capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
         else:
-            note_input(address)
             capture = cv2.VideoCapture(address)
         if not capture.isOpened():
             raise SequenceError(f"camera:{without_password(address)}: cannot be opened{_hint(address)}")
-        if plays_a_file(address):
-            if width is not None or height is not None:
-                capture.release()
-                raise ConfigurationError(f"camera:{address}: a file has a size of its own: leave out width and height")
-            return PlayedFile(capture, fps)
         wanted = ((cv2.CAP_PROP_FRAME_WIDTH, width), (cv2.CAP_PROP_FRAME_HEIGHT, height), (cv2.CAP_PROP_FPS, fps))
         for name, value in wanted:
             if value is not None:
                 capture.set(name, value)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # images that wait in a queue are old
     return capture
-
-
-def plays_a_file(address: str) -> bool:
-    """Whether an address is a file, which has an end."""
-    try:
-        return Path(address).is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def read_image(device: Device) -> np.ndarray | None:

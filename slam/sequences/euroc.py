@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,21 @@ from slam.geometry.se3 import Array, pose, rotation_from_quaternion
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.sequences.base import RecordedSequence
-from slam.sequences.calibration import ImuCamera, euroc_camera, kalibr_cameras, rig_from_cameras
+from slam.sequences.calibration import naming
+from slam.sequences.calibration_keys import body_pose, read_entries
 from slam.sequences.faults import FaultLog
+from slam.sequences.given import Given
+from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.source import (
-    ImagePairs,
     Listing,
-    hardware_tolerance,
+    by_names,
     image_names,
     in_order,
-    in_seconds,
     number_of,
-    pair_listings,
+    pair_up,
     present,
-    require_size,
+    read_times,
+    times_file,
 )
 from slam.sequences.tables import read_rows, shorten, stamp_and_name
 from slam.sequences.truth import LARGEST, require_truth
@@ -41,7 +44,7 @@ def matches(folder: Path) -> bool:
     return any((_root(folder) / cam / part).exists() for cam in ("cam0", "cam1") for part in ("data", "data.csv"))
 
 
-def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
+def open_folder(folder: Path, options: Given) -> RecordedSequence:
     """Open a sequence in EuRoC's format; `folder` holds ``mav0`` or is it.
 
     Raises:
@@ -51,19 +54,17 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
     root = _root(folder)
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
-        left_all, right_all = (_listing(root / cam, faults) for cam in ("cam0", "cam1"))
-        left, right_names = pair_listings(left_all, right_all, hardware_tolerance(left_all), "ns", faults)
-        cameras, calibration = _cameras(root)
-        rig = rig_from_cameras(cameras[0], cameras[1], calibration)
-        left, right_names, stamps = in_seconds(left, right_names, faults)
-        size = (rig.width, rig.height)
-        source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
-        require_size(source.first_size(), (rig.width, rig.height), calibration)
-        truth = _ground_truth(root, cameras[0].T_body_camera, faults)
+        left, right = _listings(root, faults)
+        path = times_file(folder, options)
+        _, source = pair_up(left, right, options, faults, read_times(path, faults))
+        own, size = _calibration(root), source.first_size()
+        named = "calibration" in options or not own
+        rig = read_rig(_named(folder, root, options) if named else own, size, options)
+        source = replace(source, size=size)
+        truth = _ground_truth(root, own, faults)
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    return RecordedSequence(
-        name, "euroc", options.get("kind", "handheld"), rig, source, truth, None, warnings, MOCAP_NOISE
-    )
+    kind = options.get("kind", "handheld")
+    return RecordedSequence(name, "euroc", kind, rig, source, truth, None, warnings, MOCAP_NOISE)
 
 
 def _root(folder: Path) -> Path:
@@ -71,44 +72,62 @@ def _root(folder: Path) -> Path:
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
-def _listing(camera: Path, faults: FaultLog) -> Listing:
-    """The images of one camera that exist, by ``data.csv`` or, where there is none, by their names."""
-    if not camera.is_dir():
-        reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
-        raise SequenceError(f"{camera}: {reason}")
-    data, table = camera / "data", camera / "data.csv"
-    if not table.exists():
-        by_stamp = [(stamp, name) for name in image_names(data) if (stamp := number_of(name)) is not None]
-        if not by_stamp:
-            raise SequenceError(f"{camera}: no data.csv, and no images named by their stamps in data")
-        by_stamp.sort()
-        keys = np.array([stamp for stamp, _ in by_stamp], np.int64)
-        return in_order(Listing(data, keys, [name for _, name in by_stamp]), str(data), faults)
+def _listings(root: Path, faults: FaultLog) -> list[Listing]:
+    """The images of both cameras that exist, by ``data.csv`` or, where there is none, by their names."""
+    cameras = [root / cam for cam in ("cam0", "cam1")]
+    for camera in cameras:
+        if not camera.is_dir():
+            reason = "a file where a folder should be" if camera.exists() else "missing, two cameras are needed"
+            raise SequenceError(f"{camera}: {reason}")
+    if all((camera / "data.csv").exists() for camera in cameras):
+        return [_listed(camera, faults) for camera in cameras]
+    folders = [camera / "data" for camera in cameras]
+    names = [[name for name in image_names(folder) if number_of(name) is not None] for folder in folders]
+    for folder, own in zip(folders, names):
+        if not own:
+            raise SequenceError(f"{folder.parent}: no data.csv, and no images named by their stamps in data")
+    return by_names(folders, names, faults)
+
+
+def _listed(camera: Path, faults: FaultLog) -> Listing:
+    """The images that ``data.csv`` lists."""
+    table = camera / "data.csv"
     rows = [row for row in read_rows(table, stamp_and_name, faults) if row is not None]
-    listing = Listing(data, np.array([s for s, _ in rows], np.int64), [n for _, n in rows])
+    listing = Listing(camera / "data", np.array([s for s, _ in rows], np.int64), [n for _, n in rows], True)
     return present(in_order(listing, str(table), faults), str(table), faults)
 
 
-def _cameras(root: Path) -> tuple[list[ImuCamera], Path]:
-    """Both cameras from ``sensor.yaml`` or, where those are missing, from a Kalibr ``camchain.yaml``."""
+def _calibration(root: Path) -> list[Path]:
+    """Both ``sensor.yaml`` or, where those are missing, a Kalibr ``camchain.yaml``; empty for neither."""
     files = [root / cam / "sensor.yaml" for cam in ("cam0", "cam1")]
-    if any(f.exists() for f in files):
-        return [euroc_camera(f) for f in files], files[1]
-    for name in _CAMCHAINS:
-        chain = root / name
-        if chain.is_file():
-            return kalibr_cameras(chain), chain
-    raise CalibrationError(f"{files[0]}: the calibration is missing (nor is there a Kalibr camchain.yaml)")
+    if any(file.exists() for file in files):
+        return files
+    return next(([root / name] for name in _CAMCHAINS if (root / name).is_file()), [])
 
 
-def _ground_truth(root: Path, T_body_camera: Array, faults: FaultLog) -> Trajectory | None:
+def _named(folder: Path, root: Path, options: Given) -> list[Path]:
+    """The calibration by option, or in the sequence's folder under a usual name."""
+    try:
+        return calibration_files(folder, options)
+    except CalibrationError:
+        if "calibration" in options:
+            raise
+        missing = f"{root / 'cam0' / 'sensor.yaml'}: the calibration is missing (nor is there a Kalibr camchain.yaml)"
+        raise CalibrationError(f"{missing}: add calibration=FILE") from None
+
+
+def _ground_truth(root: Path, calibration: list[Path], faults: FaultLog) -> Trajectory | None:
     """The left camera's path: body poses times the camera's pose in the body."""
     for folder in _TRUTH:
         path = root / folder / "data.csv"
         if path.is_file():
             try:
+                if not calibration:
+                    raise SequenceError(f"{path}: no sensor.yaml says where the camera is on the body")
+                with naming(calibration[0]):
+                    T_body_camera = body_pose(read_entries(calibration, None), 0)
                 return _camera_path(path, T_body_camera, faults)
-            except (TrajectoryError, SequenceError) as error:
+            except (TrajectoryError, SequenceError, CalibrationError) as error:
                 faults.report("ground truth", f"{error}; there is no ground truth")
     return None
 

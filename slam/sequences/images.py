@@ -65,6 +65,18 @@ def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray
     return image
 
 
+def halves(image: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """The left and the right half of an image that holds two side by side.
+
+    Raises:
+        SequenceError: its width is odd; the message names `what`.
+    """
+    width = image.shape[1]
+    if width % 2 or width < 2:
+        raise SequenceError(f"{what}: an image of {size_text(image.shape[1::-1])} cannot hold two side by side")
+    return image[:, : width // 2], image[:, width // 2 :]
+
+
 def size_text(size: tuple[int, ...]) -> str:
     """A size as text, width first."""
     return "x".join(str(s) for s in size)

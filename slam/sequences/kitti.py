@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slam.errors import SequenceError, TrajectoryError
+from slam.errors import CalibrationError, SequenceError, TrajectoryError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, pose
 from slam.geometry.trajectory import Trajectory, TruthNoise
@@ -20,28 +20,69 @@ from slam.sequences.calibration import (
     rig_from_projections,
 )
 from slam.sequences.faults import FaultLog
+from slam.sequences.given import Given
 from slam.sequences.images import Size
-from slam.sequences.source import ImagePairs, Listing, numbered, pair_listings, stamped
-from slam.sequences.tables import read_rows, seconds
+from slam.sequences.rigs import calibration_files, read_rig
+from slam.sequences.source import Listing, numbered, pair_up, read_times, times_file
 from slam.sequences.truth import require_truth
 
 #: The data sheet of KITTI's GPS/IMU unit (OXTS RT 3003, with RTK corrections): 2 cm, 0.03° in roll and pitch, and 0.1°
 #: in heading, which changes slowly. That, and how the camera stands to the unit, is left to be found.
 OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, mounting=float(np.radians(1.0)))
 
-#: Frames per second where there is no times.txt.
-RATE = 10.0
-
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Where the files of a sequence are.
+
+    Attributes:
+        name: of the sequence.
+        left, right: folders of the images.
+        cameras: their numbers.
+        calibration: the file.
+        times: the file, which may be missing.
+        poses: files of which the first that is there has the truth.
+    """
+
+    name: str
+    left: Path
+    right: Path
+    cameras: tuple[str, str]
+    calibration: Path
+    times: Path
+    poses: tuple[Path, ...]
+
+
 def matches(folder: Path) -> bool:
-    """Whether a folder looks like a KITTI odometry sequence."""
-    return any((folder / f"image_{i}").exists() for i in range(4))
+    """Whether a folder looks like a KITTI odometry sequence, or like the left images of one of KITTI tracking."""
+    return any((folder / f"image_{i}").exists() for i in range(4)) or _is_tracking(folder)
 
 
-def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
-    """Open one KITTI odometry sequence.
+def _is_tracking(folder: Path) -> bool:
+    """Whether a folder is ``image_02/0000`` with ``image_03/0000`` beside it."""
+    return folder.parent.name == "image_02" and (folder.parent.parent / "image_03" / folder.name).is_dir()
+
+
+def _layout(folder: Path) -> _Layout:
+    """Where the files are, of KITTI odometry or of KITTI tracking."""
+    if not _is_tracking(folder):
+        a, b = choose_pair(folder, "image_{}", _PAIRS)
+        poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
+        left, right = (folder / f"image_{camera}" for camera in (a, b))
+        return _Layout(folder.name, left, right, (a, b), folder / "calib.txt", folder / "times.txt", poses)
+    root, name = folder.parent.parent, folder.name
+    calibration = root / "calib" / f"{name}.txt"
+    if not calibration.exists():  # as downloaded: data_tracking_calib/training beside data_tracking_image_2/training
+        others = sorted(root.parent.parent.glob(f"*/{root.name}/calib/{name}.txt"))
+        calibration = others[0] if others else calibration
+    right = root / "image_03" / name
+    return _Layout(name, folder, right, ("2", "3"), calibration, root / f"times_{name}.txt", ())
+
+
+def open_folder(folder: Path, options: Given) -> RecordedSequence:
+    """Open one sequence of KITTI odometry, or of KITTI tracking.
 
     Raises:
         SequenceError: a camera or all its images are missing, or nothing can be paired.
@@ -49,22 +90,16 @@ def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
     """
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
-        cameras = choose_pair(folder, "image_{}", _PAIRS)
-        left_all, right_all = (numbered(folder / f"image_{c}", faults) for c in cameras)
-        left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
-        times = _times(folder / "times.txt", faults)
-        stamps: Array = left.keys / RATE
-        if times is not None:
-            keep, stamps = stamped(left.keys, times, folder / "times.txt", faults)
-            left, right_names = left.select(keep), [right_names[i] for i in keep]
-        source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names)
+        where = _layout(folder)
+        left_all, right_all = (numbered(side, faults) for side in (where.left, where.right))
+        path = times_file(folder, options, where.times)
+        left, source = pair_up(left_all, right_all, options, faults, read_times(path, faults), by_number=True)
         size = source.first_size()
-        rig, T_reference_left = _rig(folder / "calib.txt", cameras, size)
-        truth = _ground_truth(folder, left, stamps, T_reference_left, faults)
-    source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
+        rig, T_reference_left = _rig(folder, where, size, options)
+        truth = _ground_truth(where, left, source.stamps, T_reference_left, faults)
     kind = options.get("kind", "driving")
     noise = replace(OXTS_NOISE, wheels=kind == "driving")
-    return RecordedSequence(folder.name, "kitti", kind, rig, source, truth, None, warnings, noise)
+    return RecordedSequence(where.name, "kitti", kind, rig, replace(source, size=size), truth, None, warnings, noise)
 
 
 def choose_pair(folder: Path, pattern: str, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
@@ -86,29 +121,26 @@ def choose_pair(folder: Path, pattern: str, pairs: tuple[tuple[str, str], ...]) 
     raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
 
 
-def _times(path: Path, faults: FaultLog) -> Array | None:
-    """Times by frame number (T,), NaN for unreadable rows; None for 10 frames per second where there is no file."""
-    if not path.exists():
-        faults.assume(f"{path} is missing: {RATE:g} frames per second assumed")
-        return None
-    rows = read_rows(path, seconds, faults)
-    return np.array([np.nan if row is None else row for row in rows])
-
-
-def _rig(path: Path, cameras: tuple[str, str], size: Size) -> tuple[StereoRig, Array]:
+def _rig(folder: Path, where: _Layout, size: Size, options: Given) -> tuple[StereoRig, Array]:
     """The rig, and the left camera's pose (4, 4) in the frame of reference (camera 0), which the poses are of."""
-    rows = read_kitti(path)
-    with naming(path):
-        P_left, P_right = (kitti_matrix(rows, f"P{c}", (3, 4)) for c in cameras)
-        return rig_from_projections(P_left, P_right, size), pose(np.eye(3), -projection_offset(P_left))
+    named = calibration_files(folder, options) if "calibration" in options else None
+    if named and not where.calibration.exists():
+        return read_rig(named, size, options), np.eye(4)
+    if not where.calibration.exists():
+        raise CalibrationError(f"{where.calibration}: the calibration is missing: add calibration=FILE")
+    rows = read_kitti(where.calibration)
+    with naming(where.calibration):
+        P_left, P_right = (kitti_matrix(rows, f"P{c}", (3, 4)) for c in where.cameras)
+        T_reference_left = pose(np.eye(3), -projection_offset(P_left))
+        rig = read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size)
+        return rig, T_reference_left
 
 
 def _ground_truth(
-    folder: Path, left: Listing, stamps: Array, T_reference_left: Array, faults: FaultLog
+    where: _Layout, left: Listing, stamps: Array, T_reference_left: Array, faults: FaultLog
 ) -> Trajectory | None:
     """Poses by frame number, from ``poses.txt`` inside or ``poses/NAME.txt`` beside ``sequences``."""
-    candidates = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
-    path = next((p for p in candidates if p.is_file()), None)
+    path = next((p for p in where.poses if p.is_file()), None)
     return None if path is None else read_poses(path, left, stamps, T_reference_left, faults)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,68 +21,86 @@ from slam.sequences.calibration import (
     rig_from_projections,
 )
 from slam.sequences.faults import FaultLog
+from slam.sequences.given import Given
 from slam.sequences.images import Size
-from slam.sequences.kitti import OXTS_NOISE, RATE, choose_pair, read_poses
+from slam.sequences.kitti import OXTS_NOISE, choose_pair, read_poses
+from slam.sequences.names import MOST_FRAMES
 from slam.sequences.oxts import read_oxts
-from slam.sequences.source import MOST_FRAMES, ImagePairs, Listing, numbered, pair_listings, stamped
+from slam.sequences.rigs import calibration_files, read_rig
+from slam.sequences.source import RATE, Listing, numbered, pair_up, read_times, times_file
 from slam.sequences.tables import date_time, read_rows, shorten
 from slam.sequences.truth import require_truth
 
 #: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
 _OXTS_TIME = 0.01 / np.sqrt(12)
 
+_DATA = ("data", "data_rect")  # KITTI raw, KITTI-360
+
 _PAIRS = (("00", "01"), ("02", "03"))  # grey first, colour where there is no grey
 
 
 def matches(folder: Path) -> bool:
-    """Whether a folder looks like a drive of KITTI raw."""
-    return any((folder / f"image_{i:02d}").exists() for i in range(4))
+    """Whether a folder looks like a drive of KITTI raw or KITTI-360; KITTI tracking has folders of sequences there."""
+    cameras = [path for i in range(4) if (path := folder / f"image_{i:02d}").exists()]
+    return bool(cameras) and not any(path.name.isdecimal() and path.is_dir() for path in _inside(cameras[0]))
 
 
-def open_folder(folder: Path, options: dict[str, str]) -> RecordedSequence:
+def _inside(folder: Path) -> list[Path]:
+    return list(islice(folder.iterdir(), 10)) if folder.is_dir() else []
+
+
+def open_folder(folder: Path, options: Given) -> RecordedSequence:
     """Open one drive; stamps count from its first row of times.
 
     Raises:
         SequenceError: a camera or all its images are missing, or nothing can be paired.
-        CalibrationError: ``calib_cam_to_cam.txt`` is missing, unreadable or impossible.
+        CalibrationError: the calibration is missing, unreadable or impossible.
     """
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
         cameras = choose_pair(folder, "image_{}", _PAIRS)
-        left_all, right_all = (numbered(folder / f"image_{c}" / "data", faults) for c in cameras)
-        left, right_names = pair_listings(left_all, right_all, 0, "frames", faults)
-        path = left.folder.parent / "timestamps.txt"
-        origin, times = _times(path, faults)
-        stamps: Array = left.keys / RATE
-        if times is not None:
-            keep, stamps = stamped(left.keys, times, path, faults)
-            left, right_names = left.select(keep), [right_names[i] for i in keep]
-        source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names)
-        size = source.first_size()
-        day = _day(folder)
-        rig, T_left_reference = _rig(day / "calib_cam_to_cam.txt", cameras, size)
-        gps = _gps(folder / "ego_gps_m.txt", times, faults)
-        truth = _ground_truth(folder, day, origin, T_left_reference, left, stamps, faults)
-    source = ImagePairs(stamps, left.folder, left.names, right_all.folder, right_names, size)
+        data = next((name for name in _DATA if (folder / f"image_{cameras[0]}" / name).exists()), _DATA[0])
+        left_all, right_all = (numbered(folder / f"image_{c}" / data, faults) for c in cameras)
+        path = times_file(folder, options, left_all.folder.parent / "timestamps.txt")
+        origin, known = (None, read_times(path, faults)) if "times" in options else _times(path, faults)
+        left, source = pair_up(left_all, right_all, options, faults, known, by_number=True)
+        stamps, size = source.stamps, source.first_size()
+        calibration = _calibration(folder)
+        named = calibration_files(folder, options) if "calibration" in options else None
+        if named is None and not calibration.exists():
+            raise CalibrationError(f"{calibration}: the calibration is missing: add calibration=FILE")
+        rig: StereoRig | None = None
+        T_left_reference: Array = np.eye(4)
+        if calibration.exists():
+            rig, T_left_reference = _rig(calibration, cameras, size)
+        if named is not None:
+            rig = read_rig(named, size, options)
+        assert rig is not None  # one of the two is there
+        gps = _gps(folder / "ego_gps_m.txt", None if known is None else known[1], faults)
+        truth = _ground_truth(folder, calibration.parent, origin, T_left_reference, left, stamps, faults)
     kind = options.get("kind", "driving")
     time = 0.0 if (folder / "oxts").is_dir() else _OXTS_TIME
     noise = replace(OXTS_NOISE, time=time, wheels=kind == "driving")
-    return RecordedSequence(folder.name, "kitti-raw", kind, rig, source, truth, gps, warnings, noise)
+    return RecordedSequence(
+        folder.name, "kitti-raw", kind, rig, replace(source, size=size), truth, gps, warnings, noise
+    )
 
 
-def _day(folder: Path) -> Path:
-    """Where the calibration is: in the drive's own folder, or in the day's above it."""
-    return folder if (folder / "calib_cam_to_cam.txt").exists() else folder.parent
+def _calibration(folder: Path) -> Path:
+    """In the drive's own folder, or in the day's above it; of KITTI-360 in ``calibration`` beside ``data_2d_raw``."""
+    perspective = folder.parent.parent / "calibration" / "perspective.txt"
+    usual = folder / "calib_cam_to_cam.txt"
+    places = (usual, folder.parent / usual.name, perspective, folder.parent / "calibration" / perspective.name)
+    return next((path for path in places if path.exists()), folder.parent / usual.name)
 
 
-def _times(path: Path, faults: FaultLog) -> tuple[int | None, Array | None]:
+def _times(path: Path | None, faults: FaultLog) -> tuple[int | None, tuple[Path, Array] | None]:
     """The first row's time [ns since 1970] and the times by frame number (T,) [s] from there on; None without file."""
-    if not path.exists():
-        faults.assume(f"{path} is missing: {RATE:g} frames per second assumed")
+    if path is None:
         return None, None
     rows = read_rows(path, date_time, faults)
     origin = next(row for row in rows if row is not None)
-    return origin, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows])
+    return origin, (path, np.array([np.nan if row is None else (row - origin) * 1e-9 for row in rows]))
 
 
 def _rig(path: Path, cameras: tuple[str, str], size: Size) -> tuple[StereoRig, Array]:
@@ -149,6 +168,9 @@ def _ground_truth(
 
     Without them ``poses_cam0_oxts.txt`` serves: poses of camera 0, rows of 12 as in KITTI odometry, one a frame.
     """
+    world = folder.parent.parent / "data_poses" / folder.name / "cam0_to_world.txt"
+    if world.is_file() and left.folder.parent.name == "image_00":  # KITTI-360
+        return _poses_360(world, dict(zip(left.keys.tolist(), stamps.tolist())), faults)
     if not (folder / "oxts").is_dir():
         path = folder / "poses_cam0_oxts.txt"
         known = path.is_file() and left.folder.parent.name == "image_00"
@@ -163,6 +185,25 @@ def _ground_truth(
         return None
     poses = body.poses @ inverse(T_left_imu)
     return Trajectory(body.stamps, inverse(poses[0]) @ poses)
+
+
+def _poses_360(path: Path, stamps: dict[int, float], faults: FaultLog) -> Trajectory | None:
+    """KITTI-360's path of the rectified left camera: rows of a frame's number and 16 numbers of its pose."""
+
+    def parse(text: str) -> list[float]:
+        row = [float(word) for word in text.split()]
+        if len(row) != 17 or not np.isfinite(row).all():
+            raise ValueError(f"{shorten(text)} is not a frame and its pose")
+        return row
+
+    try:
+        rows = [row for row in read_rows(path, parse, faults) if row is not None and row[0] in stamps]
+        table = np.array(sorted(rows)).reshape(-1, 17)
+        times = np.array([stamps[int(number)] for number in table[:, 0]])
+        return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), path)
+    except (SequenceError, TrajectoryError) as error:
+        faults.report("ground truth", f"{error}; there is no ground truth")
+        return None
 
 
 def _extrinsics(path: Path) -> Array:

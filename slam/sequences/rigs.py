@@ -10,31 +10,27 @@ from pathlib import Path
 from slam.errors import CalibrationError, ConfigurationError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
-from slam.sequences.calibration import (
-    euroc_camera,
-    kalibr_cameras,
-    kitti_matrix,
-    naming,
-    read_kitti,
-    rig_from_cameras,
-    rig_from_projections,
-)
+from slam.sequences.calibration import kitti_matrix, naming, read_kitti, rig_from_projections
+from slam.sequences.calibration_keys import read_entries, rig_of
+from slam.sequences.given import flag
 from slam.sequences.images import Size
-from slam.sequences.opencv_storage import opencv_rig
 from slam.sequences.source import require_size
 from slam.sequences.yaml_files import read_calibration
 
 #: Options of the formats whose calibration is in a file that can be named.
 OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye"})
 
-_STORAGE_SUFFIXES = (".yaml", ".yml", ".xml", ".json")
+_STORAGE_SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".conf")
 _STEMS = ("calibration", "calib", "stereo", "camchain")
 _ONE_FILE = tuple(stem + s for stem in _STEMS for s in _STORAGE_SUFFIXES)
-_TWO_FILES = tuple((f"intrinsics{s}", f"extrinsics{s}") for s in _STORAGE_SUFFIXES)
+_TWO_FILES = tuple(
+    tuple(f"{name}{s}" for name in names)
+    for names in (("intrinsics", "extrinsics"), ("left", "right"))
+    for s in _STORAGE_SUFFIXES[:2]
+)
 _SENSORS = tuple(tuple(f"{root}{cam}/sensor.yaml" for cam in ("cam0", "cam1")) for root in ("", "mav0/"))
 _KITTI = ("calib.txt", "calib_cam_to_cam.txt")
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_YES = {"1": True, "yes": True, "true": True, "0": False, "no": False, "false": False}
 
 
 def load_rig(
@@ -47,10 +43,10 @@ def load_rig(
     """The rig of a calibration.
 
     Args:
-        *paths: one file: OpenCV's (YAML, XML, JSON), Kalibr's camchain, KITTI's ``calib.txt`` or
-            ``calib_cam_to_cam.txt``, or the numbers fx, fy, cx, cy [px] and baseline in YAML. Two files: OpenCV's
-            intrinsics and extrinsics, or EuRoC's ``sensor.yaml`` of the left and the right camera. Or the folder where
-            they are under their usual names.
+        *paths: one file: OpenCV's (YAML, XML, JSON), Kalibr's camchain, ORB-SLAM's or stella_vslam's settings, ZED's
+            or depthai's file, KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``, or the numbers fx, fy, cx, cy [px]
+            and baseline in YAML. Two files: OpenCV's intrinsics and extrinsics, ROS's or EuRoC's of the left and the
+            right camera. Or the folder where they are under their usual names.
         size: width and height of the images [px], where the file names none.
         unit: of length in an OpenCV file: ``"m"``, ``"cm"`` or ``"mm"``.
         rectified: of an OpenCV file take the rectified cameras (``P1``, ``P2``).
@@ -70,11 +66,12 @@ def load_rig(
         raise CalibrationError("no calibration is named")
     if len(files) == 1 and files[0].is_dir():
         files = _in_folder(files[0])
-    return read_rig(files, size, options)
+    rig = read_rig(files, size, options)
+    return StereoRig(*rig.as_recorded) if rig.turns else rig  # refused, unless the images are turned, too
 
 
 def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str]) -> StereoRig:
-    """The rig of one or two files, see `load_rig`.
+    """The rig of one or two files, see `load_rig`; of cameras above each other, that of turned images.
 
     Args:
         paths: the files.
@@ -85,34 +82,38 @@ def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str
         CalibrationError, ConfigurationError: see `load_rig`.
         SequenceError: the images are of another size than the calibration is for.
     """
-    unit = options.get("unit", "m")
-    if unit not in _UNITS:
-        raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
-    texts = [read_calibration(path) for path in paths]
-    rig, owner = _other_form(paths, texts, size)
-    if rig is None:
-        rectified, fisheye = flag(options, "rectified"), flag(options, "fisheye")
-        rig, expected = opencv_rig(paths, size, _UNITS[unit], rectified, fisheye)
+    unit = metres_per_unit(options)
+    form = "KITTI's"
+    allowed: tuple[str, ...] = ()
+    kitti = re.search(r"^(P|P_rect_0)0[: ]", read_calibration(paths[0]), re.MULTILINE) if len(paths) == 1 else None
+    entries = None if kitti else read_entries(paths, size)
+    if entries is not None:
+        form, allowed = entries.form, entries.options
+    rectified, fisheye = flag(options, "rectified"), flag(options, "fisheye")
+    foreign = sorted(({"rectified", "fisheye"} | ({"unit"} if unit != 1 else set())) & set(options) - set(allowed))
+    if foreign:
+        raise ConfigurationError(f"option {foreign[0]!r} does nothing with {paths[0]}, which is {form}")
+    if kitti:
+        rig = _kitti_rig(paths[0], kitti[1], size)
     else:
-        expected = (rig.width, rig.height)
-        foreign = sorted(({"rectified", "fisheye"} | ({"unit"} if unit != "m" else set())) & set(options))
-        if foreign:
-            raise ConfigurationError(f"option {foreign[0]!r} goes with OpenCV's files, {paths[0]} is {owner}")
+        assert entries is not None
+        with naming(paths[-1]):
+            rig = rig_of(entries, size, unit, rectified, fisheye)
     if size is not None:
-        require_size(size, expected, paths[0])
+        require_size(size, rig, paths[0])
     return rig
 
 
-def _other_form(paths: Sequence[Path], texts: Sequence[str], size: Size | None) -> tuple[StereoRig | None, str]:
-    """The rig of files that are not OpenCV's, and whose they are; None where they are OpenCV's."""
-    if len(paths) == 2 and all(re.search(r"^T_BS:", text, re.MULTILINE) for text in texts):
-        left, right = (euroc_camera(path) for path in paths)
-        return rig_from_cameras(left, right, paths[1]), "EuRoC's"
-    if len(paths) == 1 and re.search(r"^cam\d+:", texts[0], re.MULTILINE):
-        cameras = kalibr_cameras(paths[0])
-        return rig_from_cameras(cameras[0], cameras[1], paths[0]), "Kalibr's"
-    kitti = re.search(r"^(P|P_rect_0)0[: ]", texts[0], re.MULTILINE) if len(paths) == 1 else None
-    return (_kitti_rig(paths[0], kitti[1], size), "KITTI's") if kitti else (None, "")
+def metres_per_unit(options: Mapping[str, str]) -> float:
+    """The option ``unit``, of length.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    unit = options.get("unit", "m")
+    if unit not in _UNITS:
+        raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
+    return _UNITS[unit]
 
 
 def _kitti_rig(path: Path, prefix: str, size: Size | None) -> StereoRig:
@@ -163,15 +164,3 @@ def _usual(folder: Path, names: Sequence[Sequence[str]]) -> list[Path]:
     """The first of several sets of files that is complete; empty where none is."""
     sets = ([folder / name for name in names_] for names_ in names)
     return next((files for files in sets if all(file.is_file() for file in files)), [])
-
-
-def flag(options: Mapping[str, str], name: str) -> bool:
-    """An option that is yes or no.
-
-    Raises:
-        ConfigurationError: it is neither.
-    """
-    text = options.get(name, "no").lower()
-    if text not in _YES:
-        raise ConfigurationError(f"{name} must be yes or no, got {text!r}")
-    return _YES[text]

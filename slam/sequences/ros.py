@@ -5,16 +5,18 @@ They are read by the package rosbags (``pip install 'surf-stereo-slam[ros]'``), 
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from slam.data import StereoFrame
-from slam.errors import ConfigurationError, SequenceError
+from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
@@ -23,29 +25,35 @@ from slam.sequences.base import RecordedSequence
 from slam.sequences.calibration import naming
 from slam.sequences.camera_info import rig_from_camera_infos
 from slam.sequences.faults import FaultLog
+from slam.sequences.given import Given, flag
 from slam.sequences.images import Size
 from slam.sequences.ros_images import grey_image, naming_recording
 from slam.sequences.ros_topics import Topics, choose_topics
 from slam.sequences.source import Listing, hardware_tolerance, in_order, in_seconds, pair_listings, require_size
 
 #: Options besides ``kind``.
-OPTIONS = frozenset({"left", "right", "left_info", "right_info", "tolerance"}) | rigs.OPTIONS
+OPTIONS = frozenset({"left_info", "right_info"})
 
 #: Endings of files, in lower case.
-SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
+SUFFIXES = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
-_METADATA = "metadata.yaml"
-_WIDEST_TOLERANCE = 10.0  # [s]
+_METADATA, _ROS_2, _BEGINNING = "metadata.yaml", b"rosbag2_bagfile_information", 4096
+
+_LATE = 10  # messages in a row that are out of order; more, or the last ones, are of a clock that was set back
+_LATEST = 10**9  # [ns] that a message is late; more is a wrong stamp, or the clock
 
 
 def matches(path: Path) -> bool:
     """Whether a path is a ROS recording by its ending or, for a folder, by its ``metadata.yaml``."""
-    if path.is_dir():
-        return (path / _METADATA).is_file() and any(file.suffix in SUFFIXES for file in path.iterdir())
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+    if not path.is_dir():
+        return path.name.lower().endswith(SUFFIXES) and path.is_file()
+    metadata = path / _METADATA
+    return metadata.is_file() and (
+        any(file.name.endswith(SUFFIXES) for file in path.iterdir()) or _ROS_2 in metadata.read_bytes()[:_BEGINNING]
+    )
 
 
-def open_folder(path: Path, options: dict[str, str]) -> RecordedSequence:
+def open_folder(path: Path, options: Given) -> RecordedSequence:
     """Open a recording; all of it is read once, for the stamps.
 
     Raises:
@@ -59,9 +67,10 @@ def open_folder(path: Path, options: dict[str, str]) -> RecordedSequence:
             topics = choose_topics(bag, options)
             left_all, right_all = (_listing(bag, topic, faults) for topic in (topics.left, topics.right))
             size = _first_size(bag, topics.left)
-        ordered = [in_order(messages.listing(), messages.topic, faults) for messages in (left_all, right_all)]
-        tolerance = _tolerance(options, ordered[0])
-        left, partners = pair_listings(ordered[0], ordered[1], tolerance, "ns", faults)
+        ordered = _in_time((left_all, right_all), faults)
+        told = options.tolerance()
+        tolerance = hardware_tolerance(ordered[0]) if told is None else told
+        left, partners = pair_listings(ordered[0], ordered[1], tolerance, faults)
         left, partners, stamps = in_seconds(left, partners, faults)
         rig = _rig(path, topics, size, options)
     rows = np.array([int(name) for name in left.names])
@@ -83,10 +92,6 @@ class Messages:
     topic: str
     stamps: IntArray
     recorded: IntArray
-
-    def listing(self) -> Listing:
-        """Them as a listing; the names are their rows."""
-        return Listing(Path(self.topic), self.stamps, [str(i) for i in range(len(self.stamps))])
 
     def seek(self, row: int) -> tuple[int | None, int]:
         """The time from which on to read for a row, and the first row that comes then; None for the beginning."""
@@ -140,21 +145,25 @@ class RosPairs:
     def _images(
         self, bag: Bag, messages: Messages, rows: IntArray
     ) -> Generator[np.ndarray | SequenceError, None, None]:
-        """The images of these rows of a topic, which increase; an error in place of one that is damaged."""
+        """The images of these rows of a topic; an error in place of one that is damaged."""
         if not len(rows):
             return
-        wanted = iter(rows.tolist())
-        row = next(wanted)
-        since, first = messages.seek(row)
+        wanted = rows.tolist()
+        ahead: dict[int, tuple[str, bytes]] = {}  # read before their turn, where messages are out of order
+        expected, due = set(wanted), 0
+        since, first = messages.seek(min(wanted))
         for number, (_, kind, raw) in enumerate(bag.messages([messages.topic], since), start=first):
-            if number == row:
+            if number in expected:
+                ahead[number] = kind, raw
+            while due < len(wanted) and wanted[due] in ahead:
+                kind, raw = ahead.pop(wanted[due])
                 try:
-                    yield bag.image(raw, kind, f"{messages.topic}, message {row}", self.size)
+                    yield bag.image(raw, kind, f"{messages.topic}, message {wanted[due]}", self.size)
                 except SequenceError as error:
                     yield error
-                row = next(wanted, -1)
-                if row < 0:
-                    return
+                due += 1
+            if due == len(wanted):
+                return
 
 
 class Bag:
@@ -208,10 +217,72 @@ def open_bag(path: Path) -> Iterator[Bag]:
         ) from None
     with ExitStack() as stack:
         with naming_recording(path):
+            if path.name.lower().endswith(".zstd"):
+                path = _unpacked(path, Path(stack.enter_context(TemporaryDirectory())))
             reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             stack.enter_context(reader)
             bag = Bag(path, reader)
         yield bag
+
+
+def _unpacked(path: Path, folder: Path) -> Path:
+    """A compressed file, decompressed into a folder, by what rosbags does it with."""
+    try:
+        from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        from backports import zstd
+    target = folder / path.stem
+    with zstd.open(path, "rb") as packed, target.open("wb") as file:
+        shutil.copyfileobj(packed, file)
+    return target
+
+
+def _in_time(topics: tuple[Messages, Messages], faults: FaultLog) -> list[Listing]:
+    """The messages of both topics in order of time; the names are their rows.
+
+    Messages out of order are sorted. Where a clock was set back, time goes on as the recording's own clock did, by
+    the left topic for both.
+    """
+    listings, shifts = [], list[int]()
+    for messages in topics:
+        stamps, found, start = messages.stamps.copy(), list[int](), 1
+        while (row := _set_back(stamps, start)) is not None:
+            step = int(messages.recorded[row] - messages.recorded[row - 1])
+            found.append(step - int(stamps[row] - stamps[row - 1]))
+            shift = shifts[len(found) - 1] if len(found) <= len(shifts) else found[-1]
+            stamps[row:] += shift
+            line = f"{messages.topic}: the clock was set back by {1e-9 * shift:.3f} s at message {row}"
+            faults.report("clock", f"{line}; time goes on by the clock of the recording")
+            start = row + 1
+        shifts = shifts or found
+        late = np.maximum.accumulate(stamps) - stamps
+        rows = np.flatnonzero(late <= _LATEST)
+        rows = rows[np.argsort(stamps[rows], kind="stable")]
+        disordered = int(((late > 0) & (late <= _LATEST)).sum())
+        if disordered:
+            faults.report("order", f"{messages.topic}: {disordered} messages are out of order; sorted by their stamps")
+        if len(rows) < len(stamps):
+            faults.report(
+                "stamps", f"{messages.topic}: {len(stamps) - len(rows)} of {len(stamps)} stamps run backwards; left out"
+            )
+        listing = Listing(Path(messages.topic), stamps[rows], [str(row) for row in rows.tolist()], True)
+        listings.append(in_order(listing, messages.topic, faults))
+    return listings
+
+
+def _set_back(stamps: IntArray, start: int) -> int | None:
+    """The first row, from `start` on, from which on a clock is behind what it was, and stays so; None for none."""
+    late = stamps < np.maximum.accumulate(stamps)
+    begins = np.flatnonzero(late & ~np.concatenate([[False], late[:-1]]))
+    ends = np.flatnonzero(late & ~np.concatenate([late[1:], [False]])) + 1
+    for first, end in zip(begins.tolist(), ends.tolist()):
+        behind, length = stamps[first - 1] - stamps[first], end - first
+        # Late messages fill a gap; after a clock was set back there are messages of the same times twice.
+        twice = int(((stamps[:first] >= stamps[first]) & (stamps[:first] <= stamps[end - 1])).sum())
+        again = length > 1 and 2 * twice >= length
+        if first >= start and (again or length > _LATE or (end == len(stamps) and behind > _LATEST)):
+            return first
+    return None
 
 
 def _listing(bag: Bag, topic: str, faults: FaultLog) -> Messages:
@@ -243,28 +314,15 @@ def _first_size(bag: Bag, topic: str) -> Size:
     raise SequenceError(f"{bag.path}: no image of {topic} can be read: {reason}")
 
 
-def _tolerance(options: dict[str, str], left: Listing) -> int:
-    """How far the stamps of a pair may be apart [ns]."""
-    if "tolerance" not in options:
-        return hardware_tolerance(left)
-    try:
-        seconds = float(options["tolerance"])
-    except ValueError:
-        seconds = float("nan")
-    if not 0 <= seconds <= _WIDEST_TOLERANCE:
-        raise ConfigurationError(f"tolerance must be 0 to {_WIDEST_TOLERANCE:g} s, got {options['tolerance']!r}")
-    return round(1e9 * seconds)
-
-
-def _rig(path: Path, topics: Topics, size: Size, options: dict[str, str]) -> StereoRig:
+def _rig(path: Path, topics: Topics, size: Size, options: Given) -> StereoRig:
     """The rig by the calibration file that is named, else by the camera messages."""
     if "calibration" in options:
         paths = rigs.calibration_files(path if path.is_dir() else path.parent, options)
         return rigs.read_rig(paths, size, options)
     assert topics.left_info is not None and topics.right_info is not None
     where = Path(topics.info_names)
-    rectified = rigs.flag(options, "rectified") if "rectified" in options else topics.rectified
+    rectified = flag(options, "rectified") if "rectified" in options else topics.rectified
     with naming(where):
-        rig = rig_from_camera_infos(topics.left_info, topics.right_info, rectified)
-    require_size(size, (rig.width, rig.height), where)
+        rig = rig_from_camera_infos(topics.left_info, topics.right_info, rectified, rigs.metres_per_unit(options))
+    require_size(size, rig, where)
     return rig

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from slam.data import StereoFrame
 from slam.errors import SequenceError
-from slam.files import note_input
+from slam.files import expanded, note_input
+from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import IMAGE_SUFFIXES, Size, read_image, size_text
+from slam.sequences.given import WIDEST_TOLERANCE, Given
+from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, size_text
+from slam.sequences.names import MOST_FRAMES, keys_of, natural, same_order, stem
+from slam.sequences.tables import read_rows, seconds
 
 #: Stamps of one pair may differ by so much: hardware-triggered cameras agree far better [ns].
 TOLERANCE = 5_000_000
 
-#: Numbers of frames go up to this: as floating-point numbers they are still told apart.
-MOST_FRAMES = 10**12
+#: Frames per second of images that say nothing of time.
+RATE = 10.0
 
 
 @dataclass(frozen=True)
@@ -32,11 +36,13 @@ class Listing:
         folder: where they are.
         keys: what pairs them with the other camera's (N,), strictly increasing: stamps [ns] or frame numbers.
         names: their file names, N of them.
+        stamped: the keys are stamps.
     """
 
     folder: Path
     keys: IntArray
     names: list[str]
+    stamped: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -44,7 +50,7 @@ class Listing:
     def select(self, rows: IntArray | slice) -> Listing:
         """The listing of these rows."""
         index = np.arange(len(self))[rows]
-        return Listing(self.folder, self.keys[index], [self.names[i] for i in index])
+        return replace(self, keys=self.keys[index], names=[self.names[i] for i in index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +62,7 @@ class ImagePairs:
         left_folder, left: where the left images are, and their file names (N).
         right_folder, right: the same for the right ones; None where there is no right image.
         size: width and height that every image must have; None while it is not known yet.
+        halves: both images are in the left file, side by side; there are no others.
     """
 
     stamps: Array
@@ -64,6 +71,7 @@ class ImagePairs:
     right_folder: Path
     right: list[str | None]
     size: Size | None = None
+    halves: bool = False
 
     def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
         """Decode frames `start` to `stop`.
@@ -72,12 +80,17 @@ class ImagePairs:
         without it.
         """
         for index in range(start, stop):
+            right = None
             try:
                 left = self._read_one(self.left_folder / self.left[index])
+                if self.halves:
+                    left, right = halves(left, self.left[index])
             except SequenceError as error:
                 faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {error}")
                 continue
-            yield StereoFrame(index, float(self.stamps[index]), left, self._read_right(index, faults))
+            if not self.halves:
+                right = self._read_right(index, faults)
+            yield StereoFrame(index, float(self.stamps[index]), left, right)
 
     def _read_right(self, index: int, faults: FaultLog) -> np.ndarray | None:
         name = self.right[index]
@@ -91,7 +104,8 @@ class ImagePairs:
             return None
 
     def _read_one(self, path: Path) -> np.ndarray:
-        return read_image(path, self.size)
+        double = self.halves and self.size is not None
+        return read_image(path, (2 * self.size[0], self.size[1]) if double else self.size)  # type: ignore[index]
 
     def first_size(self) -> Size:
         """Width and height of the first pair of images that can be read.
@@ -105,7 +119,8 @@ class ImagePairs:
                 continue
             left_path, right_path = self.left_folder / left_name, self.right_folder / right_name
             try:
-                left, right = read_image(left_path), read_image(right_path)
+                left = read_image(left_path)
+                left, right = halves(left, str(left_path)) if self.halves else (left, read_image(right_path))
             except SequenceError as error:
                 reason = str(error)
                 continue
@@ -116,18 +131,19 @@ class ImagePairs:
         raise SequenceError(f"{self.left_folder}: no pair of images can be read: {reason}")
 
 
-def require_size(size: Size, expected: Size, calibration: Path) -> None:
-    """Raise where images are not of the calibration's size.
+def require_size(size: Size, rig: StereoRig, calibration: Path) -> None:
+    """Raise where images, as recorded, are not of the calibration's size.
 
     Raises:
         SequenceError: they are not.
     """
+    expected = (rig.height, rig.width) if rig.turns % 2 else (rig.width, rig.height)
     if size != expected:
         raise SequenceError(f"images are {size_text(size)}, but {calibration} is for {size_text(expected)}")
 
 
 def image_names(folder: Path) -> list[str]:
-    """Names of the image files in a folder, sorted.
+    """Names of the image files in a folder, sorted as people count.
 
     Raises:
         SequenceError: there is no such folder, or it is a file.
@@ -140,7 +156,7 @@ def image_names(folder: Path) -> list[str]:
     except OSError as error:
         raise SequenceError(f"{folder}: {error.strerror or error}") from error
     note_input(folder)
-    return sorted(n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES)  # noqa: PTH122
+    return sorted((n for n in names if os.path.splitext(n)[1].lower() in IMAGE_SUFFIXES), key=natural)  # noqa: PTH122
 
 
 def numbered(folder: Path, faults: FaultLog) -> Listing:
@@ -166,11 +182,101 @@ def numbered(folder: Path, faults: FaultLog) -> Listing:
 
 def number_of(name: str) -> int | None:
     """The number that is the name of a file without its ending, in 64 bits; None where it is none."""
-    stem = name.rpartition(".")[0]
-    if not (stem.isascii() and stem.isdecimal()):
+    text = stem(name)
+    if not (text.isascii() and text.isdecimal()):
         return None
-    number = int(stem)
+    number = int(text)
     return number if number < 2**63 else None
+
+
+def by_names(folders: list[Path], names: list[list[str]], faults: FaultLog) -> list[Listing]:
+    """The images of one camera or two by what their names say: stamps, else numbers, else their order.
+
+    Raises:
+        SequenceError: only their order is left, and the cameras have unequally many.
+    """
+    found = keys_of(names)
+    if found is None:
+        if len({len(own) for own in names}) > 1:
+            counts = " and ".join(f"{folder} has {len(own)} images" for folder, own in zip(folders, names))
+            raise SequenceError(f"{counts}: neither stamps nor numbers in their names say which go together")
+        names = [sorted(own, key=natural) for own in names]
+        found = [np.arange(len(own)) for own in names], False, ""
+        if len(names) > 1 and not same_order(names):
+            found = *found[:2], "neither stamps nor numbers in the names say which images go together: their order does"
+    keys, stamped, guess = found
+    if guess:
+        faults.assume(f"{folders[0]}: {guess}")
+    listings = []
+    for folder, own_keys, own in zip(folders, keys, names):
+        order = np.argsort(own_keys, kind="stable")
+        listing = Listing(folder, own_keys[order], [own[i] for i in order], stamped)
+        listings.append(in_order(listing, str(folder), faults))
+    return listings
+
+
+def times_file(folder: Path, options: Given, *usual: Path) -> Path | None:
+    """The file of times, by option or by convention; None where ``fps`` is given in its place."""
+    if "times" in options:
+        return folder / expanded(options["times"])
+    return None if "fps" in options else next((path for path in usual if path.is_file()), None)
+
+
+def read_times(path: Path | None, faults: FaultLog) -> tuple[Path, Array] | None:
+    """A file and the times in it by row [s], NaN for unreadable ones; None where there is no file."""
+    if path is None:
+        return None
+    return path, np.array([np.nan if row is None else row for row in read_rows(path, seconds, faults)])
+
+
+def pair_up(
+    left: Listing,
+    right: Listing | None,
+    options: Given,
+    faults: FaultLog,
+    times: tuple[Path, Array] | None = None,
+    by_number: bool = False,
+) -> tuple[Listing, ImagePairs]:
+    """Pair the images of two cameras by their keys, and give each pair its time.
+
+    Time is by the file of times, else by ``fps``, else by stamps, else by numbers at `RATE`.
+
+    Args:
+        left: of the left camera.
+        right: of the right one; None where both images are in one file, side by side.
+        options: ``fps`` and ``tolerance`` are read where they mean something.
+        faults: told what does not pair.
+        times: a file and the times in it by row [s].
+        by_number: a row's number is a frame's; else rows belong to the left images in order.
+
+    Returns:
+        The left images that are left, and the pairs.
+
+    Raises:
+        SequenceError: nothing pairs, or hardly a frame has a time.
+    """
+    rate = None if times else options.rate()
+    kept, partners = left, list[str | None](left.names)
+    if right is not None:
+        told = bool(times or rate)
+        wanted = options.tolerance() if left.stamped else 0
+        tolerance = hardware_tolerance(left, told) if wanted is None else wanted
+        kept, partners = pair_listings(left, right, tolerance, faults)
+    position = np.searchsorted(left.keys, kept.keys)
+    if times is not None:
+        path, rows = times
+        if not by_number and len(rows) != len(left):
+            faults.report("stamps", f"{path} has {len(rows)} rows, {left.folder} has {len(left)} images")
+        keep, stamps = stamped(kept.keys if by_number else position, rows, path, faults)
+        kept, partners = kept.select(keep), [partners[i] for i in keep]
+    elif left.stamped and rate is None:
+        kept, partners, stamps = in_seconds(kept, partners, faults)
+    else:
+        numbers = position if left.stamped else kept.keys if by_number else kept.keys - kept.keys[0]
+        if rate is None:
+            faults.assume(f"{left.folder}: no times, {RATE:g} frames per second assumed (see fps=…)")
+        stamps = numbers / (rate or RATE)
+    return kept, ImagePairs(stamps, left.folder, kept.names, (right or left).folder, partners, halves=right is None)
 
 
 def in_seconds(
@@ -208,25 +314,24 @@ def present(listing: Listing, what: str, faults: FaultLog) -> Listing:
     Raises:
         SequenceError: none exists; or see `image_names`.
     """
-    there = image_names(listing.folder)
-    known = set(there)
-    by_stem = {name.rpartition(".")[0]: name for name in there}
-    names = [n if n in known else by_stem.get(n.rpartition(".")[0], "") for n in listing.names]
+    known = {name: name for name in image_names(listing.folder)}
+    by_stem = {stem(name): name for name in known}
+    names = [known.get(n) or by_stem.get(stem(n), "") for n in listing.names]
     missing = [wanted for wanted, found in zip(listing.names, names) if not found]
     if len(missing) == len(names):
         raise SequenceError(f"{listing.folder}: none of the {len(names)} images listed in {what} is there")
     if missing:
         line = f"{what}: {len(missing)} of {len(names)} listed images are missing (first: {missing[0]})"
         faults.report("listed images", line)
-    found_rows = np.flatnonzero([bool(n) for n in names])
-    return Listing(listing.folder, listing.keys, names).select(found_rows)
+    return replace(listing, names=names).select(np.flatnonzero([bool(n) for n in names]))
 
 
-def hardware_tolerance(listing: Listing) -> int:
-    """How far two stamps of a pair may be apart [ns]: less than half a frame, and never more than `TOLERANCE`."""
+def hardware_tolerance(listing: Listing, told: bool = False) -> int:
+    """How far stamps of a pair may be apart [ns]: half a frame, and `TOLERANCE` at most, unless the rate is told."""
     if len(listing) < 2:
         return TOLERANCE
-    return int(min(TOLERANCE, np.median(np.diff(listing.keys)) / 2))
+    half = np.median(np.diff(listing.keys)) / 2
+    return int(0.98 * half if told else min(TOLERANCE, half))
 
 
 def stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> tuple[np.ndarray, Array]:
@@ -254,9 +359,7 @@ def stamped(numbers: np.ndarray, times: Array, path: Path, faults: FaultLog) -> 
     return keep, stamps[keep]
 
 
-def pair_listings(
-    left: Listing, right: Listing, tolerance: int, unit: str, faults: FaultLog
-) -> tuple[Listing, list[str | None]]:
+def pair_listings(left: Listing, right: Listing, tolerance: int, faults: FaultLog) -> tuple[Listing, list[str | None]]:
     """Left images and, for each, the name of the right image nearest in key, None where none is within `tolerance`.
 
     Left images before the first pair and after the last are left out, and so are right images without a partner;
@@ -268,7 +371,7 @@ def pair_listings(
     partner = pair(left.keys, right.keys, tolerance)
     rows = trim(partner)
     if rows.stop == 0:
-        raise SequenceError(_no_pair(left, right, tolerance, unit))
+        raise SequenceError(_no_pair(left, right, tolerance))
     head, tail = rows.start, len(left) - rows.stop
     if head or tail:
         line = f"{left.folder}: {head} images before the first pair and {tail} after the last are left out"
@@ -285,12 +388,14 @@ def pair_listings(
     return left.select(rows), names
 
 
-def _no_pair(left: Listing, right: Listing, tolerance: int, unit: str) -> str:
+def _no_pair(left: Listing, right: Listing, tolerance: int) -> str:
     """Why nothing pairs, with how far the nearest two images are apart."""
     after = np.searchsorted(right.keys, left.keys).clip(0, len(right) - 1)
     before = (after - 1).clip(0)
     gaps = np.minimum(np.abs(right.keys[after] - left.keys), np.abs(right.keys[before] - left.keys))
-    return (
-        f"no image of {left.folder} has a partner in {right.folder}: the nearest two are {gaps.min()} {unit} apart, "
-        f"{tolerance} {unit} are allowed"
-    )
+    line = f"no image of {left.folder} has a partner in {right.folder}: the nearest two are "
+    if not left.stamped:
+        return f"{line}{gaps.min()} frames apart"
+    line += f"{1e-6 * gaps.min():.6g} ms apart, {1e-6 * tolerance:.6g} ms are allowed"
+    enough = gaps.min() <= WIDEST_TOLERANCE * 1e9
+    return f"{line}; see tolerance=… [s]" if enough else f"{line}: the clocks of the cameras differ"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,12 @@ from slam.errors import SequenceError
 from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
-from slam.sequences.images import MOST_PIXELS, Size
+from slam.sequences.given import FASTEST, SLOWEST
+from slam.sequences.images import MOST_PIXELS, Size, halves
 from slam.sequences.quiet import quiet_libraries
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
-
-#: Frame rates that are believed [1/s].
-SLOWEST, FASTEST = 1e-3, 1e5
 
 _MOST_FRAMES = 10_000_000  # of a video, four days of it: what a header says may be anything
 
@@ -34,13 +32,13 @@ class VideoPairs:
 
     Attributes:
         stamps: times (N,) [s]: frame number by frame rate.
-        left, right: the files.
+        left, right: the files; right is None where the left one has both images side by side.
         size: width and height of the frames.
     """
 
     stamps: Array
     left: Path
-    right: Path
+    right: Path | None
     size: Size
 
     def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
@@ -49,27 +47,37 @@ class VideoPairs:
         A video cannot be entered in the middle without errors, so what is skipped is passed over, though not
         converted.
         """
-        with open_video(self.left) as left, open_video(self.right) as right:
+        paths = [path for path in (self.left, self.right) if path is not None]
+        with ExitStack() as stack:
+            videos = [stack.enter_context(open_video(path)) for path in paths]
             with quiet_libraries():
                 for _ in range(start):
-                    left.grab(), right.grab()
+                    for video in videos:
+                        video.grab()
             for index in range(start, stop):
-                images = [_next_grey(video) for video in (left, right)]
-                for path, image in zip((self.left, self.right), images):
+                images = [_next_grey(video) for video in videos]
+                for path, image in zip(paths, images):
                     if image is None:
                         faults.report("videos", f"{path}: ends or is damaged at frame {index} of {len(self.stamps)}")
-                if images[0] is None or images[1] is None:
+                there = [image for image in images if image is not None]
+                if len(there) < len(images):
                     return
-                yield StereoFrame(index, float(self.stamps[index]), images[0], images[1])
+                left, right = there if len(there) == 2 else halves(there[0], str(self.left))
+                yield StereoFrame(index, float(self.stamps[index]), left, right)
 
 
-def open_videos(left: Path, right: Path, rate: float | None, faults: FaultLog) -> VideoPairs:
-    """The frame source of two videos; `rate` [1/s] overrides what the left one says of itself.
+def open_videos(left: Path, right: Path | None, rate: float | None, faults: FaultLog) -> VideoPairs:
+    """The frame source of two videos, or of one side by side; `rate` [1/s] overrides what the left one says of itself.
 
     Raises:
         SequenceError: a file is no readable video, the frame sizes differ, or the frame rate is not known.
     """
-    (count_left, rate_left, size_left), (count_right, _, size_right) = _describe(left), _describe(right)
+    (count_left, rate_left, size_left) = _describe(left)
+    count_right, size_right = count_left, size_left
+    if right is None:
+        size_left = size_right = halves(np.empty(size_left[::-1], bool), str(left))[0].shape[::-1]
+    else:
+        count_right, _, size_right = _describe(right)
     if size_left != size_right:
         raise SequenceError(
             f"left and right images differ in size: {left} is {size_left[0]}x{size_left[1]}, "

@@ -8,6 +8,7 @@ import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import CalibrationError, MeasurementError
+from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
 from slam.models import EstimatorModels
@@ -22,10 +23,6 @@ SHORTEST, LONGEST = 1e-3, 10.0
 
 #: guard: plausible baselines [m]; others are more often a length in another unit.
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.005, 10.0
-
-#: guard: largest distance of a principal point from the middle of an image, as a share of its width or height. That
-#: of a calibration for images half or twice as large is off by a quarter or a half.
-_OFF_MIDDLE = 0.2
 
 _INTERVALS = 5  # guard: times between frames whose median is tested: single frames may be missing
 _POOR = 5  # guard: successive frames that must show too little before a warning
@@ -55,7 +52,7 @@ class InputWarnings:
         self._pair_is_known = self._texture_is_known = self._partners_are_known = self._moment_is_known = False
         self._before: StereoFrame | None = None
         self._fits = np.zeros(3, int)  # matches with the right image of this frame, the next one and the one before
-        for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig))):
+        for unlikely in filter(None, (baseline_doubt(rig), size_doubt(rig.left, rig.right))):
             self._warn(unlikely)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
@@ -223,20 +220,6 @@ def baseline_doubt(rig: StereoRig) -> str:
         f"the cameras are {rig.baseline:g} m apart by their calibration: is it in metres? "
         "(an OpenCV file in millimetres needs unit=mm)"
     )
-
-
-def size_doubt(rig: StereoRig) -> str:
-    """What is wrong with a principal point far from the middle of the images; empty if it is near."""
-    middle = np.array([rig.width, rig.height]) / 2
-    for side, camera in (("left", rig.left), ("right", rig.right)):
-        point = np.array([camera.u0, camera.v0])
-        if (np.abs(point - middle) > 2 * _OFF_MIDDLE * middle).any():
-            return (
-                f"the principal point of the {side} camera, ({point[0]:.0f}, {point[1]:.0f}) px, is far from the "
-                f"middle of the images, ({middle[0]:.0f}, {middle[1]:.0f}) px: is the calibration for images of "
-                "another size?"
-            )
-    return ""
 
 
 def farthest_apart(rig: StereoRig, models: EstimatorModels) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
@@ -52,6 +52,7 @@ class WorldSequence:
         rig: the stereo rig as the system is told of it; `world.rig` is the true one.
         ground_truth: pose of the left camera at every frame.
         warnings: always empty; recorded sequences have faults to report here.
+        masks: of both cameras (H, W) bool, see `slam.data.StereoFrame`.
     """
 
     format = "synthetic"
@@ -62,6 +63,7 @@ class WorldSequence:
         self.rig = world.rig if rig is None else rig
         self.values = dict(values)
         self.warnings: list[str] = []
+        self.masks: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
         self.faults = Faults.of(values, len(world), values["seed"])
         self._kept = np.flatnonzero(~self.faults.drop)
         self._stamps = (world.stamps + self.faults.delay)[self._kept]
@@ -108,7 +110,8 @@ class WorldSequence:
 
     def frame(self, k: int) -> StereoFrame:
         """Images of frame k."""
-        return self._recorder.record(self._source(k), int(k), float(self._stamps[int(k)]))
+        frame = self._recorder.record(self._source(k), int(k), float(self._stamps[int(k)]))
+        return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
 
     def depth(self, k: int) -> np.ndarray:
         """True distance along the left camera's axis in frame k (H, W) float32 [m], 0 where nothing is."""

@@ -130,25 +130,16 @@ def test_a_camera_that_nobody_read_for_a_while_is_opened_again(rig_here, played,
         assert Played.opened == opened
 
 
-def test_a_video_file_plays_a_device_at_its_own_rate(rig_here, scene, tmp_path):
+def test_a_video_is_no_camera_but_runs_live(rig_here, scene, tmp_path):
     write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 20.0)
-    sequence = slam.open_sequence("camera:both.avi")
+    with pytest.raises(SequenceError, match=r"a file, not a camera; .*'both\.avi\?layout=sbs'"):
+        slam.open_sequence("camera:both.avi")
     began = time.monotonic()
-    frames = list(slam.LiveFrames(sequence))
-    assert [f.index for f in frames] == [0, 1, 2, 3]  # a file has an end
+    frames = list(slam.LiveFrames(slam.open_sequence("both.avi?layout=sbs")))
+    assert [f.index for f in frames] == [0, 1, 2, 3]
     assert time.monotonic() - began > 0.14
     assert frames[0].left.shape == (HEIGHT, WIDTH)
     assert [np.abs(f.left.astype(float) - s.left).mean() < 5 for f, s in zip(frames, scene)] == [True] * 4
-
-
-def test_a_file_is_played_as_fast_as_asked(rig_here, scene, tmp_path):
-    write_video(tmp_path / "both.avi", [np.hstack([f.left, f.right]) for f in scene], 1.0)
-    began = time.monotonic()
-    frames = list(slam.open_sequence("camera:both.avi?fps=40"))
-    assert 0.04 < time.monotonic() - began < 1.0
-    assert np.diff([f.stamp for f in frames]).max() < 0.5
-    with pytest.raises(ConfigurationError, match="a file has a size of its own: leave out width and height"):
-        slam.open_sequence("camera:both.avi?width=640")
 
 
 # ------------------------------------------------------------------------------------------------ faults

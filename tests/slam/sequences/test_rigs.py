@@ -43,7 +43,7 @@ def test_kalibr_s_file_names_the_size(tmp_path: Path) -> None:
     (tmp_path / "camchain.yaml").write_text(f"cam0:\n{camera}cam1:\n{camera}{T}")
     rig = slam.load_rig(tmp_path)
     assert (rig.width, rig.height, rig.left.model, rig.baseline) == (64, 48, "equidistant", pytest.approx(0.1))
-    with pytest.raises(ConfigurationError, match=r"'fisheye' goes with OpenCV's files, .* is Kalibr's"):
+    with pytest.raises(ConfigurationError, match=r"'fisheye' does nothing with .*, which is Kalibr's"):
         slam.load_rig(tmp_path, fisheye=True)
 
 

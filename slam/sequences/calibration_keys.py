@@ -1,0 +1,351 @@
+"""Calibration files of any program as one table of entries, and the rig that they describe.
+
+Every form says the same few things under other names: camera matrices, distortions, how the cameras stand to each
+other. `_SPELLINGS` has the names; `rig_of` does not care whose they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.errors import CalibrationError
+from slam.geometry.camera import PinholeCamera
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, pose, so3_exp
+from slam.sequences.calibration import (
+    NO_NUMBERS,
+    projection_offset,
+    require_possible,
+    rig_from_projections,
+    rig_from_transform,
+)
+from slam.sequences.calibration_forms import read_form
+from slam.sequences.images import Size
+
+#: Names of entries, in lower case, letters and digits only, without the side: K1, cameraMatrix1, camera_matrix_left,
+#: LEFT.K, cam0/intrinsics and Camera1.fx are all found.
+_SPELLINGS: dict[str, tuple[str, ...]] = {
+    "K": ("k", "m", "cameramatrix", "mtx", "intrinsics", "intrinsicmatrix"),
+    "D": ("d", "distcoeffs", "dist", "distortion", "distortioncoeffs", "distortioncoefficients", "distortioncoeff"),
+    "P": ("p", "projectionmatrix", "projection"),
+    "R_rect": ("r", "rectificationmatrix"),
+    "T_BS": ("tbs",),
+    "T_cam_imu": ("tcamimu",),
+    "R": ("r", "rot", "rotation", "rotationmatrix", "stereor", "rstereo"),
+    "T": ("t", "trans", "translation", "translationvector", "stereot", "tstereo"),
+    "T_cn_cnm1": ("cam1tcncnm1",),
+    "T_c1_c2": ("stereotc1c2",),
+    "width": ("imagewidth", "width", "cols"),
+    "height": ("imageheight", "height", "rows"),
+    "size": ("imagesize", "size", "imgsize", "resolution"),
+    "baseline": ("baseline", "stereob"),
+    "bf": ("bf", "focalxbaseline"),
+    "distortion model": ("distortionmodel",),
+    "camera model": ("cameramodel", "model", "cameratype"),
+}
+_FISHEYE = ("equidistant", "fisheye", "kannalabrandt8", "kannalabrandt")
+_PINHOLE = ("", "none", "radialtangential", "radtan", "plumbbob", "rationalpolynomial", "pinhole", "perspective",
+            "rectified")  # fmt: skip
+_OF_ONE = ("tbs", "cameramatrix", "projectionmatrix")  # names that a file of one camera has
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_PLAIN = ("fx", "fy", "cx", "cy")
+
+#: Whose a form is, by entries that only it has, and which options go with it.
+_FORMS = (
+    ("Kalibr's", ("cam0intrinsics", "cam1intrinsics", "cam0cameramodel"), ()),
+    ("EuRoC's", ("lefttbs",), ()),
+    ("ROS's", ("leftcameramatrix",), ("rectified",)),
+    ("ORB-SLAM's", ("camerabf", "stereotc1c2", "stereob", "camera1fx"), ("rectified",)),
+    ("stella_vslam's", ("camerafocalxbaseline",), ("rectified",)),
+)
+_MISSING = {  # the two cameras, and how they stand to each other, by the names of a form
+    "Kalibr's": ("cam0/intrinsics", "cam1/intrinsics", "cam1/T_cn_cnm1"),
+    "EuRoC's": ("intrinsics", "intrinsics of the right camera", "T_BS"),
+}
+
+
+class Entries:
+    """The entries of calibration files by their names in lower case, letters and digits only.
+
+    Args:
+        files: name to name as written, and value; of two files of one camera each the first is the left one's.
+        form: whose form it is, as ``"Kalibr's"``; empty where the entries themselves are to tell.
+
+    Attributes:
+        form: whose form it is; empty for OpenCV's, and for plain numbers.
+        options: that mean something for this form.
+    """
+
+    def __init__(self, files: Sequence[Mapping[str, tuple[str, Any]]], form: str = "") -> None:
+        self.form = form
+        self.options: tuple[str, ...] = () if form else ("unit", "rectified", "fisheye")
+        self._values: dict[str, tuple[str, Any]] = {}
+        single = len(files) == 2 and any(all(n in f for f in files) for n in _OF_ONE)
+        for side, file in zip(("left", "right"), files):
+            self._values |= {(side + name if single else name): entry for name, entry in file.items()}
+        for known, names, options in _FORMS:
+            if not self.form and any(name in self._values for name in names):
+                self.form, self.options = known, options
+        zero = any(name in self._values for name in ("k0", "m0", "d0", "cameramatrix0", "camera0fx"))
+        counts = ("0", "1") if zero else ("1", "2")
+        self._sides = [
+            (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")
+            for side, (word, count) in enumerate(zip(("left", "right"), counts))
+        ]
+
+    def find(self, role: str, side: int | None = None) -> tuple[str, Any] | None:
+        """Name as written, and value, of an entry; None where there is none."""
+        spellings = _SPELLINGS.get(role, (role,))
+        if side is None:
+            names: Iterator[str] = chain(spellings, (f"camera{s}" for s in spellings))
+        else:
+            names = (name for s in spellings for token in self._sides[side] for name in (s + token, token + s))
+        return next((self._values[n] for n in names if self._values.get(n, ("", None))[1] is not None), None)
+
+    def numbers(self, role: str, side: int | None, shape: tuple[int, ...] | None) -> Array | None:
+        """A finite array of this shape, flat where that is None; None where there is no such entry."""
+        found = self.find(role, side)
+        return None if found is None else _array(found[1], found[0], shape)
+
+    def names(self) -> str:
+        """All entries as they are written."""
+        return ", ".join(sorted(name for name, _ in self._values.values())) or "nothing"
+
+
+def read_entries(paths: Sequence[Path], images: Size | None) -> Entries:
+    """The entries of calibration files, read by the XML, INI and YAML libraries: OpenCV's reader can crash.
+
+    Args:
+        paths: one file or several.
+        images: width and height of the images, which choose one of several resolutions; None where not known.
+
+    Raises:
+        CalibrationError: a file is missing or unreadable.
+    """
+    read = [read_form(path, images) for path in paths]
+    return Entries([dict(_flat(root, "", "")) for root, _ in read], read[0][1] if len(read) == 1 else "")
+
+
+def rig_of(entries: Entries, images: Size | None, unit: float, rectified: bool, fisheye: bool) -> StereoRig:
+    """The rig of calibration files.
+
+    Taken are two cameras with R and T as ``cv2.stereoCalibrate`` gives them (``h_right = R h_left + T``), with poses on
+    a body, or with rectifications; for rectified images two projections, or the numbers fx, fy, cx, cy and baseline.
+
+    Args:
+        entries: of the files.
+        images: width and height of the images, where the files name none; None where they are not known.
+        unit: metres per unit of T, of the projections' last column, and of the baseline.
+        rectified: take the projections, although camera matrices may be there too.
+        fisheye: the distortion is ``cv2.fisheye``'s; also where the file names such a model.
+
+    Raises:
+        CalibrationError: entries are missing (all are named), or the rig is impossible.
+    """
+    sizes = [_size(entries, side) for side in (0, 1)]
+    size = sizes[0] or sizes[1] or images
+    if size is None:
+        raise CalibrationError("names no image size: give size=(width, height)")
+    P, K = ([entries.find(role, side) is not None for side in (0, 1)] for role in ("P", "K"))
+    scalars = [entries.find("fx", side) is not None for side in (0, 1)]
+    if rectified or (any(P) and not K[0] and not scalars[0]):
+        _require(entries, P, "P1", "P2")
+        return rig_from_projections(*_projections(entries, unit), size)
+    T_right_left = _extrinsics(entries, unit)
+    if T_right_left is None and not any(K):
+        plain = _plain(entries, size, unit)
+        if plain is not None:
+            return plain
+    labels = _MISSING.get(entries.form, ("K1", "K2", "T"))
+    there = [k or s for k, s in zip(K, scalars)]
+    if entries.form or entries.find("R") is not None:
+        _require(entries, [*there, T_right_left is not None], *labels)
+    else:
+        _require(entries, [*there, False, entries.find("T") is not None], "K1", "K2", "R", "T")
+    assert T_right_left is not None  # `_require` has seen it
+    cameras = [_camera(entries, side, sizes[side] or size, fisheye) for side in (0, 1)]
+    return rig_from_transform(cameras[0], cameras[1], T_right_left)
+
+
+def body_pose(entries: Entries, side: int) -> Array:
+    """``T_body_camera`` (4, 4) of a camera; where no body is named, it is the left camera."""
+    found = entries.numbers("T_BS", side, (4, 4))
+    if found is not None:
+        return _rigid(found, "T_BS")
+    found = entries.numbers("T_cam_imu", side, (4, 4))
+    return np.eye(4) if found is None else inverse(_rigid(found, "T_cam_imu"))
+
+
+def _require(entries: Entries, there: Sequence[bool], *names: str) -> None:
+    """Raise CalibrationError with the names of all that is not there, and of the entries that are."""
+    missing = [name for name, found in zip(names, there) if not found]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        whose = f" (it looks like {entries.form})" if entries.form else ""
+        if entries.find("cameramatrix") is not None:
+            whose = " (it is one camera's: name both files, calibration=LEFT,RIGHT)"
+        raise CalibrationError(
+            f"{', '.join(missing)} {verb} missing{whose}; in it: {entries.names()}. A stereo calibration "
+            "has K1, D1, K2, D2, R and T; one of rectified images P1 and P2, or fx, fy, cx, cy and baseline"
+        )
+
+
+def _extrinsics(entries: Entries, unit: float) -> Array | None:
+    """``T_right_left`` (4, 4) [m], by whichever entries say it; None where none does."""
+    R, t = entries.numbers("R", None, None), entries.numbers("T", None, (3,))
+    if R is not None and t is not None:
+        rotation = so3_exp(R) if R.size == 3 else _array(R, "R", (3, 3))
+        return pose(rotation, unit * t)
+    if any(all(entries.find(role, side) is not None for side in (0, 1)) for role in ("T_BS", "T_cam_imu")):
+        return inverse(body_pose(entries, 1)) @ body_pose(entries, 0)
+    for role, turned in (("T_cn_cnm1", False), ("T_c1_c2", True)):
+        T = entries.numbers(role, None, (4, 4))
+        if T is not None:
+            return inverse(_rigid(T, role)) if turned else _rigid(T, role)
+    left, right = (entries.numbers("R_rect", side, (3, 3)) for side in (0, 1))
+    offset = _rectified_offset(entries, unit)
+    return None if left is None or right is None or offset is None else pose(right.T @ left, right.T @ offset)
+
+
+def _rectified_offset(entries: Entries, unit: float) -> Array | None:
+    """Where the rectified left camera is in the rectified right one's axes (3,) [m]; None where nothing says it."""
+    if all(entries.find("P", side) is not None for side in (0, 1)):
+        left, right = _projections(entries, unit)
+        return projection_offset(right) - projection_offset(left)
+    baseline = _baseline(entries, unit)
+    return None if baseline is None else np.array([-baseline, 0.0, 0.0])
+
+
+def _projections(entries: Entries, unit: float) -> tuple[Array, Array]:
+    """Both projections (3, 4), their last column for metres."""
+    left, right = (entries.numbers("P", side, (3, 4)) for side in (0, 1))
+    assert left is not None and right is not None
+    if left[0, 3] == right[0, 3] and left[1, 3] == right[1, 3]:
+        raise CalibrationError("the cameras are not calibrated as a pair: P of the right one holds no baseline")
+    scale = np.array([1, 1, 1, unit])
+    return left * scale, right * scale
+
+
+def _baseline(entries: Entries, unit: float) -> float | None:
+    """The baseline [m], perhaps by its product with the focal length; None where there is none."""
+    found = entries.find("baseline")
+    if found is not None:
+        return unit * _number(found)
+    product, focal = entries.find("bf"), entries.find("fx")
+    return None if product is None or focal is None else unit * _number(product) / _number(focal)
+
+
+def _plain(entries: Entries, size: Size, unit: float) -> StereoRig | None:
+    """A rectified rig of two equal cameras by five numbers; None where none of them is there.
+
+    Raises:
+        CalibrationError: numbers are missing or impossible; all of them are named.
+    """
+    side = 0 if entries.find("fx") is None and entries.find("fx", 0) is not None else None
+    last = "bf" if entries.find("baseline") is None and entries.find("bf") is not None else "baseline"
+    found = {name: entries.find(name, side) for name in _PLAIN} | {last: entries.find(last)}
+    if not any(found.values()):
+        return None
+    values, wrong = {}, []
+    for name, entry in found.items():
+        try:
+            if entry is None:
+                raise CalibrationError(f"{name} is missing")
+            values[name] = _number(entry)
+            if values[name] <= 0 and name not in ("cx", "cy"):
+                wrong.append(f"{name} is {values[name]:g}, which must be positive")
+        except CalibrationError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise CalibrationError(f"{'; '.join(wrong)} (a rectified pair needs fx, fy, cx, cy in pixels and baseline)")
+    if any(_number(entry) for name in _COEFFICIENTS if (entry := entries.find(name, side)) is not None):
+        raise CalibrationError("names distortion, but only one camera: images of five numbers are rectified")
+    fx, fy, cx, cy, length = values.values()
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return StereoRig.from_pinhole(K, size=size, baseline=unit * (length / fx if last == "bf" else length))
+
+
+def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCamera:
+    """One camera from its matrix, or its four numbers, and its distortion."""
+    models = {role: entries.find(role, side) or entries.find(role) for role in ("distortion model", "camera model")}
+    for role, found in models.items():
+        name = "".join(filter(str.isalnum, str(found[1] if found else "").lower()))
+        if found and name not in _FISHEYE + _PINHOLE and (entries.form or role == "distortion model"):
+            raise CalibrationError(f"{role} {found[1]!r} is not supported")
+        fisheye = fisheye or name in _FISHEYE
+    found = entries.find("K", side)
+    if found is None:
+        values = [_number(entries.find(name, side) or (name, None)) for name in _PLAIN]
+    else:
+        values = _array(found[1], found[0], None).tolist()
+        if len(values) != 4 and entries.form in _MISSING:
+            raise CalibrationError(f"{found[0]} has {len(values)} numbers, 4 expected")
+        if len(values) != 4:
+            values = _array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    D = entries.numbers("D", side, None)
+    if D is None:
+        names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
+        D = np.array([_number(entries.find(name, side) or (name, 0.0)) for name in names])
+    D = D[:4] if fisheye else D
+    if 0 < len(D) < 4:
+        raise CalibrationError(f"distortion model takes 4 coefficients or more, got {len(D)}")
+    fx, fy, cx, cy = values
+    return PinholeCamera.from_matrix(
+        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), D if D.any() or fisheye else None, size, fisheye
+    )
+
+
+def _size(entries: Entries, side: int) -> Size | None:
+    """Width and height of a camera's images, where the files name them."""
+    for which in (side, None):
+        both = entries.numbers("size", which, (2,))
+        if both is None:
+            parts = [entries.numbers(name, which, (1,)) for name in ("width", "height")]
+            both = None if parts[0] is None or parts[1] is None else np.concatenate([parts[0], parts[1]])
+        if both is not None:
+            return int(both[0]), int(both[1])
+    return None
+
+
+def _number(entry: tuple[str, Any]) -> float:
+    """One finite number."""
+    name, value = entry
+    if isinstance(value, bool) or value is None:
+        raise CalibrationError(f"{name} is no number")
+    return float(_array(value, name, ())[()])
+
+
+def _array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
+    """A finite array of the shape; flat where that is None. OpenCV's matrices are ``{rows, cols, data}``."""
+    data = value.get("data") if isinstance(value, Mapping) else value
+    try:
+        array = np.array(data.split() if isinstance(data, str) and shape != () else data, dtype=float)
+        array = array.reshape(-1 if shape is None else shape)
+    except NO_NUMBERS:
+        what = "no number" if shape == () else "no matrix" + (f" of shape {shape}" if shape else "")
+        raise CalibrationError(f"{name} is {what}") from None
+    require_possible(array, name)
+    return array
+
+
+def _rigid(T: Array, name: str) -> Array:
+    """The rigid motion (4, 4), where it is one."""
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
+        raise CalibrationError(f"{name} is not a rigid motion")
+    return T
+
+
+def _flat(node: Mapping[str, Any], written: str, plain: str) -> Iterator[tuple[str, tuple[str, Any]]]:
+    """Entries of nested mappings, their names joined; matrices are values."""
+    for key, value in node.items():
+        name = "".join(filter(str.isalnum, str(key).lower()))
+        inner = plain + ("" if name == "stereorectifier" else name)
+        if isinstance(value, Mapping) and "data" not in value:
+            yield from _flat(value, f"{written}{key}/", inner)
+        else:
+            yield inner, (f"{written}{key}", value)

@@ -1,0 +1,180 @@
+"""What the names of image files say: which camera, which moment, which frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam.geometry.stamps import IntArray
+from slam.sequences.tables import MOST_NANOSECONDS
+
+#: Numbers of frames go up to this: as floating-point numbers they are still told apart.
+MOST_FRAMES = 10**12
+
+_SHORTEST = 10**6  # [ns] between frames: no camera is faster, and no count of frames has such steps
+_LONGEST = 10**11  # [ns] between frames: a hundred seconds
+_FIRST = 10**8  # [s] since 1970 of a stamp with a fraction in a longer name: the year 1973
+_SIDES = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("l", "r"))
+
+_DATE = re.compile(
+    r"(?<!\d)(20\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[-_T ]?([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-5]\d)"
+    r"(?:[-_.s]?(\d{1,9}))?(?!\d)",
+    re.ASCII,
+)
+_STAMP = re.compile(r"(?<!\d)(?:(\d{9,10})[._](\d{1,9})|(\d{18,19})|(\d{16})|(\d{13}))(?!\d)", re.ASCII)
+_SECONDS = re.compile(r"\d{1,10}\.\d{1,9}", re.ASCII)  # a whole name, perhaps since a start
+_NUMBER = re.compile(r"\d+", re.ASCII)
+
+
+def stem(name: str) -> str:
+    """A file's name without its ending."""
+    return name.rpartition(".")[0]
+
+
+def natural(name: str) -> list[tuple[str, int]]:
+    """What sorts names as people count: their numbers as numbers."""
+    return [(text, int(digits or -1)) for text, digits in re.findall(r"([^0-9]*)([0-9]*)", name)]
+
+
+def same_order(sides: Sequence[Sequence[str]]) -> bool:
+    """Whether images in order have the same names in both folders, but for words such as left and right."""
+    plain = [[re.sub(r"left|right|cam[01]|(?<![a-z])[lr](?![a-z])", "", n.lower()) for n in names] for names in sides]
+    return all(own == plain[0] for own in plain)
+
+
+def of_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """The left and the right images of one folder by words such as left and right in their names; None for neither."""
+    for words in _SIDES:
+        ends = (rf"(?<![a-z]){word}(?![{'0-9' if word[-1].isdigit() else 'a-z'}])" for word in words)
+        left, right = ([n for n in names if re.search(end, stem(n), re.IGNORECASE)] for end in ends)
+        if left and right and not set(left) & set(right):
+            return left, right
+    return None
+
+
+def keys_of(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str] | None:
+    """What pairs the images of cameras: stamps [ns], or else numbers of frames.
+
+    A stamp is 19 digits (nanoseconds), 16 (microseconds), 13 (milliseconds), seconds with a fraction, or a date with
+    the time, anywhere in the names; or whole names so far apart that they cannot count frames. A frame's number is
+    the one that differs from name to name; of several, those that both cameras share.
+
+    Returns:
+        For each camera its keys (N,), whether these are stamps, and what was guessed, empty where nothing was. None
+        where neither stamps nor numbers tell the images apart.
+    """
+    for read in (_dates, _stamps):
+        found = [read(names) for names in sides]
+        if all(keys is not None for keys in found):
+            inside = [n for names in sides for n in names if not _is_stamp(stem(n))]
+            moment = f"{1e-9 * found[0][0]:.6f} s" if inside else ""  # type: ignore[index]
+            guess = f"the stamp in {sides[0][0]} is taken as {moment} since 1970" if inside else ""
+            return [keys for keys in found if keys is not None], True, guess
+    return _numbers(sides)
+
+
+def _is_stamp(text: str) -> bool:
+    """Whether a whole name is a stamp: nothing is guessed then."""
+    return (_STAMP.fullmatch(text) or _SECONDS.fullmatch(text)) is not None
+
+
+def _stamps(names: Sequence[str]) -> IntArray | None:
+    """A stamp [ns] that every name has and that tells the names apart."""
+    since_start = all(_SECONDS.fullmatch(stem(name)) for name in names)
+    rows = [[(*stem(n).split("."), "", "", "")] if since_start else _STAMP.findall(stem(n)) for n in names]
+    for column in range(min(map(len, rows), default=0)):
+        parts = [row[column] for row in rows]
+        fractions = [part[1] for part in parts if part[1]]
+        # Fractions of unequal length that end in zeros are whole microseconds or nanoseconds, printed without padding.
+        unpadded = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
+        width = 0 if not unpadded else 6 if max(map(len, fractions)) <= 6 else 9
+        keys = [_nanoseconds(part, width) for part in parts]
+        whole = all(_is_stamp(stem(name)) for name in names)
+        if _median_step(np.array([min(k, MOST_NANOSECONDS) for k in keys])) > _LONGEST:
+            continue  # of a clock that counts from its start, in a finer unit
+        if len(set(keys)) == len(keys) and all(k <= MOST_NANOSECONDS and (whole or k >= _FIRST * 10**9) for k in keys):
+            return np.array(keys, np.int64)
+    return None
+
+
+def _nanoseconds(part: tuple[str, ...], width: int) -> int:
+    """Of the digits of a stamp; its fraction filled up in front to `width`, if not zero."""
+    seconds, fraction, nano, micro, milli = part
+    if seconds:
+        return int(seconds) * 10**9 + int(fraction.rjust(width, "0").ljust(9, "0"))
+    return int(nano) if nano else int(micro) * 10**3 if micro else int(milli) * 10**6
+
+
+def _dates(names: Sequence[str]) -> IntArray | None:
+    """Dates with the time [ns since 1970] that every name has and that tell the names apart."""
+    found = [_DATE.search(stem(name)) for name in sorted(names, key=natural)]
+    if not all(found):
+        return None
+    rest = [int(match[7] or 0) for match in found if match]
+    if rest == sorted(rest) and len({match[6] for match in found if match}) > 1 and any(rest):
+        return None  # it counts on when the second is over: no fraction
+    try:
+        keys = {name: _date(match) for name, match in zip(sorted(names, key=natural), found) if match}
+    except ValueError:
+        return None
+    return np.array([keys[name] for name in names], np.int64) if len(set(keys.values())) == len(names) else None
+
+
+def _date(match: re.Match[str]) -> int:
+    """Nanoseconds since 1970."""
+    year, month, day, hour, minute, second, fraction = match.groups()
+    time = np.datetime64(f"{year}-{month}-{day}T{hour}:{minute}:{second}", "ns").astype(np.int64)
+    return int(time) + int((fraction or "0").ljust(9, "0"))
+
+
+def _numbers(sides: Sequence[Sequence[str]]) -> tuple[list[IntArray], bool, str] | None:
+    """Numbers of frames in the names, see `keys_of`."""
+    tables = [_columns(names) or [] for names in sides]
+    if not all(tables):
+        return None
+    told = [[c for c in table if len(set(c)) == len(c) and max(c) <= MOST_NANOSECONDS] for table in tables]
+    if not all(told):
+        return _ranks([list(zip(*table)) for table in tables])
+    best, chosen = -1, [columns[-1] for columns in told]
+    for column in told[0]:
+        others = [max(columns, key=lambda c, column=column: len(set(c) & set(column))) for columns in told[1:]]  # type: ignore[misc]
+        common = min((len(set(column) & set(c)) for c in others), default=0)
+        if common >= best:
+            best, chosen = common, [column, *others]
+    guess = ""
+    for names, columns, column in zip(sides, told, chosen):
+        order = np.argsort(column, kind="stable").tolist()
+        if any(np.argsort(c, kind="stable").tolist() != order for c in columns):
+            guess = (
+                f"numbers in the names disagree; of {names[order[0]]} the {column[order[0]]} is taken as frame number"
+            )
+    keys = [np.array(column, np.int64) for column in chosen]
+    stamped = all(_median_step(k) >= _SHORTEST for k in keys)
+    if not stamped and max(k.max() for k in keys) > MOST_FRAMES:
+        return None
+    return keys, stamped, guess
+
+
+def _columns(names: Sequence[str]) -> list[list[int]] | None:
+    """The numbers at each place of the names that are not the same in all of them; None for names unlike each other."""
+    rows = [[int(digits) for digits in _NUMBER.findall(stem(name))] for name in names]
+    if len({len(row) for row in rows}) != 1:
+        return None
+    columns = [list(column) for column in zip(*rows)]
+    return columns if len(names) == 1 else [c for c in columns if len(set(c)) > 1]
+
+
+def _ranks(rows: Sequence[Sequence[tuple[int, ...]]]) -> tuple[list[IntArray], bool, str] | None:
+    """Places of names that only several numbers together tell apart, in the order of all of them."""
+    if any(len(set(own)) < len(own) for own in rows) or not set(rows[0]).intersection(*rows[1:]):
+        return None
+    rank = {row: number for number, row in enumerate(sorted(set().union(*rows)))}
+    guess = "no single number in the names tells the images apart; frames are counted in the order of all of them"
+    return [np.array([rank[row] for row in own], np.int64) for own in rows], False, guess
+
+
+def _median_step(numbers: np.ndarray) -> float:
+    """How far numbers are apart; zero for a single one."""
+    return float(np.median(np.diff(np.sort(numbers)))) if len(numbers) > 1 else 0.0
