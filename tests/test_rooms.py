@@ -16,6 +16,7 @@ MAY_IMPORT = {
     "kernels": {"runtime"},
     "geometry": {"kernels", "runtime"},
     "data": {"geometry"},
+    "window": {"data", "geometry", "kernels", "runtime"},
     "tracking": {"data", "geometry", "kernels", "runtime"},
     "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracking", "data", "geometry", "runtime"},

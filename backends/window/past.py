@@ -74,7 +74,7 @@ class Past:
         for one in reversed(self.left):
             now = np.array([where[serial] for serial in one.stayed.tolist()]).reshape(-1, 3)
             poses_now = np.array([known[frame] for frame in one.frames.tolist()])
-            points, pose = one.conditional.of(now - one.positions, log(inverse(one.poses) @ poses_now))
+            moved, pose = one.conditional.of(now - one.positions, log(inverse(one.poses) @ poses_now))
             known[one.frame] = one.pose @ exp(pose)
-            where.update(zip(one.serials.tolist(), one.points + points))
+            where.update(zip(one.serials.tolist(), one.points + moved))
         return {one.frame: known[one.frame] for one in self.left}
