@@ -36,6 +36,14 @@ OF_ONE = {
         "final mean [cm]": "the same of the path as it is known at the end",
         "doubled": "pairs of landmarks that look like one, which was put into the map twice",
     },
+    "ablation": {
+        "error": "first row: ATE online [m], of the library the error of distances of places seen twice [m]; below: "
+        "how many times that of the first row, median of the runs; bold where all runs agree that it is more, or less",
+        "mean ratio": "geometric mean over the sequences",
+        "lost": "frames without a measured pose, all runs together; below: more or fewer than in the first row",
+        "CPU": "time of a step without extraction of features, over that of the first row; median",
+        "NEES": "of relative poses over 10 m on drives, else 1 m: 6 is right, more means errors larger than claimed",
+    },
     "startup": {
         "pixels": "what is measured: both images (stereo), the left one, or both by the back end alone (no search)",
         "start [cm]": "where the system is told that it stands",

@@ -97,6 +97,7 @@ EXPERIMENTS = (
     Experiment("frame_rate", "What a frame rate costs in accuracy"),
     Experiment("alignment", "Features aligned to their first sight"),
     Experiment("informative", "How many measurements a frame needs", "", ("informative.png",)),
+    Experiment("ablation", "What each part is worth"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),
     Experiment(
         "loops", "Long drives that come back: loops closed",

@@ -26,7 +26,7 @@ def test_middlebury_disparities(slam_data):
     errors = errors[np.isfinite(errors)]
     assert len(errors) > 400
     assert (np.abs(errors) < 1).mean() > 0.8
-    assert np.median(np.abs(errors)) < 0.3
+    assert np.median(np.abs(errors)) < 0.28  # 1.5 times the median over noise and numbers of features
 
 
 def test_kitti_epipolar_lines(slam_data):
@@ -40,4 +40,4 @@ def test_kitti_epipolar_lines(slam_data):
         assert features.has_stereo.mean() > 0.5
         off = (features.uv_right - features.uv_left)[features.has_stereo, 1]
         assert (np.abs(off) < 1).mean() > 0.9
-        assert np.median(off) == pytest.approx(-0.2, abs=0.25)  # the data set's own rectification
+        assert np.median(off) == pytest.approx(-0.15, abs=0.1)  # the data set's own rectification

@@ -1,0 +1,152 @@
+"""What each part is worth: recordings and worlds with one part of the system switched off at a time.
+
+    [SLAM_DATA=/path/to/data] python experiments/ablation.py [--quick] [--trials 5] [--only VARIANT …] [--out DIR]
+
+Each sequence is run several times, with another first frame, pixel noise of half a grey level, and up to 20 % more or
+fewer features, a world with another seed as well (`experiments/perturbations.py`). Features are extracted once for
+all variants, so a variant is compared with the usual settings on the same features. Runs are appended to
+``ablation.csv`` as they end, and a later call goes on with those that are missing. Printed are, for each back end,
+medians with the usual settings, and for each variant the median ratio to them; then the NEES.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import slam
+from experiments.ablation_parts import CASES, GROUPS, USUAL, Case, Variant, error_of, opened
+from experiments.common import script_options, timed
+from experiments.perturbations import BACKENDS, NONE, features_of, frames_of
+from experiments.tables import markdown
+from frontends import create
+from slam.data import StereoFeatures
+from slam.evaluation.summary import consistency
+from slam.interfaces import Frontend
+from slam.run.summary import RunRecord
+from slam.sequences import Sequence
+from slam.system import StereoSlam
+
+_LONG = 100  # frames from which a sequence comes last
+HEADER = ("sequence", "trial", "back end", "variant", "error", "NEES", "frames", "lost", "ms")
+
+
+def run(
+    sequence: Sequence, case: Case, frontend: Frontend, features: list[StereoFeatures], backend: str, variant: Variant
+) -> list[float | int]:
+    """Error [m], NEES, number of frames, of those without a measured pose, and CPU time of a step, median [ms]."""
+    record, nan = RunRecord(), float("nan")
+    config = variant.config(sequence, case, backend)
+    try:
+        with variant.patch():
+            system = StereoSlam(sequence.rig, frontend, backend, config=config)
+            results, times = timed(system.process_features, features)
+    except slam.SlamError as error:  # a run that ends before its last frame has no figures
+        print(f"{case.name}, {backend}, {variant.name}: {error}", file=sys.stderr, flush=True)
+        return [nan, nan, len(features), len(features), nan]
+    for number, result in enumerate(results):
+        record.add(number, result)
+    measured = np.array(record.measured)
+    path, rows = record.trajectory.select(measured), np.flatnonzero(measured)
+    common = [record.common[row] for row in rows]
+    nees = consistency(path, np.array(record.covariances)[rows], sequence, common).get(f"NEES over {case.over} m", nan)
+    return [error_of(path, sequence), nees, len(results), len(results) - len(path), float(np.median(times))]
+
+
+def runs(cases: list[Case], trials: int, names: list[str], done: set[tuple[str, ...]]) -> Iterator[list[object]]:
+    """The rows that are missing; those of the longest sequence come last."""
+    for late, group in itertools.product((False, True), GROUPS):
+        for trial, case in ((t, c) for t in range(trials) for c in cases if t < c.trials):
+            if late != (case.frames > _LONG):
+                continue
+            chosen = [v for v in group if not names or v.name in names]
+            sequence = opened(case, trial)
+            if sequence is None:
+                continue
+            usual = {b: USUAL.config(sequence, case, b) for b in BACKENDS}
+            wanted = [
+                (b, v) for v in chosen for b in BACKENDS
+                if (v is USUAL or v.patch is not nullcontext or v.config(sequence, case, b) != usual[b])
+                and (case.name, str(trial), b, v.name) not in done
+            ]  # fmt: skip
+            if not wanted:
+                continue
+            options = {**usual[BACKENDS[0]].frontend, "features": features_of(sequence, trial)}
+            frontend = create("surf", sequence.rig, **options)
+            features = [frontend.extract(f) for f in frames_of(sequence, NONE, case.frames, trial)]
+            for backend, variant in wanted:
+                figures = run(sequence, case, frontend, features, backend, variant)
+                yield [case.name, trial, backend, variant.name, *figures]
+
+
+def tables(rows: list[dict[str, str]], backend: str) -> str:
+    """Errors and times as ratios to those with the usual settings, and the NEES; medians over the trials."""
+    own = [row for row in rows if row["back end"] == backend]
+    cases = list(dict.fromkeys(row["sequence"] for row in own))
+    usual = {(row["sequence"], row["trial"]): row for row in own if row["variant"] == USUAL.name}
+    errors: list[list[object]] = [[USUAL.name, *_medians(usual.values(), cases, "error", "{:.4f}")]]
+    errors[0] += ["1", sum(int(row["lost"]) for row in usual.values()), "1"]
+    nees: list[list[object]] = [[USUAL.name, *_medians(usual.values(), cases, "NEES", "{:.1f}")]]
+    for variant in (v for group in GROUPS for v in group if v is not USUAL):
+        mine = [r for r in own if r["variant"] == variant.name and (r["sequence"], r["trial"]) in usual]
+        if not mine:
+            continue
+        cells, logs, costs = [], [], []
+        for case in cases:
+            pairs = [(r, usual[r["sequence"], r["trial"]]) for r in mine if r["sequence"] == case]
+            ratio = np.array([float(r["error"]) / float(u["error"]) for r, u in pairs])
+            ratio = ratio[np.isfinite(ratio)]
+            sure = len(ratio) >= 3 and ((ratio > 1).all() or (ratio < 1).all())
+            cells.append(f"{'**' * sure}{np.median(ratio):.2f}{'**' * sure}" if len(ratio) else None)
+            logs += [np.log(np.median(ratio))] if len(ratio) else []
+            costs += [float(r["ms"]) / float(u["ms"]) for r, u in pairs]
+        more = sum(int(r["lost"]) - int(usual[r["sequence"], r["trial"]]["lost"]) for r in mine)
+        mean = f"{np.exp(np.mean(logs)):.2f}" if logs else None
+        errors.append([variant.name, *cells, mean, f"{more:+d}", f"{np.nanmedian(costs):.2f}"])
+        nees.append([variant.name, *_medians(mine, cases, "NEES", "{:.1f}")])
+    head = ("error", *cases, "mean ratio", "lost", "CPU")
+    return f"{markdown(head, errors)}\n\n{markdown(('NEES', *cases), nees)}"
+
+
+def _medians(rows: Iterable[dict[str, str]], cases: list[str], column: str, form: str) -> list[str | None]:
+    """Of a column, for each case; None where no run has it."""
+    values = [[float(r[column]) for r in rows if r["sequence"] == c] for c in cases]
+    known = [[x for x in v if np.isfinite(x)] for v in values]
+    return [form.format(np.median(v)) if v else None for v in known]
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "one trial, twelve frames of one world, three variants")
+    parser.add_argument("--trials", type=int, default=5, help="runs of each sequence")
+    parser.add_argument("--only", nargs="*", default=[], metavar="VARIANT", help="these variants alone")
+    given = parser.parse_args()
+    cases, trials, names = list(CASES), given.trials, given.only
+    if given.quick:
+        cases, trials, names = [Case("desk", "synthetic:desk?frames=12", 12)], 1, [v.name for v in GROUPS[0][:3]]
+    file = given.out / ("quick.csv" if given.quick else "ablation.csv")
+    given.out.mkdir(parents=True, exist_ok=True)
+    if not file.exists():
+        file.write_text(",".join(HEADER) + "\n", encoding="utf-8")
+    with file.open(newline="", encoding="utf-8") as before:
+        done = {tuple(row[:4]) for row in csv.reader(before)}
+    with file.open("a", newline="", encoding="utf-8") as after:
+        for row in runs(cases, trials, names, done):
+            csv.writer(after).writerow(row)
+            after.flush()
+    with file.open(newline="", encoding="utf-8") as whole:
+        rows = list(csv.DictReader(whole))
+    for backend in BACKENDS:
+        print(f"\n# {backend}\n\n{tables(rows, backend)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Parts of `experiments/ablation.py`: the sequences, what is switched off, and the error of a path."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.common import recordings
+from slam.config import SystemConfig
+from slam.evaluation.summary import evaluate
+from slam.geometry.trajectory import Trajectory
+from slam.rig_error import CommonError
+from slam.sequences import Sequence, open_sequence
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sequence.
+
+    Attributes:
+        name: for the table.
+        path: of a recording below SLAM_DATA, or text of a world.
+        frames: how many of it, the first ones.
+        over: length of the stretches of which the NEES is given [m].
+        trials: most runs of it.
+        settings: for all of its runs.
+    """
+
+    name: str
+    path: str
+    frames: int
+    over: int = 1
+    trials: int = 100
+    settings: tuple[str, ...] = ()
+
+
+_DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
+CASES = (
+    Case("KITTI 06", "kitti_odometry/sequences/06", 51, 10),
+    Case("raw 0001", f"{_DAY}0001_sync", 60, 10),
+    Case("raw 0013", f"{_DAY}0013_sync", 80, 10),
+    Case("V1_01", "euroc/V1_01_keyframes_a", 20),
+    Case("MH_01", "euroc/MH_01_part", 60),
+    Case("aisle", "synthetic:aisle?frames=60", 60),
+    Case("desk", "synthetic:desk?frames=60", 60),
+    Case("box", "synthetic:box?frames=60", 60),
+    Case("street", "synthetic:street?frames=45", 45, 10),
+    # Back where it began: the drift, so without what recognises the place.
+    Case("library", "handheld_library", 346, 1, 3, ("atlas.enabled=false", "map.forget_after=30")),
+)
+RECORDED = tuple(case for case in CASES if not case.path.startswith("synthetic:"))
+#: Frames of the library that show one place, and how far apart they are [m], by the features of both alone.
+CLOSINGS = ((5, 340, 0.07), (10, 345, 0.04), (5, 345, 0.52), (10, 340, 0.50))
+
+
+def exact_rig() -> AbstractContextManager[object]:
+    """The rig's uncertainty is added to nothing."""
+    stack = ExitStack()
+    for name, put in (
+        ("slam.calibration.consider.SchmidtFilter.observe", lambda *_: None),
+        ("slam.calibration.remaining.RemainingRigError.added_to", lambda _, estimate: estimate),
+        ("slam.calibration.remaining.RemainingRigError.common", lambda *_, **__: CommonError()),
+    ):
+        stack.enter_context(mock.patch(name, put))
+    return stack
+
+
+def no_first_frames() -> AbstractContextManager[object]:
+    """The detector waits until it knows its tracks."""
+    name = "slam.objects.detector.MovingObjectDetector.newly_moving"
+    return mock.patch(name, lambda *_: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is switched off, or changed.
+
+    Attributes:
+        name: for the table.
+        settings: by kind of motion; those of both where it is one tuple. A back end that has none of them is left out.
+        patch: the change of the program for what has no setting.
+    """
+
+    name: str
+    settings: tuple[str, ...] | dict[str, tuple[str, ...]] = ()
+    patch: Callable[[], AbstractContextManager[object]] = nullcontext
+
+    def config(self, sequence: Sequence, case: Case, backend: str) -> SystemConfig:
+        """All settings of a run."""
+        own = self.settings if isinstance(self.settings, tuple) else self.settings[sequence.kind]
+        known = [s for s in own if not s.startswith("backend.") or backend == "ekf"]
+        return SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings([*case.settings, *known])
+
+
+_HALF = {"driving": ("map.target_in_view=80",), "handheld": ("map.target_in_view=40",)}
+_FEW = "association.measured=40"
+USUAL = Variant("usual settings")
+#: In the order in which they are run; those of one tuple share the features of a trial.
+GROUPS = (
+    (
+        USUAL,
+        Variant("no patch alignment", ("association.align=false",)),
+        Variant("half as many landmarks in view", _HALF),
+        Variant("40 measured, the most informative", (_FEW,)),
+        Variant("both of these", {kind: (*half, _FEW) for kind, half in _HALF.items()}),
+        Variant("the other form of landmarks", {
+            "driving": ("backend.landmarks=inverse_depth",), "handheld": ("backend.landmarks=euclidean",),
+        }),
+        Variant("no self-calibration", ("self_calibration.enabled=false",)),
+        Variant("no detector of moving objects", ("objects.mode=off",)),
+    ),
+    (
+        Variant("one iteration", ("backend.iterations=1",)),
+        Variant("covariance not transported", ("backend.consistent=false",)),
+        Variant("no uncertainty of the rig", (), exact_rig),
+        Variant("no test of first frames", (), no_first_frames),
+        Variant("no atlas", ("atlas.enabled=false",)),
+        Variant("left pixels alone", ("backend.measurement=left",)),
+        Variant("pixel noise of the other kind", {
+            "driving": ("models.pixel_sigma=0.3",), "handheld": ("models.pixel_sigma=0.7",),
+        }),
+    ),
+)  # fmt: skip
+
+
+def opened(case: Case, trial: int) -> Sequence | None:
+    """A sequence, of a world with the trial's seed; None where the recording is not there."""
+    if case.path.startswith("synthetic:"):
+        return open_sequence(f"{case.path}&seed={trial}")
+    found = recordings({case.name: case.path})
+    return open_sequence(found[case.name]) if found else None
+
+
+def closing_error(path: Trajectory, sequence: Sequence) -> float:
+    """RMSE of the distances between frames of the library that show one place [m]."""
+    stamps = np.asarray(sequence.stamps)
+    at = {float(stamp): position for stamp, position in zip(path.stamps, path.positions)}
+    pairs = [(at.get(float(stamps[a])), at.get(float(stamps[b])), d) for a, b, d in CLOSINGS if b < len(stamps)]
+    off = [np.linalg.norm(b - a) - d for a, b, d in pairs if a is not None and b is not None]
+    return float(np.sqrt(np.mean(np.square(off)))) if off else float("nan")
+
+
+def error_of(path: Trajectory, sequence: Sequence) -> float:
+    """ATE [m]; of the library, which has no truth, the closing error."""
+    if sequence.ground_truth is None:
+        return closing_error(path, sequence)
+    return evaluate(path, sequence).get("ATE RMSE [m]", float("nan"))

@@ -1,0 +1,125 @@
+"""Medians over perturbations of what the tests on recordings measure; the tests allow half as much more.
+
+    SLAM_DATA=/path/to/data python experiments/bars.py [--quick] [--trials 7] [--out DIR]
+
+Recordings with the usual settings, each time with another first frame, pixel noise, and number of features
+(`experiments/perturbations.py`): the error of the online and of the final path. Recorded tracks (`recorded_tracks`):
+how far a stretch is off at its end, with another first frame, a tenth of the tracks left out, and other wrong matches.
+Writes ``bars.json``, whose place is ``tests/bars.json``, and prints the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import backends
+from experiments import recorded_tracks
+from experiments.ablation_parts import RECORDED, USUAL, Case, error_of, opened
+from experiments.common import script_options
+from experiments.perturbations import BACKENDS, MEASURED, NONE, features_of, frames_of
+from experiments.recorded_tracks import Step, Tracks, replay
+from frontends import create
+from slam.config import SystemConfig
+from slam.geometry.se3 import inverse
+from slam.geometry.trajectory import Trajectory
+from slam.sequences import Sequence
+from slam.system import StereoSlam
+
+#: Stretches of the recorded tracks, with the share of wrong matches.
+STRETCHES = ((2, 27, 0.0), (370, 450, 0.0), (370, 450, 0.2))
+ROOM = 1.5  # of a test, times the median
+FILE = Path(__file__).resolve().parents[1] / "tests" / "bars.json"
+_OTHER = 5  # first frames of a stretch
+_LEFT_OUT = 0.1  # share of the tracks
+
+Medians = dict[str, dict[str, dict[str, float]]]
+
+
+def stretch_name(start: int, stop: int, wrong: float) -> str:
+    """The key of a stretch in the file."""
+    return f"tracks {start} to {stop}, {100 * wrong:.0f} % wrong"
+
+
+def bar(name: str, backend: str, figure: str) -> float:
+    """What a test allows [m]: `ROOM` times the median of a figure of a recording."""
+    medians: Medians = json.loads(FILE.read_text(encoding="utf-8"))
+    return ROOM * medians[name][backend][figure]
+
+
+def errors(case: Case, sequence: Sequence, trial: int) -> dict[str, dict[str, float]]:
+    """Of each back end, the error of the online and of the final path in one trial [m]."""
+    options = {**SystemConfig.for_kind(sequence.kind).frontend, "features": features_of(sequence, trial)}
+    frontend = create("surf", sequence.rig, **options)
+    features = [frontend.extract(frame) for frame in frames_of(sequence, NONE, case.frames, trial)]
+    found = {}
+    for backend in BACKENDS:
+        config = USUAL.config(sequence, case, backend)
+        system = StereoSlam(sequence.rig, frontend, backend, config=config)
+        estimates = [r.estimate for r in map(system.process_features, features) if r.status in MEASURED]
+        online = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
+        found[backend] = {"online": error_of(online, sequence), "final": error_of(system.trajectory(), sequence)}
+    return found
+
+
+def replayed(tracks: Tracks, name: str, wrong: float, seed: int = 1) -> tuple[list[Step], object, float]:
+    """The steps of a replay, the back end, and how far its last pose is off [m], seen from the first."""
+    config = SystemConfig.for_kind("driving", None, name)
+    backend = backends.create(name, tracks.rig, models=config.models, **config.backend)
+    steps = list(replay(tracks, backend, config, wrong, seed))
+    moved = inverse(steps[0].T_world_left) @ steps[-1].T_world_left
+    off = np.linalg.norm(moved[:3, 3] - (inverse(tracks.poses[0]) @ tracks.poses[-1])[:3, 3])
+    return steps, backend, float(off)
+
+
+def perturbed(tracks: Tracks, start: int, stop: int, trial: int) -> Tracks:
+    """A stretch that begins a little later, without a tenth of its tracks."""
+    rng = np.random.default_rng(trial)
+    found = tracks.between(start + int(rng.integers(_OTHER)), stop)
+    kept = rng.random(found.pixels.shape[1]) >= _LEFT_OUT
+    return replace(found, pixels=found.pixels[:, kept])
+
+
+def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Of each back end and figure."""
+    first = trials[0]
+    return {b: {f: round(float(np.median([t[b][f] for t in trials])), 4) for f in first[b]} for b in first}
+
+
+def main() -> int:
+    parser = script_options(__file__, __doc__, "one trial of one recording")
+    parser.add_argument("--trials", type=int, default=7)
+    given = parser.parse_args()
+    trials = 1 if given.quick else given.trials
+    found: Medians = {}
+    for case in RECORDED[: 1 if given.quick else None]:
+        sequence = opened(case, 0)
+        if sequence is not None:
+            found[case.name] = _medians([errors(case, sequence, t) for t in range(min(trials, case.trials))])
+            print(case.name, found[case.name], file=sys.stderr, flush=True)
+    if not found:
+        print("bars: set SLAM_DATA to the folder that holds the recordings; nothing was run")
+        return 0
+    tracks = recorded_tracks.load(Path(os.environ["SLAM_DATA"]))
+    for start, stop, wrong in STRETCHES[: 1 if given.quick else None]:
+        runs = [
+            {b: {"end": replayed(perturbed(tracks, start, stop, t), b, wrong, t)[2]} for b in BACKENDS}
+            for t in range(trials)
+        ]
+        found[stretch_name(start, stop, wrong)] = _medians(runs)
+    text = json.dumps(found, indent=1)
+    given.out.mkdir(parents=True, exist_ok=True)
+    (given.out / "bars.json").write_text(text + "\n", encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
