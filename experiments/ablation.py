@@ -1,6 +1,7 @@
 """What each part is worth: recordings and worlds with one part of the system switched off at a time.
 
-    [SLAM_DATA=/path/to/data] python experiments/ablation.py [--quick] [--trials 5] [--only VARIANT …] [--out DIR]
+    [SLAM_DATA=/path/to/data] python experiments/ablation.py [--quick] [--trials 5] [--only VARIANT …]
+        [--sequences NAME …] [--out DIR]
 
 Each sequence is run several times, with another first frame, pixel noise of half a grey level, and up to 20 % more or
 fewer features, a world with another seed as well (`experiments/perturbations.py`). Features are extracted once for
@@ -127,8 +128,10 @@ def main() -> int:
     parser = script_options(__file__, __doc__, "one trial, twelve frames of one world, three variants")
     parser.add_argument("--trials", type=int, default=5, help="runs of each sequence")
     parser.add_argument("--only", nargs="*", default=[], metavar="VARIANT", help="these variants alone")
+    parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone")
     given = parser.parse_args()
-    cases, trials, names = list(CASES), given.trials, given.only
+    cases = [case for case in CASES if not given.sequences or case.name in given.sequences]
+    trials, names = given.trials, given.only
     if given.quick:
         cases, trials, names = [Case("desk", "synthetic:desk?frames=12", 12)], 1, [v.name for v in GROUPS[0][:3]]
     file = given.out / ("quick.csv" if given.quick else "ablation.csv")

@@ -42,10 +42,6 @@ FRONTENDS: dict[tuple[str, str | None], dict[str, Any]] = {
     ("driving", "surf"): {"upright": True},
 }
 
-#: Options of a back end that suit a kind of motion. On recorded drives the filter is twice as accurate with landmarks
-#: in world coordinates, though less consistent; walking with a camera, twice as accurate with inverse depths.
-BACKENDS: dict[tuple[str, str | None], dict[str, Any]] = {("driving", "ekf"): {"landmarks": "euclidean"}}
-
 
 @dataclass(frozen=True)
 class SystemConfig:
@@ -93,7 +89,6 @@ class SystemConfig:
             map=MAPS[kind],
             objects=OBJECTS[kind],
             frontend=dict(FRONTENDS.get((kind, frontend), {})),
-            backend=dict(BACKENDS.get((kind, backend), {})),
         )
 
     def to_json(self) -> dict[str, Any]:

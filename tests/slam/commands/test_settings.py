@@ -52,7 +52,7 @@ def test_every_option_of_front_ends_and_back_ends_is_there(every, role):
 def test_defaults_differ_by_kind_of_motion_where_they_do(every):
     shown = {(s.owner, s.key): s.defaults for s in every}
     assert shown["", "map.max_landmarks"] == {"handheld": 1000, "driving": 200}
-    assert shown["ekf", "backend.landmarks"] == {"handheld": "inverse_depth", "driving": "euclidean"}
+    assert shown["ekf", "backend.landmarks"] == {"handheld": "inverse_depth", "driving": "inverse_depth"}
     assert shown["surf", "frontend.upright"] == {"handheld": False, "driving": True}
 
 
