@@ -5,9 +5,9 @@
 
 Each sequence is run several times, with another first frame, pixel noise of half a grey level, and up to 20 % more or
 fewer features, a world with another seed as well (`experiments/perturbations.py`). Features are extracted once for
-all variants, so a variant is compared with the usual settings on the same features. Runs are appended to
+all variants, so a variant is compared with everything on, on the same features. Runs are appended to
 ``ablation.csv`` as they end, and a later call goes on with those that are missing. Printed are, for each back end,
-medians with the usual settings, and for each variant the median ratio to them; then the NEES.
+medians with everything on, and for each variant the median ratio to them; then the NEES.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
-from experiments.ablation_parts import CASES, GROUPS, USUAL, Case, Variant, error_of, opened
+from experiments.ablation_parts import ALL_ON, CASES, GROUPS, Case, Variant, error_of, opened
 from experiments.common import script_options, timed
 from experiments.perturbations import BACKENDS, NONE, features_of, frames_of
 from experiments.tables import markdown
@@ -72,15 +72,15 @@ def runs(cases: list[Case], trials: int, names: list[str], done: set[tuple[str, 
             sequence = opened(case, trial)
             if sequence is None:
                 continue
-            usual = {b: USUAL.config(sequence, case, b) for b in BACKENDS}
+            base = {b: ALL_ON.config(sequence, case, b) for b in BACKENDS}
             wanted = [
                 (b, v) for v in chosen for b in BACKENDS
-                if (v is USUAL or v.patch is not nullcontext or v.config(sequence, case, b) != usual[b])
+                if (v is ALL_ON or v.patch is not nullcontext or v.config(sequence, case, b) != base[b])
                 and (case.name, str(trial), b, v.name) not in done
             ]  # fmt: skip
             if not wanted:
                 continue
-            options = {**usual[BACKENDS[0]].frontend, "features": features_of(sequence, trial)}
+            options = {**base[BACKENDS[0]].frontend, "features": features_of(sequence, trial)}
             frontend = create("surf", sequence.rig, **options)
             features = [frontend.extract(f) for f in frames_of(sequence, NONE, case.frames, trial)]
             for backend, variant in wanted:
@@ -89,27 +89,27 @@ def runs(cases: list[Case], trials: int, names: list[str], done: set[tuple[str, 
 
 
 def tables(rows: list[dict[str, str]], backend: str) -> str:
-    """Errors and times as ratios to those with the usual settings, and the NEES; medians over the trials."""
+    """Errors and times as ratios to those with everything on, and the NEES; medians over the trials."""
     own = [row for row in rows if row["back end"] == backend]
     cases = list(dict.fromkeys(row["sequence"] for row in own))
-    usual = {(row["sequence"], row["trial"]): row for row in own if row["variant"] == USUAL.name}
-    errors: list[list[object]] = [[USUAL.name, *_medians(usual.values(), cases, "error", "{:.4f}")]]
-    errors[0] += ["1", sum(int(row["lost"]) for row in usual.values()), "1"]
-    nees: list[list[object]] = [[USUAL.name, *_medians(usual.values(), cases, "NEES", "{:.1f}")]]
-    for variant in (v for group in GROUPS for v in group if v is not USUAL):
-        mine = [r for r in own if r["variant"] == variant.name and (r["sequence"], r["trial"]) in usual]
+    base = {(row["sequence"], row["trial"]): row for row in own if row["variant"] == ALL_ON.name}
+    errors: list[list[object]] = [[ALL_ON.name, *_medians(base.values(), cases, "error", "{:.4f}")]]
+    errors[0] += ["1", sum(int(row["lost"]) for row in base.values()), "1"]
+    nees: list[list[object]] = [[ALL_ON.name, *_medians(base.values(), cases, "NEES", "{:.1f}")]]
+    for variant in (v for group in GROUPS for v in group if v is not ALL_ON):
+        mine = [r for r in own if r["variant"] == variant.name and (r["sequence"], r["trial"]) in base]
         if not mine:
             continue
         cells, logs, costs = [], [], []
         for case in cases:
-            pairs = [(r, usual[r["sequence"], r["trial"]]) for r in mine if r["sequence"] == case]
+            pairs = [(r, base[r["sequence"], r["trial"]]) for r in mine if r["sequence"] == case]
             ratio = np.array([float(r["error"]) / float(u["error"]) for r, u in pairs])
             ratio = ratio[np.isfinite(ratio)]
-            sure = len(ratio) >= 3 and ((ratio > 1).all() or (ratio < 1).all())
-            cells.append(f"{'**' * sure}{np.median(ratio):.2f}{'**' * sure}" if len(ratio) else None)
+            bold = "**" if len(ratio) >= 3 and ((ratio > 1).all() or (ratio < 1).all()) else ""
+            cells.append(f"{bold}{np.median(ratio):.2f}{bold}" if len(ratio) else None)
             logs += [np.log(np.median(ratio))] if len(ratio) else []
             costs += [float(r["ms"]) / float(u["ms"]) for r, u in pairs]
-        more = sum(int(r["lost"]) - int(usual[r["sequence"], r["trial"]]["lost"]) for r in mine)
+        more = sum(int(r["lost"]) - int(base[r["sequence"], r["trial"]]["lost"]) for r in mine)
         mean = f"{np.exp(np.mean(logs)):.2f}" if logs else None
         errors.append([variant.name, *cells, mean, f"{more:+d}", f"{np.nanmedian(costs):.2f}"])
         nees.append([variant.name, *_medians(mine, cases, "NEES", "{:.1f}")])

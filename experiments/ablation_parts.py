@@ -83,6 +83,13 @@ def no_first_frames() -> AbstractContextManager[object]:
     return mock.patch(name, lambda *_: np.zeros(0, np.int64))
 
 
+#: Settings with which every part that may be worth something is on, by kind of motion.
+BASE = {
+    "driving": ("association.align=true", "map.target_in_view=150", "backend.landmarks=euclidean"),
+    "handheld": (),
+}
+
+
 @dataclass(frozen=True)
 class Variant:
     """What is switched off, or changed.
@@ -91,25 +98,30 @@ class Variant:
         name: for the table.
         settings: by kind of motion; those of both where it is one tuple. A back end that has none of them is left out.
         patch: the change of the program for what has no setting.
+        base: whether the settings are changes of `BASE`; else of the defaults.
     """
 
     name: str
     settings: tuple[str, ...] | dict[str, tuple[str, ...]] = ()
     patch: Callable[[], AbstractContextManager[object]] = nullcontext
+    base: bool = True
 
     def config(self, sequence: Sequence, case: Case, backend: str) -> SystemConfig:
         """All settings of a run."""
         own = self.settings if isinstance(self.settings, tuple) else self.settings[sequence.kind]
-        known = [s for s in own if not s.startswith("backend.") or backend == "ekf"]
+        both = (*(BASE[sequence.kind] if self.base else ()), *own)
+        known = [s for s in both if not s.startswith("backend.") or backend == "ekf"]
         return SystemConfig.for_kind(sequence.kind, "surf", backend).with_settings([*case.settings, *known])
 
 
 _HALF = {"driving": ("map.target_in_view=80",), "handheld": ("map.target_in_view=40",)}
 _FEW = "association.measured=40"
-USUAL = Variant("usual settings")
+ALL_ON = Variant("everything on")
+USUAL = Variant("default settings", base=False)
 #: In the order in which they are run; those of one tuple share the features of a trial.
 GROUPS = (
     (
+        ALL_ON,
         USUAL,
         Variant("no patch alignment", ("association.align=false",)),
         Variant("half as many landmarks in view", _HALF),

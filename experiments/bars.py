@@ -1,6 +1,6 @@
 """Medians over perturbations of what the tests on recordings measure; the tests allow half as much more.
 
-    SLAM_DATA=/path/to/data python experiments/bars.py [--quick] [--trials 7] [--out DIR]
+    SLAM_DATA=/path/to/data python experiments/bars.py [--quick] [--trials 5] [--sequences NAME …] [--out DIR]
 
 Recordings with the usual settings, each time with another first frame, pixel noise, and number of features
 (`experiments/perturbations.py`): the error of the online and of the final path. Recorded tracks (`recorded_tracks`):
@@ -95,20 +95,23 @@ def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, f
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "one trial of one recording")
-    parser.add_argument("--trials", type=int, default=7)
+    parser.add_argument("--trials", type=int, default=5)
+    parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone; the file keeps its others")
     given = parser.parse_args()
-    trials = 1 if given.quick else given.trials
-    found: Medians = {}
+    trials, file = 1 if given.quick else given.trials, given.out / "bars.json"
+    found: Medians = json.loads(file.read_text(encoding="utf-8")) if given.sequences and file.exists() else {}
     for case in RECORDED[: 1 if given.quick else None]:
         sequence = opened(case, 0)
-        if sequence is not None:
+        if sequence is not None and (not given.sequences or case.name in given.sequences):
             found[case.name] = _medians([errors(case, sequence, t) for t in range(min(trials, case.trials))])
             print(case.name, found[case.name], file=sys.stderr, flush=True)
-    if not found:
+    if not found and not given.sequences:
         print("bars: set SLAM_DATA to the folder that holds the recordings; nothing was run")
         return 0
     tracks = recorded_tracks.load(Path(os.environ["SLAM_DATA"]))
     for start, stop, wrong in STRETCHES[: 1 if given.quick else None]:
+        if given.sequences and stretch_name(start, stop, wrong) not in given.sequences:
+            continue
         runs = [
             {b: {"end": replayed(perturbed(tracks, start, stop, t), b, wrong, t)[2]} for b in BACKENDS}
             for t in range(trials)
@@ -116,7 +119,7 @@ def main() -> int:
         found[stretch_name(start, stop, wrong)] = _medians(runs)
     text = json.dumps(found, indent=1)
     given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "bars.json").write_text(text + "\n", encoding="utf-8")
+    file.write_text(text + "\n", encoding="utf-8")
     print(text)
     return 0
 

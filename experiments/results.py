@@ -95,7 +95,6 @@ EXPERIMENTS = (
     ),
     Experiment("faults", "Blackout, dropped frames, a kidnapped camera"),
     Experiment("frame_rate", "What a frame rate costs in accuracy"),
-    Experiment("alignment", "Features aligned to their first sight"),
     Experiment("informative", "How many measurements a frame needs", "", ("informative.png",)),
     Experiment("ablation", "What each part is worth"),
     Experiment("starry_night", "Starry Night: stereo observations and a known state"),

@@ -24,10 +24,11 @@ MAPS = {
 }
 
 #: Association by kind of motion: in a car, descriptors are updated on approach, so the angle and distance of view are
-#: not limited. Alignment keeps these features from drifting over surfaces.
+#: not limited. Features are not aligned to their first sight: recorded drives gain nothing by it
+#: (`experiments/ablation.py`).
 ASSOCIATIONS = {
     "handheld": AssociationConfig(),
-    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6),
+    "driving": AssociationConfig(view_angle=180.0, view_ratio=1e6, align=False),
 }
 
 #: Moving objects by kind of motion: traffic is faster than what a hand or a robot moves.
