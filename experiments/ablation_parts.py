@@ -123,6 +123,7 @@ GROUPS = (
     (
         ALL_ON,
         USUAL,
+        Variant("defaults, half as many in view", {"driving": _HALF["driving"], "handheld": ()}, base=False),
         Variant("no patch alignment", ("association.align=false",)),
         Variant("half as many landmarks in view", _HALF),
         Variant("40 measured, the most informative", (_FEW,)),
