@@ -24,7 +24,7 @@ import backends
 from experiments import recorded_tracks
 from experiments.ablation_parts import RECORDED, USUAL, Case, error_of, opened
 from experiments.common import script_options
-from experiments.perturbations import BACKENDS, MEASURED, NONE, features_of, frames_of
+from experiments.perturbations import MEASURED, NONE, features_of, frames_of
 from experiments.recorded_tracks import Step, Tracks, replay
 from frontends import create
 from slam.config import SystemConfig
@@ -33,6 +33,7 @@ from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
+BACKENDS = ("ekf", "smoother", "window")
 #: Stretches of the recorded tracks, with the share of wrong matches.
 STRETCHES = ((2, 27, 0.0), (370, 450, 0.0), (370, 450, 0.2))
 ROOM = 1.5  # of a test, times the median
@@ -41,6 +42,7 @@ _OTHER = 5  # first frames of a stretch
 _LEFT_OUT = 0.1  # share of the tracks
 
 Medians = dict[str, dict[str, dict[str, float]]]
+Names = tuple[str, ...]
 
 
 def stretch_name(start: int, stop: int, wrong: float) -> str:
@@ -54,13 +56,13 @@ def bar(name: str, backend: str, figure: str) -> float:
     return ROOM * medians[name][backend][figure]
 
 
-def errors(case: Case, sequence: Sequence, trial: int) -> dict[str, dict[str, float]]:
+def errors(case: Case, sequence: Sequence, names: Names, trial: int) -> dict[str, dict[str, float]]:
     """Of each back end, the error of the online and of the final path in one trial [m]."""
     options = {**SystemConfig.for_kind(sequence.kind).frontend, "features": features_of(sequence, trial)}
     frontend = create("surf", sequence.rig, **options)
     features = [frontend.extract(frame) for frame in frames_of(sequence, NONE, case.frames, trial)]
     found = {}
-    for backend in BACKENDS:
+    for backend in names:
         config = USUAL.config(sequence, case, backend)
         system = StereoSlam(sequence.rig, frontend, backend, config=config)
         estimates = [r.estimate for r in map(system.process_features, features) if r.status in MEASURED]
@@ -96,27 +98,30 @@ def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, f
 def main() -> int:
     parser = script_options(__file__, __doc__, "one trial of one recording")
     parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone; the file keeps its others")
+    parser.add_argument("--sequences", nargs="*", metavar="NAME", help="these alone; a file in DIR keeps its others")
+    parser.add_argument("--backends", nargs="*", default=BACKENDS, metavar="NAME", help="these alone, likewise")
     given = parser.parse_args()
     trials, file = 1 if given.quick else given.trials, given.out / "bars.json"
-    found: Medians = json.loads(file.read_text(encoding="utf-8")) if given.sequences and file.exists() else {}
+    found: Medians = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     for case in RECORDED[: 1 if given.quick else None]:
         sequence = opened(case, 0)
         if sequence is not None and (not given.sequences or case.name in given.sequences):
-            found[case.name] = _medians([errors(case, sequence, t) for t in range(min(trials, case.trials))])
+            runs = [errors(case, sequence, given.backends, t) for t in range(min(trials, case.trials))]
+            found[case.name] = found.get(case.name, {}) | _medians(runs)
             print(case.name, found[case.name], file=sys.stderr, flush=True)
-    if not found and not given.sequences:
+    if not os.environ.get("SLAM_DATA"):
         print("bars: set SLAM_DATA to the folder that holds the recordings; nothing was run")
         return 0
     tracks = recorded_tracks.load(Path(os.environ["SLAM_DATA"]))
     for start, stop, wrong in STRETCHES[: 1 if given.quick else None]:
-        if given.sequences and stretch_name(start, stop, wrong) not in given.sequences:
+        name = stretch_name(start, stop, wrong)
+        if given.sequences and name not in given.sequences:
             continue
         runs = [
-            {b: {"end": replayed(perturbed(tracks, start, stop, t), b, wrong, t)[2]} for b in BACKENDS}
+            {b: {"end": replayed(perturbed(tracks, start, stop, t), b, wrong, t)[2]} for b in given.backends}
             for t in range(trials)
         ]
-        found[stretch_name(start, stop, wrong)] = _medians(runs)
+        found[name] = found.get(name, {}) | _medians(runs)
     text = json.dumps(found, indent=1)
     given.out.mkdir(parents=True, exist_ok=True)
     file.write_text(text + "\n", encoding="utf-8")
