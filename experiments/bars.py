@@ -50,10 +50,10 @@ def stretch_name(start: int, stop: int, wrong: float) -> str:
     return f"tracks {start} to {stop}, {100 * wrong:.0f} % wrong"
 
 
-def bar(name: str, backend: str, figure: str) -> float:
-    """What a test allows [m]: `ROOM` times the median of a figure of a recording."""
+def bars(name: str) -> dict[str, dict[str, float]]:
+    """What a test allows, by back end and figure [m]: `ROOM` times the medians of a recording."""
     medians: Medians = json.loads(FILE.read_text(encoding="utf-8"))
-    return ROOM * medians[name][backend][figure]
+    return {b: {f: ROOM * value for f, value in figures.items()} for b, figures in medians[name].items()}
 
 
 def errors(case: Case, sequence: Sequence, names: Names, trial: int) -> dict[str, dict[str, float]]:

@@ -80,6 +80,8 @@ class SystemConfig:
     def for_kind(cls, kind: str, frontend: str | None = "surf", backend: str | None = None) -> SystemConfig:
         """The default settings for a kind of motion (``"handheld"``, ``"driving"``), front end and back end by name.
 
+        No back end has options that depend on the kind today.
+
         Raises:
             ConfigurationError: the kind is not known.
         """
