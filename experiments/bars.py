@@ -3,8 +3,7 @@
     SLAM_DATA=/path/to/data python experiments/bars.py [--quick] [--trials 5] [--sequences NAME …] [--out DIR]
 
 Recordings with the usual settings, each time with another first frame, pixel noise, and number of features
-(`experiments/perturbations.py`): the error of the online and of the final path. Recorded tracks (`recorded_tracks`):
-how far a stretch is off at its end, with another first frame, a tenth of the tracks left out, and other wrong matches.
+(`experiments/perturbations.py`): the error of the online and of the final path.
 Writes ``bars.json``, whose place is ``tests/bars.json``, and prints the same.
 """
 
@@ -13,41 +12,27 @@ from __future__ import annotations
 import json
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import backends
-from experiments import recorded_tracks
 from experiments.ablation_parts import RECORDED, USUAL, Case, error_of, opened
 from experiments.common import script_options
 from experiments.perturbations import MEASURED, NONE, features_of, frames_of
-from experiments.recorded_tracks import Step, Tracks, replay
 from frontends import create
 from slam.config import SystemConfig
-from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.sequences import Sequence
 from slam.system import StereoSlam
 
 BACKENDS = ("ekf", "smoother", "window")
-#: Stretches of the recorded tracks, with the share of wrong matches.
-STRETCHES = ((2, 27, 0.0), (370, 450, 0.0), (370, 450, 0.2))
 ROOM = 1.5  # of a test, times the median
 FILE = Path(__file__).resolve().parents[1] / "tests" / "bars.json"
-_OTHER = 5  # first frames of a stretch
-_LEFT_OUT = 0.1  # share of the tracks
 
 Medians = dict[str, dict[str, dict[str, float]]]
 Names = tuple[str, ...]
-
-
-def stretch_name(start: int, stop: int, wrong: float) -> str:
-    """The key of a stretch in the file."""
-    return f"tracks {start} to {stop}, {100 * wrong:.0f} % wrong"
 
 
 def bars(name: str) -> dict[str, dict[str, float]]:
@@ -69,24 +54,6 @@ def errors(case: Case, sequence: Sequence, names: Names, trial: int) -> dict[str
         online = Trajectory(np.array([e.stamp for e in estimates]), np.array([e.T_world_left for e in estimates]))
         found[backend] = {"online": error_of(online, sequence), "final": error_of(system.trajectory(), sequence)}
     return found
-
-
-def replayed(tracks: Tracks, name: str, wrong: float, seed: int = 1) -> tuple[list[Step], object, float]:
-    """The steps of a replay, the back end, and how far its last pose is off [m], seen from the first."""
-    config = SystemConfig.for_kind("driving", None, name)
-    backend = backends.create(name, tracks.rig, models=config.models, **config.backend)
-    steps = list(replay(tracks, backend, config, wrong, seed))
-    moved = inverse(steps[0].T_world_left) @ steps[-1].T_world_left
-    off = np.linalg.norm(moved[:3, 3] - (inverse(tracks.poses[0]) @ tracks.poses[-1])[:3, 3])
-    return steps, backend, float(off)
-
-
-def perturbed(tracks: Tracks, start: int, stop: int, trial: int) -> Tracks:
-    """A stretch that begins a little later, without a tenth of its tracks."""
-    rng = np.random.default_rng(trial)
-    found = tracks.between(start + int(rng.integers(_OTHER)), stop)
-    kept = rng.random(found.pixels.shape[1]) >= _LEFT_OUT
-    return replace(found, pixels=found.pixels[:, kept])
 
 
 def _medians(trials: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
@@ -112,16 +79,6 @@ def main() -> int:
     if not os.environ.get("SLAM_DATA"):
         print("bars: set SLAM_DATA to the folder that holds the recordings; nothing was run")
         return 0
-    tracks = recorded_tracks.load(Path(os.environ["SLAM_DATA"]))
-    for start, stop, wrong in STRETCHES[: 1 if given.quick else None]:
-        name = stretch_name(start, stop, wrong)
-        if given.sequences and name not in given.sequences:
-            continue
-        runs = [
-            {b: {"end": replayed(perturbed(tracks, start, stop, t), b, wrong, t)[2]} for b in given.backends}
-            for t in range(trials)
-        ]
-        found[name] = found.get(name, {}) | _medians(runs)
     text = json.dumps(found, indent=1)
     given.out.mkdir(parents=True, exist_ok=True)
     file.write_text(text + "\n", encoding="utf-8")
