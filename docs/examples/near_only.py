@@ -1,5 +1,9 @@
 """The built-in filter with one thing changed: it is not given landmarks whose disparity is below a limit."""
 
+from dataclasses import replace
+
+import numpy as np
+
 from backends.ekf import EkfBackend
 
 
@@ -10,4 +14,5 @@ class NearOnly(EkfBackend):
 
     def update(self, observations, guess=None):
         far = observations.uv_left[:, 0] - observations.uv_right[:, 0] < self.least_disparity  # no right pixel: not far
-        return super().update(observations.select(~far), guess)
+        report = super().update(observations.select(~far), guess)
+        return replace(report, rejected=np.union1d(report.rejected, observations.ids[far]))
