@@ -62,7 +62,7 @@ class _Numbered(StereoFrame):
     @classmethod
     def of(cls, index: int, features: object) -> _Numbered:
         """Without an image."""
-        return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features)
+        return cls(index, 0.0, np.zeros((0, 0), np.uint8), None, features=features)
 
 
 class _Frontend:
