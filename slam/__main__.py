@@ -1,5 +1,10 @@
 """``python -m slam``: the command ``slam``."""
 
+import sys
+from pathlib import Path
+
 from slam.commands.cli import main
 
+if Path(sys.path[0]) == Path.cwd():  # as with `slam`: last, so that folders here hide nothing of ours
+    sys.path.append(sys.path.pop(0))
 main()

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
@@ -62,20 +63,38 @@ def resolve(role: str, name: str) -> Any:
     target = name if ":" in name else _table(role).get(name)
     if target is None:
         raise UnknownNameError(f"{unknown(what, name, names(role))}; or one of your own: module:Class")
+    if target is not name and name in BUILT_IN[role] and (hidden := _hidden(role)):
+        raise UnknownNameError(f"{what} {name!r} cannot be loaded: {hidden}")
     if target is name and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))  # last: nothing that is installed is replaced
     module, _, attribute = target.partition(":")
     try:
         return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        where = ""
-        if target is name and error.name == module.partition(".")[0]:
-            where = f"; looked for in {Path.cwd()}, where `slam` runs, and among the installed packages"
+        where, package = "", (error.name or "").partition(".")[0]
+        if package in BUILT_IN:
+            where = f": {_hidden(package) or f'`{package}` is the package of slam, so call yours by another name'}"
+        elif target is name and package == module.partition(".")[0]:
+            where = (
+                f"; looked for in {Path.cwd()}, where `slam` runs, among the installed packages, and in PYTHONPATH, "
+                "to which you can add another folder"
+            )
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}{where}") from error
     except (ImportError, AttributeError, ValueError, TypeError, SyntaxError) as error:
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {text_of(error)}") from error
     except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
         raise UnknownNameError(f"{what} {name!r} cannot be loaded: {cause(error)}") from error
+
+
+def _hidden(package: str) -> str:
+    """What hides `backends` or `frontends` of this distribution, in words; empty where nothing does."""
+    spec = find_spec(package)
+    if spec is None:
+        return ""
+    found = Path(next(iter(spec.submodule_search_locations or [str(spec.origin)]))).resolve()
+    if found.parent == Path(__file__).resolve().parents[1]:
+        return ""
+    return f"{found} hides slam's own `{package}`: rename it"
 
 
 def create(role: str, name: str, rig: Any, **options: Any) -> Any:

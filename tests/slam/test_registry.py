@@ -1,0 +1,54 @@
+"""Back ends and front ends by name where the user's folder has packages of the same names."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+_RESOLVE = "from slam import registry; registry.resolve({role!r}, {name!r})"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for package in ("backends", "frontends", "mypackage"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").touch()
+        (tmp_path / package / "mytoy.py").write_text("class Toy:\n    def __init__(self, rig, models=None): ...\n")
+    return tmp_path
+
+
+def _said(folder, *words, path=(ROOT,)):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    done = subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
+    return done.stderr.strip().splitlines()[-1] if done.stderr.strip() else ""
+
+
+@pytest.mark.parametrize(("role", "name"), [("backends", "ekf"), ("frontends", "surf")])
+def test_a_folder_that_hides_ours_is_named(folder, role, name):
+    said = _said(folder, "-c", _RESOLVE.format(role=role, name=name))
+    assert f"{folder / role} hides slam's own `{role}`: rename it" in said
+
+
+def test_python_m_slam_is_not_hidden_and_finds_a_package_in_the_folder(folder):
+    run = ("-m", "slam", "run", "synthetic:desk?frames=3", "--out", "out", "--frontend", "nothing", "--backend")
+    assert "unknown front end 'nothing'" in _said(folder, *run, "ekf")
+    assert "it lacks predict" in _said(
+        folder, "-m", "slam", "run", "synthetic:desk?frames=3", "--out", "out", "--backend", "mypackage.mytoy:Toy"
+    )
+
+
+def test_a_package_of_ones_own_is_found_from_anywhere(folder, tmp_path_factory):
+    elsewhere, own = (
+        tmp_path_factory.mktemp("elsewhere"),
+        ("-c", _RESOLVE.format(role="backends", name="mypackage.mytoy:Toy")),
+    )
+    assert "PYTHONPATH" in _said(elsewhere, *own)
+    assert not _said(elsewhere, *own, path=(ROOT, folder))
+
+
+def test_a_module_in_a_folder_of_our_name_is_told_to_change_it(folder):
+    run = ("-m", "slam", "run", "synthetic:desk?frames=3", "--out", "out", "--backend", "backends.mytoy:Toy")
+    assert "call yours by another name" in _said(folder, *run)
