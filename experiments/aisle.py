@@ -27,8 +27,9 @@ from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.evaluation.association_truth import AssociationScore, SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
-from slam.run.figures import RunData, draw_map_3d, draw_top_view
+from slam.run.figures import draw_map_3d, draw_top_view
 from slam.run.plots import plot
+from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.sequences import Sequence, open_sequence
 

@@ -20,8 +20,9 @@ from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
-from slam.run.figures import RunData, draw_map_3d, draw_top_view
+from slam.run.figures import draw_map_3d, draw_top_view
 from slam.run.plots import plot
+from slam.run.run_data import RunData
 from slam.runtime.cores import available_cores
 from slam.sequences import open_sequence
 

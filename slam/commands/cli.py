@@ -266,7 +266,7 @@ def compare_command(
     ] = None,
     settings: SetOption = None,
     mask: MaskOption = None,
-    trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 1,
+    trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 12,
     frames: FramesOption = None,
     replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
@@ -364,11 +364,13 @@ def view_command(
 
 
 @app.command("list", short_help="List back ends, sequences and formats.")
-def list_command() -> None:
+def list_command(
+    options: Annotated[bool, typer.Option("--options", help="Also the options of the built-in sequences.")] = False,
+) -> None:
     """List back ends, front ends, built-in sequences and formats."""
     from slam.commands.display import print_listing
 
-    print_listing()
+    print_listing(options)
 
 
 @app.command("warm-up", short_help="Compile all kernels beforehand.")

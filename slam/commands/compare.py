@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 from slam.compare.paper import write_paper
-from slam.compare.plan import Plan, Variant, parse_variant
+from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import conclusions, most_trials, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
 from slam.compare.tables import count_tests, groups, write_tables
-from slam.compare.wording import caution
+from slam.compare.wording import beforehand, caution
 from slam.errors import ConfigurationError
 from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
 
 _QUICK_FRAMES, _QUICK_TRIALS = 30, 2
 _MOST_WORKERS = 1024
+
+
+def _seconds(trial: Trial) -> float:
+    """About what a frame takes [s]: more where there are images, which worlds have to render."""
+    return 0.12 if trial.mode == CLOSED_LOOP and trial.variant.frontend != SIMULATED else 0.03
 
 
 def variants_of(frontends: Sequence[str], variants: Sequence[str], settings: Sequence[str]) -> tuple[Variant, ...]:
@@ -71,7 +77,12 @@ def compare(
     frames = check(plan, out, overwrite)  # before there is a progress bar
     planned = [frames[trial.sequence] for mode in plan.modes for trial in plan.trials_of(mode)]
     if not quiet:
-        print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}", flush=True)
+        seconds = sum(frames[t.sequence] * _seconds(t) for mode in plan.modes for t in plan.trials_of(mode))
+        about = (
+            timedelta(seconds=round(seconds / count, -1)) if address is None else "a time that depends on the cluster"
+        )
+        print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}: about {about}")
+        print(beforehand(plan.trials if any(map(is_world, plan.sequences)) else 1), flush=True)
     with said_before(), SweepProgress(planned, quiet) as bar:  # `check` has said what opening says
         scheduler: Scheduler = LocalScheduler(count, bar.frames) if address is None else DaskScheduler(address)
         runs = sweep(

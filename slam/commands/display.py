@@ -170,8 +170,9 @@ def print_conclusions(every: Sequence[Conclusions], caution: str, reference: str
     used = {line.verdict for found in every for line in found.headlines}
     for found in every:
         _say(found.name, "bold")
-        if found.failed:
-            _say(found.failed)
+        for text in (*found.verdict, found.failed):
+            if text:
+                _say(text)
         table = Table.grid(padding=(0, 2))
         for line in found.headlines:
             style = f"bold {_COLOURS[line.direction]}" if WORDS[line.verdict] == "certain" else _COLOURS[line.direction]
@@ -213,13 +214,20 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
         ("status", [", ".join(f"{n} {k}" for k, n in s["status"].items()) for s in summaries]),
         ("landmarks", [str(s.get("landmarks", 0)) for s in summaries]),
         ("path length [m]", [f"{s.get('path_length_m', 0.0):.2f}" for s in summaries]),
+        ("speed, median [m/s]", [_figure(s.get("speed_m_per_s")) for s in summaries]),
+        _in_its_unit("sigma of the last position [m]", [s.get("final_sigma_m") for s in summaries]),
     ]
+    if any("loops" in s for s in summaries):
+        loops = [s.get("loops", {}) for s in summaries]
+        rows.append(("loops closed, refused", [f"{n.get('closed', '–')}, {n.get('refused', '–')}" for n in loops]))
+        rows.append(("moving bodies found", [_figure(s.get("bodies")) for s in summaries]))
+    rows += _body_rows([s.get("objects", {}).get("bodies", {}) for s in summaries])
     for when, wanted in (("online", None), ("final", ("ATE RMSE [m]", "GPS distance RMSE [m]"))):
         keys = {key: None for s in summaries for key in s.get("accuracy", {}).get(when, {})}
         for key in keys:
             if key == "poses with truth" or (wanted and key not in wanted):
                 continue
-            rows.append((f"{when} {key}", [_figure(s["accuracy"][when].get(key)) for s in summaries]))
+            rows.append(_in_its_unit(f"{when} {key}", [s["accuracy"][when].get(key) for s in summaries]))
     if any(s.get("accuracy", {}).get("poses left out") for s in summaries):
         rows.append(("poses not measured, left out", [str(s["accuracy"]["poses left out"]) for s in summaries]))
     for key in ("NEES over 10 m", "NEES over 100 m", "scale error [%]", "scale sigma [%]"):
@@ -245,12 +253,33 @@ def _summary_rows(summaries: list[dict[str, Any]]) -> list[tuple[str, list[str]]
     return rows
 
 
+def _body_rows(bodies: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
+    """How well bodies whose truth is known were found, by their number."""
+    rows = []
+    for body in dict.fromkeys(body for one in bodies for body in one):
+        own = [one.get(body, {}) for one in bodies]
+        seen = [f"{_figure(one.get('coverage') and 100 * one['coverage'])} %" for one in own]
+        rows.append((f"body {body}: measured, of the frames it moves in", seen))
+        for unit in ("[m]", "[deg]"):
+            what = f"{'translation' if unit == '[m]' else 'rotation'} median"
+            values = [one.get("ME", {}).get(f"{what} {unit}") for one in own]
+            rows.append(_in_its_unit(f"body {body}: error of its motion a frame {unit}", values))
+    return rows
+
+
+def _in_its_unit(label: str, values: Sequence[Any]) -> tuple[str, list[str]]:
+    """A row whose label names metres: in millimetres where all values are below one metre."""
+    if "[m" in label and all(value is None or abs(value) < 1 for value in values):
+        label, values = label.replace("[m", "[mm"), [None if value is None else 1e3 * value for value in values]
+    return label, [_figure(value) for value in values]
+
+
 def _figure(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (int, float)) else "–"
 
 
-def print_listing() -> None:
-    """Back ends, front ends, built-in sequences and formats."""
+def print_listing(options: bool = False) -> None:
+    """Back ends, front ends, formats and built-in sequences, these with their options where they are asked for."""
     from slam import registry, worlds
     from slam.sequences import formats
 
@@ -259,10 +288,14 @@ def print_listing() -> None:
     table.add_row("front ends", ", ".join(registry.names("frontends")))
     table.add_row("formats", ", ".join(formats()))
     _console.print(table)
-    worlds_table = Table(title="built-in sequences", show_lines=False)
-    worlds_table.add_column("name")
-    worlds_table.add_column("what")
+    if not options:
+        table = Table.grid(padding=(0, 2))
+        for name in worlds.names():
+            table.add_row(f"synthetic:{name}", escape(worlds.describe(name).splitlines()[0].partition(": ")[2]))
+        _console.print("built-in sequences")
+        _console.print(table)
+        _console.print("`slam list --options` shows the options of each", highlight=False)
+        return
     for name in worlds.names():
-        worlds_table.add_row(f"synthetic:{name}", escape(worlds.describe(name)))
-    _console.print(worlds_table)
-    _console.print(escape(worlds.describe_common()))
+        _say(f"\nsynthetic:{worlds.describe(name)}")
+    _say(f"\n{worlds.describe_common()}")

@@ -124,13 +124,13 @@ def draw_pairs(group: Group, metric: Metric) -> Figure:
     figure, axis = _axes(2.6)
     values = np.array([metric.scale * group.values(name, metric.key) for name in group.runs])
     backends, trials = values.shape
-    x = np.arange(1, trials + 1) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
+    x = np.arange(trials) + (np.linspace(-0.25, 0.25, backends) if backends > 1 else np.zeros(1))[:, None]
     axis.plot(x, values, color="0.7", lw=1, zorder=1)
     for at, value, (name, colour) in zip(x, values, colours(group).items()):
         axis.plot(at, value, "o", color=colour, ms=4, alpha=0.8, label=name)
-    axis.set_xlim(0.5, trials + 0.5)
-    axis.set_xticks(range(1, trials + 1, -(-trials // _MOST_TICKS)))
-    axis.set(xlabel="trial", ylabel=metric.title)
+    axis.set_xlim(-0.5, trials - 0.5)
+    axis.set_xticks(range(0, trials, -(-trials // _MOST_TICKS)))
+    axis.set(xlabel="seed", ylabel=metric.title)
     low, high = float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=1e-9))
     axis.set_ylim(0 if low < 0.5 * high else low - 0.1 * high, 1.1 * high)  # trifles are not blown up
     _legend_above(axis)

@@ -27,6 +27,7 @@ from slam.compare.wording import (
     failures,
     headline,
     honesty,
+    in_short,
     innovations,
     measurements,
     replayed,
@@ -93,6 +94,7 @@ class Conclusions:
 
     Attributes:
         name: of the group.
+        verdict: which back end is better in what, a sentence for each but the reference.
         failed: which runs failed; empty where none did.
         headlines: what is certain, likely and a hint, in both directions, and which main figures are open.
         sentences: one per main figure.
@@ -100,6 +102,7 @@ class Conclusions:
     """
 
     name: str
+    verdict: list[str]
     failed: str
     headlines: list[Line]
     sentences: list[str]
@@ -121,12 +124,14 @@ def _conclusions(group: Group, every: Sequence[Group]) -> Conclusions:
     compared = [group.differences(metric) for metric in group.metrics]
     headlines: list[Line] = []
     sentences: list[str] = []
+    verdict: list[str] = []
     for other in others:
         own = [differences[other] for differences in compared]
+        verdict.append(in_short(own, first, other))
         headlines += headline(own, other)
         sentences += [sentence(d, first, other) for d in own if worth_saying(d)]
     failed = failures({b: group.failures(b) for b in group.runs}, group.trials)
-    return Conclusions(_name(group), failed, headlines, sentences, _honesty(group, every))
+    return Conclusions(_name(group), verdict, failed, headlines, sentences, _honesty(group, every))
 
 
 def _honesty(group: Group, every: Sequence[Group]) -> list[str]:

@@ -36,6 +36,8 @@ _VERB = {Verdict.CERTAIN: "is", Verdict.LIKELY: "seems", Verdict.HINT: "seems", 
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 _MISSING = 0.5  # of what the smaller of two shares lacks: with a larger difference, nearly all is not as good as all
 
+_FACTOR = 3.0  # between two means, from which on it is said as a factor
+
 _SMOOTHER, _ROUGHER = 0.5, 2.0  # NIS per degree of freedom beyond which a sentence says what it means
 
 #: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
@@ -103,6 +105,26 @@ def headline(differences: Sequence[Difference], other: str) -> list[Line]:
     return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
 
 
+def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
+    """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
+    told = [
+        d for d in differences if d.metric.main and d.verdict in (Verdict.CERTAIN, Verdict.LIKELY) and not is_trifle(d)
+    ]
+    parts = []
+    for better, first, second in ((True, other, reference), (False, reference, other)):
+        if names := [f"{_name(d.metric)} ({WORDS[d.verdict]})" for d in told if d.better is better]:
+            parts.append(f"{first} is better than {second} in {', '.join(names)}")
+    return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
+
+
+def beforehand(trials: int) -> str:
+    """What so many trials can show, before they are run."""
+    tests = int(ALPHA * 2 ** min(trials - 1, 30))
+    if tests < 1:
+        return caution(trials)
+    return f"With {trials} trials a difference that has the same sign in all is certain where up to {tests} are tested."
+
+
 def is_trifle(d: Difference) -> bool:
     """Whether two means are so near that nobody would choose by them, however sure their difference is.
 
@@ -131,7 +153,7 @@ def sentence(d: Difference, reference: str, other: str) -> str:
         return f"{label}: {first} was better, {against}, {STRENGTH[d.verdict]}."
     if d.verdict is Verdict.OPEN:
         return f"{label}: no difference can be concluded, {first} {against}, mean of {trials}; {_evidence(d)}."
-    how = f"{against}{_less(d)}, in {d.wins} of {trials}; {_evidence(d)}"
+    how = f"{against}{_apart(d)}, in {d.wins} of {trials}; {_evidence(d)}"
     return f"{label}: {first} {_VERB[d.verdict]} better than {second}, {how}: {STRENGTH[d.verdict]}."
 
 
@@ -334,10 +356,7 @@ def _listed(differences: Sequence[Difference]) -> str:
 def _brief(d: Difference) -> str:
     """The figure from the reference's value to the other's, and by how much of the reference's that is."""
     unit = d.metric.unit and f" {d.metric.unit}"
-    share = ""
-    if d.metric.better == "lower" and d.reference > 0:
-        share = f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    return f"{_name(d.metric)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{share}"
+    return f"{_name(d.metric)} {_shown(d, d.reference)} → {_shown(d, d.other)}{unit}{_apart(d)}"
 
 
 def _shown(d: Difference, value: float) -> str:
@@ -345,9 +364,17 @@ def _shown(d: Difference, value: float) -> str:
     return shown_spread(d.metric, value, np.nan)[0]
 
 
-def _less(d: Difference) -> str:
-    """By how much of the worse one the better one is lower."""
-    return f" ({100 * abs(d.mean) / max(d.reference, d.other):.2g} % less)" if d.metric.better == "lower" else ""
+def _apart(d: Difference) -> str:
+    """By how much the other's mean is above or below the reference's: a factor where percentages are enormous."""
+    small, large = sorted((d.reference, d.other))
+    if d.metric.better != "lower" or d.reference <= 0:
+        return ""
+    if small <= 0 or large / small < _FACTOR:
+        return f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
+    return (
+        f" ({_digits(large / small) if large / small < 1e4 else f'{large / small:.1g}'} times as "
+        f"{'much' if d.other > d.reference else 'little'})"
+    )
 
 
 def _digits(value: float) -> str:

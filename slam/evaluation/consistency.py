@@ -194,17 +194,25 @@ def _mean(values: Array) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
+#: What a verdict may judge by, the best first: errors from the start add up, those of stretches do not.
+_JUDGED = {"NEES over 10 m": "over 10 m", "NEES over 1 m": "over 1 m", "mean NEES": "from the start"}
+
+
 def verdict(figures: dict[str, float]) -> str:
-    """One line in words on what the figures say; empty where there are none."""
-    key = next(
-        (k for k in ("NEES over 10 m", "NEES over 1 m", "mean NEES") if np.isfinite(figures.get(k, np.nan))), None
-    )
-    if key is None:
+    """One line in words on what the figures say, by which of them and why; empty where there are none.
+
+    A figure of which more than half of the stretches had to be left out is not judged by.
+    """
+    ratios = {
+        where: float(np.sqrt(figures[key] / _DOF))
+        for key, where in _JUDGED.items()
+        if np.isfinite(figures.get(key, np.nan)) and figures.get(f"no covariance {where}", 0.0) <= 0.5
+    }
+    if not ratios:
         return ""
-    ratio = figures[key] / _DOF
-    what = "from the start" if key == "mean NEES" else key.removeprefix("NEES ")
-    if ratio > 2:
-        return f"covariances are too small: errors {what} are {np.sqrt(ratio):.1f} times what they claim"
-    if ratio < 0.5:
-        return f"covariances are too large: errors {what} are {np.sqrt(ratio):.1f} times what they claim"
-    return f"covariances hold: errors {what} are {np.sqrt(ratio):.1f} times what they claim"
+    judged, ratio = next(iter(ratios.items()))
+    says = "are too small" if ratio**2 > 2 else "are too large" if ratio**2 < 0.5 else "hold"
+    text = f"covariances {says}: errors {judged} are {ratio:.2g} times what they claim"
+    if judged == "from the start" or "from the start" not in ratios:
+        return text
+    return f"{text}; from the start, where errors of the whole path add up, {ratios['from the start']:.2g} times"

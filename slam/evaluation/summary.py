@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from slam.evaluation.metrics import (
     relative_errors,
     segment_errors,
 )
-from slam.geometry.se3 import Array, inverse, rotation_angle
+from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
 
@@ -43,7 +44,8 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     figures: dict[str, float] = {}
     pairs = _common(estimate, sequence.ground_truth)
     if pairs is not None:
-        for part in (_absolute, _from_start, _relative, _segments):
+        mounting = getattr(sequence, "truth_noise", TruthNoise()).mounting
+        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _segments):
             figures.update(_where_possible(part, *pairs))
         figures["poses with truth"] = float(len(pairs[0]))
     gps = getattr(sequence, "gps", None)
@@ -94,11 +96,29 @@ def _absolute(own: Trajectory, true: Trajectory) -> dict[str, float]:
     return {"ATE RMSE [m]": ate.rmse, "ATE max [m]": ate.max}
 
 
-def _from_start(own: Trajectory, true: Trajectory) -> dict[str, float]:
+def _from_start(own: Trajectory, true: Trajectory, mounting: float) -> dict[str, float]:
     # Turned by the first pose, not by the aligned path: a straight path leaves the turn about itself open.
-    turn = inverse(own.poses[0]) @ own.poses @ inverse(inverse(true.poses[0]) @ true.poses)
-    rms = np.sqrt(np.mean(rotation_angle(turn[:, :3, :3]) ** 2))
-    return {"rotation RMSE from start [deg]": float(np.degrees(rms))}
+    since_start = (inverse(path.poses[0]) @ path.poses for path in (own, true))
+    R, R_true = (poses[:, :3, :3] for poses in since_start)
+    R_left = np.swapaxes(R, 1, 2)
+    errors = so3_log(R_left @ R_true)
+    if mounting:
+        errors = _remounted(errors, R_left, mounting)
+    return {"rotation RMSE from start [deg]": float(np.degrees(np.sqrt(np.mean(np.sum(errors**2, axis=1)))))}
+
+
+def _remounted(errors: Array, R_left: Array, mounting: float) -> Array:
+    """Rotation errors (N, 3) without what a constant turn w of the truth's sensor explains: ``(1 − Rᵀ) w``.
+
+    Args:
+        errors: with ``R_true = R exp(e)``, of rotations since the start [rad].
+        R_left: those rotations, transposed (N, 3, 3).
+        mounting: standard deviation of each axis of w beforehand [rad].
+    """
+    J = (np.eye(3) - R_left).reshape(-1, 3)
+    prior = np.mean(errors**2) / mounting**2
+    turn = np.linalg.solve(J.T @ J + prior * np.eye(3), J.T @ errors.ravel()) if prior else np.zeros(3)
+    return np.asarray(errors - (J @ turn).reshape(-1, 3))
 
 
 def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:

@@ -2,162 +2,36 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam.errors import SlamError
 from slam.evaluation.metrics import align, associate
-from slam.files import read_object, read_text, whole_file
+from slam.files import whole_file
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.naming import printable
-from slam.run.schema import STAGES
+from slam.run.run_data import RunData
 from slam.run.style import backend_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_TRUTH, _SEEN, _UNSEEN = "0.35", "#c62828", "#7cb342"
+_TRUTH, _SEEN, _UNSEEN, _OLD = "0.35", "#c62828", "#7cb342", "0.75"
+_MARKS = {_SEEN: ("^", 3.5), _UNSEEN: (".", 2.0)}  # told apart by shape, too
 _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
+_BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
 
 
-@dataclass(frozen=True, eq=False)
-class RunData:
-    """What a run's folder says.
-
-    Attributes:
-        name: shown in the pictures.
-        online, final: paths.
-        positions: landmarks (N, 3) [m].
-        covariances: (N, 3, 3) [m²].
-        seen_last: which landmarks were measured in the last frame (N,).
-        deviations: of the online position in world axes (F, 3) [m], a row for each pose of `online`.
-        measured: whether each pose of `online` was measured (F,), or is the motion model's alone.
-        status: of each frame.
-        milliseconds: by stage, of each frame [ms].
-        truth: true path, in its own world; None where it is not known.
-        sequence, backend: names.
-        folder: where it was read from.
-        truth_is_exact: whether the truth has no errors of its own: that of a world.
-        loops: rows of `final` whose places are the same (L, 2), the later one first.
-        refused: rows of `final` whose places only looked alike (L, 2), the later one first.
-        keyframes: rows of `final` that are keyframes (K,).
-    """
-
-    name: str
-    online: Trajectory
-    final: Trajectory
-    positions: Array
-    covariances: Array
-    seen_last: np.ndarray
-    deviations: Array
-    measured: np.ndarray
-    status: list[str]
-    milliseconds: dict[str, Array]
-    truth: Trajectory | None = None
-    sequence: str = ""
-    backend: str = ""
-    folder: Path = Path()
-    truth_is_exact: bool = True
-    loops: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    keyframes: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-
-    @classmethod
-    def read(cls, folder: Path, name: str) -> RunData:
-        """Read the files of a finished run.
-
-        Raises:
-            SlamError: the folder does not hold a finished run.
-        """
-        if not folder.exists():
-            raise SlamError(f"{folder}: there is no such folder")
-        if not (folder / "landmarks.csv").exists():
-            raise SlamError(f"{folder}: not the folder of a finished run: there is no landmarks.csv")
-        try:
-            return cls._read(folder, name)
-        except (KeyError, IndexError, ValueError, TypeError, OverflowError, csv.Error) as error:
-            raise SlamError(f"{folder}: not the folder of a finished run: {error}") from error
-
-    @classmethod
-    def _read(cls, folder: Path, name: str) -> RunData:
-        landmarks, frames = _rows(folder / "landmarks.csv"), _rows(folder / "frames.csv")
-        upper = _numbers(landmarks, ("cxx", "cxy", "cxz", "cyy", "cyz", "czz"))
-        last_seen = _numbers(landmarks, ("last_seen",))[:, 0]
-        truth, final = folder / "truth.txt", Trajectory.read_tum(folder / "trajectory_final.txt")
-        located = [row for row in frames if row["sd_x"]]
-        config = read_object(folder / "config.json")
-        return cls(
-            printable(name),
-            Trajectory.read_tum(folder / "trajectory.txt"),
-            final,
-            _numbers(landmarks, ("x", "y", "z")),
-            upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
-            last_seen == int(frames[-1]["frame"]),
-            _numbers(located, ("sd_x", "sd_y", "sd_z")),
-            np.array([row["status"] in ("started", "tracked") for row in located], bool),
-            [row["status"] for row in frames],
-            {stage: _numbers(frames, (f"ms_{stage}",))[:, 0] for stage in STAGES},
-            Trajectory.read_tum(truth) if truth.exists() else None,
-            printable(str(config["sequence"])),
-            printable(str(config["backend"])),
-            folder,
-            config["format"] == "synthetic",
-            _pairs(frames, final, "loop"),
-            _pairs(frames, final, "refused"),
-            _keyframes(frames, final),
-        )
-
-
-def _pairs(frames: list[dict[str, str]], final: Trajectory, column: str) -> np.ndarray:
-    """Rows of the final path (L, 2) of the frames that a column names a place for, and of that place."""
-    stamps = {row["frame"]: float(row["stamp"]) for row in frames}
-    pairs = [(stamps[row["frame"]], stamps[row[column]]) for row in frames if (row.get(column) or "").isdigit()]
-    return _rows_at(final, np.array(pairs).reshape(-1, 2))
-
-
-def _keyframes(frames: list[dict[str, str]], final: Trajectory) -> np.ndarray:
-    """Rows of the final path (K,) that are keyframes."""
-    return _rows_at(final, np.array([float(row["stamp"]) for row in frames if row.get("keyframe") == "1"]))
-
-
-def _rows_at(final: Trajectory, stamps: Array) -> np.ndarray:
-    """Rows of the final path at stamps."""
-    return np.searchsorted(final.stamps, stamps - 1e-9).clip(0, max(len(final) - 1, 0))
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
-
-
-def read_objects(folder: Path) -> list[tuple[float, str, list[float]]]:
-    """Stamp [s], id and position [m] of every row of objects.csv.
-
-    Raises:
-        SlamError: the file is missing or damaged.
-    """
-    path = folder / "objects.csv"
-    try:
-        return [(float(row["stamp"]), row["id"], [float(row[c]) for c in "xyz"]) for row in _rows(path)]
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise SlamError(f"{path}: no list of objects: {error}") from error
-
-
-def _numbers(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Array:
-    """Columns of a table as numbers (N, C); NaN for an empty cell."""
-    return np.array([[float(row[c] or "nan") for c in columns] for row in rows]).reshape(-1, len(columns))
-
-
 def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
-    """Top view (right, forward) of each run: landmarks red if seen in the last frame, else green (paper A, Fig. 6)."""
+    """Top view (right, forward) of each run: landmarks red triangles if seen in the last frame, else green dots.
+
+    As in paper A, Fig. 6; grey are landmarks of before.
+    """
     figure, axes = _figure(len(runs), (6.4, 6.0))
     for axis, run, colour in zip(axes, runs, backend_colours([run.backend for run in runs])):
         draw_map(axis, run, truth, colour)
@@ -183,9 +57,16 @@ def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) ->
             offset_transform=axis.transData, facecolors="none", edgecolors=shade, linewidths=0.8,
         )  # fmt: skip
         axis.add_collection(ellipses)
-        axis.plot(*run.positions[rows][:, [0, 2]].T, ".", ms=2, color=shade, label=f"landmarks {label}")
-    draw_path(axis, run, run.online, f"path of {run.name}", color=colour, lw=3, alpha=0.6)
+        mark, size = _MARKS[shade]
+        axis.plot(*run.positions[rows][:, [0, 2]].T, mark, ms=size, color=shade, label=f"landmarks {label}")
+    if len(run.old):
+        axis.plot(*run.old[:, [0, 2]].T, ".", ms=1.5, color=_OLD, zorder=0, label="landmarks before")
+    draw_path(axis, run, run.online, f"path of {run.name}, online", color=colour, lw=3, alpha=0.6)
     draw_loops(axis, run)
+    label = "moving bodies"
+    for positions, body_colour in zip(run.bodies.values(), cycle(_BODIES)):
+        axis.plot(*positions[:, [0, 2]].T, "-s", ms=4, lw=1.5, markevery=[-1], color=body_colour, label=label)
+        label = "_"
     _draw_truth(axis, run, truth)
     axis.set(xlabel="right [m]", ylabel="forward [m]", aspect="equal")
     _limit_to_most(axis, run)
@@ -200,14 +81,21 @@ def draw_path(axis: Axes, run: RunData, path: Trajectory, label: str, **style: A
 
 
 def draw_loops(axis: Axes, run: RunData) -> None:
-    """The path that loops have corrected, from above, its keyframes, and the places where loops were found."""
+    """The final path from above where it is another, keyframes, and the places where loops were found."""
     final = run.final.positions[:, [0, 2]]
+    if is_revised(run):
+        axis.plot(*final.T, color=_CORRECTED, lw=1.2, label="path, final")
     if len(run.loops):
-        axis.plot(*final.T, color=_CORRECTED, lw=1.5, label="path, corrected by loops")
         axis.plot(*final[run.keyframes].T, ".", ms=3, color=_CORRECTED, label="keyframes")
         axis.plot(*final[run.loops[:, 0]].T, "o", ms=6, mfc="none", color=_CLOSED, label="loops closed")
     if len(run.refused):
         axis.plot(*final[run.refused[:, 0]].T, "x", ms=5, color=_REFUSED, label="loops refused")
+
+
+def is_revised(run: RunData) -> bool:
+    """Whether the final path is another than the online one."""
+    same = len(run.final) == len(run.online)
+    return not (same and np.allclose(run.final.poses, run.online.poses, rtol=0, atol=1e-6))
 
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
@@ -233,6 +121,8 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
         axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+            side.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.yaxis.labelpad = axis.zaxis.labelpad = 9  # clear of the numbers
         axis.set_box_aspect(np.ptp([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()], axis=1))  # one scale for all
         axis.view_init(elev=25, azim=-65)
@@ -337,17 +227,29 @@ def well_known(run: RunData) -> np.ndarray:
     """Rows of landmarks that are well known and near the path, most recent last: others spoil a picture's scale."""
     size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
     distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
-    scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0  # where the camera hardly moved, or was lost
-    extent = max(float(np.ptp(run.online.positions, axis=0).max()), scene, 1.0)
-    return np.flatnonzero((size < 0.2 * extent) & (distance < 2.0 * extent + 3.0))
+    return np.flatnonzero((size < 0.2 * _extent(run)) & (distance < _reach(run)))
+
+
+def _extent(run: RunData) -> float:
+    """How far the path reaches [m]; of the scene where the camera hardly moved, or was lost."""
+    distance = np.linalg.norm(run.positions - run.online.positions.mean(axis=0), axis=1)
+    scene = 0.5 * float(np.median(distance)) if len(distance) else 0.0
+    return max(float(np.ptp(run.online.positions, axis=0).max()), scene, 1.0)
+
+
+def _reach(run: RunData) -> float:
+    """Distance from the middle of the path up to which landmarks are shown [m]."""
+    return 2.0 * _extent(run) + 3.0
 
 
 def _limit_to_most(axis: Axes, run: RunData) -> None:
     """Axis limits that hold the path and the well-known landmarks with their ellipses."""
     known = well_known(run)
-    points = np.concatenate([run.online.positions, run.positions[known]])[:, [0, 2]]
-    reach = _SIGMAS * np.sqrt(np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]])  # of the ellipses
-    reach = np.concatenate([np.zeros((len(run.online), 2)), reach])
+    near = np.linalg.norm(run.old - run.online.positions.mean(axis=0), axis=1) < _reach(run)
+    points = np.concatenate([run.positions[known], run.online.positions, run.final.positions, run.old[near]])[:, [0, 2]]
+    reach = np.zeros_like(points)
+    reach[: len(known)] = np.diagonal(run.covariances[known], axis1=1, axis2=2)[:, [0, 2]]
+    reach = _SIGMAS * np.sqrt(reach)  # of the ellipses
     low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
     margin = 0.05 * float((high - low).max()) + 0.1
     axis.set_xlim(low[0] - margin, high[0] + margin)

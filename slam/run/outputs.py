@@ -15,21 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from slam.data import Estimate, FrameResult
+from slam.data import Estimate, FrameResult, IdArray
 from slam.errors import SlamError
 from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.euler import angles
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, transform
 from slam.geometry.trajectory import Trajectory, tum_line
 from slam.landmarks import LandmarkTable
+from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MovingObject
-from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, STAGES, header
+from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 
 _ROWS = ("trajectory.txt", "frames.csv", "objects.csv")  # grow frame by frame
 _WHOLE = (
-    "config.json", "schema.json", "trajectory_final.txt", "truth.txt", "landmarks.csv", "summary.json", "summary.png",
+    "config.json", "schema.json", "trajectory_final.txt", "truth.txt", "landmarks.csv", OLD_LANDMARKS,
+    "summary.json", "summary.png",
 )  # fmt: skip
 
 _SPARE = 8  # file descriptors kept for the last files
@@ -120,6 +122,16 @@ class RunFiles:
         """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
         rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
         write_text(self.folder / "landmarks.csv", _rows([LANDMARK_COLUMNS, *rows]))
+
+    def write_old_landmarks(self, atlas: Atlas, present: IdArray) -> None:
+        """Write landmarks_old.csv: of this run's keyframes, without those `present`; raises as `write_trajectory`."""
+        found: dict[int, Array] = {}
+        for keyframe, T in zip(atlas.keyframes[atlas.prior_count :], atlas.poses_in_map()[atlas.prior_count :]):
+            rows = np.flatnonzero(~np.isin(keyframe.landmarks, [-1, *present]))
+            at = transform(T, np.asarray(keyframe.points, float)[rows])
+            found.update(zip(np.asarray(keyframe.landmarks)[rows].tolist(), at))
+        lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
+        write_text(self.folder / OLD_LANDMARKS, _rows([header(OLD_TABLE), *lines]))
 
     def write_truth(self, trajectory: Trajectory) -> None:
         """Write truth.txt, the true path at the frames' stamps; raises as `write_trajectory`."""

@@ -6,7 +6,7 @@ Drawn without pyplot: there is no state to share, and it is loaded faster.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -14,20 +14,22 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from slam.errors import SlamError
+from slam.evaluation.consistency import verdict
 from slam.files import whole_file
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
 from slam.run.figures import (
-    RunData,
     draw_map,
     draw_path,
+    is_revised,
     place_of_truth,
     position_errors,
     stretch,
     well_known,
     widths,
 )
+from slam.run.run_data import RunData
 from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 
 if TYPE_CHECKING:
@@ -150,7 +152,7 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
         first, *others = (part.subplots() for part in parts_above)
     else:
         width = width or 5.0 * parts
-        figure = _figure(width, max(8.2 * (width / (5.0 * parts)), _LEAST_HEIGHT))
+        figure = _figure(width, max(8.2 * (width / (5.0 * parts)), _LEAST_HEIGHT) + 0.25 * len(runs))
         above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(4.6, 3.6)))
         first, *others = above.subplots(1, parts)
         left, right = np.asarray(below.subfigures(1, 2))
@@ -159,8 +161,27 @@ def _summary(runs: Sequence[RunData], width: float | None) -> Figure:
         _map_panel(axis, run, colour)
     _error_panels(left.subplots(3, 1, sharex=True), runs)
     _time_panel(right.subplots(), runs)
-    figure.suptitle(_wrapped(_title(runs), figure.get_figwidth()))
+    lines = [_title(runs), *(f"{run.name}: {facts}" for run in runs if (facts := _facts(run.summary)))]
+    figure.suptitle("\n".join(_wrapped(line, figure.get_figwidth()) for line in lines))
     return figure
+
+
+def _facts(summary: Mapping[str, Any]) -> str:
+    """What a run found, also where there is no truth, and whether its covariances hold, in one line."""
+    words = []
+    if summary.get("speed_m_per_s") is not None:
+        words.append(f"{summary['path_length_m']:.3g} m at {summary['speed_m_per_s']:.2g} m/s")
+        words.append(f"σ of the last position {_length(summary['final_sigma_m'])}")
+    if "loops" in summary:
+        loops = summary["loops"]
+        words.append(f"loops closed {loops['closed']}, refused {loops['refused']}")
+        words.append(f"moving bodies {summary.get('bodies', 0)}")
+    return "; ".join([*words, *filter(None, [verdict(summary.get("consistency", {}))])])
+
+
+def _length(metres: float) -> str:
+    factor, unit = _unit(metres)
+    return f"{factor * metres:.2g} {unit}"
 
 
 def _path(runs: Sequence[RunData], width: float | None) -> Figure:
@@ -217,7 +238,10 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     for colour, width, run, path in zip(_colours(runs), widths(len(runs), 2.0), runs, paths):
         draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
-    _set_title(axis, "Path, online, from above (dot: start)")
+        if is_revised(run):
+            final = path.poses[0] @ inverse(run.online.poses[0]) @ run.final.poses
+            axis.plot(*final[:, [0, 2], 3].T, ":", color=colour, lw=0.7 * width, label=f"{run.name}, final")
+    _set_title(axis, "Path from above, online unless said otherwise (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     shown = paths if truth is None else [*paths, truth]
     if not stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
@@ -282,22 +306,27 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
 
 
 def _time_panel(axis: Axes, runs: Sequence[RunData]) -> None:
-    """Median time per frame and stage of each run, but for its first frame, which may wait for compilers."""
+    """Median time of a frame of each run, but for its first frame, which may wait for compilers, and its stages.
+
+    Medians of stages do not add up to that of a frame: they are drawn in proportion.
+    """
     rows = np.arange(len(runs))[::-1]
     left = np.zeros(len(runs))
-    for stage in stages(runs[0].milliseconds):
-        width = np.array([_median_of_later(run.milliseconds[stage]) for run in runs])
+    totals = np.array([_median_of_later(np.sum(list(run.milliseconds.values()), axis=0)) for run in runs])
+    names = stages(runs[0].milliseconds)
+    parts = np.array([[_median_of_later(run.milliseconds[stage]) for run in runs] for stage in names])
+    parts *= totals / np.maximum(parts.sum(axis=0), 1e-12)
+    for stage, width in zip(names, parts):
         if width.any():
             axis.barh(rows, width, left=left, height=0.6, color=stage_colour(stage), label=stage_name(stage))
         left += width
-    for row, run, end in zip(rows, runs, left):
-        total = _median_of_later(np.sum(list(run.milliseconds.values()), axis=0))  # as the run's table says it
+    for row, end, total in zip(rows, left, totals):
         axis.text(end, row, f" {total:.0f} ms" if total >= 100 else f" {total:.3g} ms", va="center", fontsize="small")
     axis.set_yticks(rows, [run.name for run in runs])
     axis.set(xlim=(0, 1.25 * max(float(left.max()), 1e-3)), xlabel="time per frame [ms]")
     margin = 0.7 if len(runs) > 1 else 1.2
     axis.set(ylim=(-margin, len(runs) - 1 + margin))
-    _set_title(axis, "Median time of each stage, and of a whole frame")
+    _set_title(axis, "Median time of a frame, and the shares of its stages")
     _legend_below(axis, *axis.get_legend_handles_labels())
 
 

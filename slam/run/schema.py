@@ -119,6 +119,11 @@ OBJECT_TABLE = (
     ),
 )
 
+#: Landmarks that had left the map before the end.
+OLD_LANDMARKS = "landmarks_old.csv"
+
+OLD_TABLE = LANDMARK_TABLE[:2]
+
 #: Files that are tables, with their columns.
 TABLES: dict[str, tuple[Columns, ...]] = {
     "trajectory.txt": _POSE,
@@ -126,6 +131,7 @@ TABLES: dict[str, tuple[Columns, ...]] = {
     "truth.txt": _POSE,
     "frames.csv": FRAME_TABLE,
     "landmarks.csv": LANDMARK_TABLE,
+    OLD_LANDMARKS: OLD_TABLE,
     "objects.csv": OBJECT_TABLE,
 }
 
@@ -136,6 +142,7 @@ FILES = {
     "truth.txt": "the true path at the same stamps, in its own world, where the sequence has one",
     "frames.csv": "a row per frame",
     "landmarks.csv": "a row per landmark of the map at the end",
+    OLD_LANDMARKS: "a row per landmark that had left the map by then, where the last keyframe that saw it has it",
     "objects.csv": "a row per frame and moving body",
     "summary.json": "counts, accuracy and consistency where the truth is known, timings; written last",
     "config.json": "what was run, with all settings; `slam run --config` repeats it",

@@ -43,6 +43,7 @@ class RunRecord:
     features: list[tuple[int, int]] = field(default_factory=list)  # number of them, and of those with a right pixel
     without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
+    bodies: set[int] = field(default_factory=set)
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -58,6 +59,7 @@ class RunRecord:
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
+        self.bodies.update(thing.id for thing in result.objects)
         if not result.located:
             return
         self.stamps.append(result.estimate.stamp)
@@ -112,6 +114,8 @@ def results_of(
     measured = np.array(record.measured)
     found: dict[str, Any] = {
         "path_length_m": record.trajectory.length,
+        "speed_m_per_s": _speed(record.trajectory),
+        "final_sigma_m": float(np.sqrt(np.trace(record.covariances[-1][3:, 3:]))),
         "landmarks": 0 if system.landmarks is None else len(system.landmarks),
         "observations": {"used": record.used, "rejected": record.rejected},
         "accuracy": {
@@ -132,6 +136,7 @@ def results_of(
     if isinstance(system, StereoSlam):
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
+        found["bodies"] = len(record.bodies)
     if score is not None:
         found["objects"] = score.summary()
     compiled = compile_clock.seconds() - record.compiled_before
@@ -148,6 +153,12 @@ def live_frames(live: LiveFrames, record: RunRecord) -> dict[str, Any]:
         "milliseconds behind": {"median": float(np.median(later)), "max": float(later.max())},
         "clock waited [s]": live.clock_waited,
     }
+
+
+def _speed(path: Trajectory) -> float | None:
+    """Median speed [m/s]; None for a single pose."""
+    steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1) / np.diff(path.stamps)
+    return float(np.median(steps)) if len(steps) else None
 
 
 def _rate(record: RunRecord) -> float | None:

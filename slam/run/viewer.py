@@ -19,7 +19,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, quaternion
 from slam.geometry.trajectory import Trajectory
 from slam.outputs import Output, require_outputs
-from slam.run.figures import RunData, read_objects
+from slam.run.run_data import RunData, read_objects
 from slam.system import StereoSlam
 
 LIVE = "live"

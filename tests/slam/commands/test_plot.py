@@ -15,8 +15,9 @@ from slam.commands.plot import leave_picture, plot_runs
 from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.geometry.trajectory import Trajectory
-from slam.run.figures import RunData, draw_map, position_errors, stretch, well_known
+from slam.run.figures import draw_map, position_errors, stretch, well_known
 from slam.run.plots import _SMALL_STYLE, _STYLE, KINDS, _in_one_world, _path_panel, plot, read_runs
+from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.run.style import backend_colours
 from slam.sequences import open_sequence

@@ -21,10 +21,10 @@ from slam.errors import MeasurementError, SequenceError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.map_io import load_map
-from slam.run.figures import RunData
 from slam.run.outputs import FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS
 from slam.run.recorded import RecordedFrame
 from slam.run.recording import load_recording
+from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, parse_frames, run
 from slam.run.warm_up import warm_up
 from slam.sequences import open_sequence
