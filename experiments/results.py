@@ -214,7 +214,8 @@ def gallery(pictures: Sequence[tuple[Experiment, Sequence[str]]]) -> str:
             lines += [f"## {experiment.title}", "", *(line for picture in shown for line in (picture, ""))]
     lines += [
         "## The demo", "",
-        "`slam demo`: the map of the bookshelf aisle that each back end makes. Red: measured in the last frame.",
+        "`slam demo`: the map of the bookshelf aisle that each back end makes. Red triangles: measured in the last "
+        "frame; grey: landmarks of before; the squared line is the box.",
         "", "![Top view of both maps](images/demo_top_view.png)", "",
         "## The worlds", "", "Drawn by `python docs/make_world_pictures.py`; see [worlds](worlds.md).", "",
     ]  # fmt: skip
@@ -238,6 +239,19 @@ def head(quick: bool) -> str:
     )
 
 
+def summary() -> str:
+    """The section that the page begins with: the README's results, whose figures tests compare with the others."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
+    return "## In short\n" + text.replace("](docs/results.md#", "](#").replace("](docs/", "](").rstrip("\n") + "\n"
+
+
+def with_summary(page: str) -> str:
+    """A page that begins with the present summary."""
+    first, *parts = page.split("\n## ")
+    parts = [part for part in parts if not part.startswith("In short\n")]
+    return "\n## ".join([first, summary().removeprefix("## "), *parts])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="every script in its short form")
@@ -258,7 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         page = with_sections(given.page.read_text(encoding="utf-8"), chosen, sections)
     else:
         page = "\n".join([head(given.quick), *sections])
-    given.page.write_text(page, encoding="utf-8")
+    given.page.write_text(with_summary(page), encoding="utf-8")
     if not given.only:  # a part of the pictures would be no gallery
         given.page.with_name("gallery.md").write_text(gallery(pictures), encoding="utf-8")
     print(f"{len(sections)} experiments, {len(failed)} failed. Page: {given.page}", file=sys.stderr)

@@ -27,6 +27,7 @@ def scripts(results, tmp_path, monkeypatch):
     )
     (folder / "bad.py").write_text("print('half')\nraise SystemExit('no way')\n")
     monkeypatch.setattr(results, "ROOT", tmp_path)
+    (tmp_path / "README.md").write_text("# It\n\n## Results\n\nGood.\n\n## More\n")
     names = [results.Experiment("good", "Good", "the paper's"), results.Experiment("bad", "Bad")]
     monkeypatch.setattr(results, "EXPERIMENTS", (*names, results.Experiment("none", "None")))
     return tmp_path
@@ -103,6 +104,12 @@ def test_the_gallery_in_the_documentation_is_as_the_script_writes_it(results):
     assert page.endswith(demo + tail)
 
 
+def test_the_page_begins_with_the_readmes_results(results):
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    assert page.split("\n## ")[1].startswith("In short\n")
+    assert results.with_summary(page) == page
+
+
 def test_columns_are_explained_in_their_order_and_others_are_not(results):
     table = "text\n\n| back end | doubled | tracked |\n| --- | ---: | ---: |\n| ekf | 1 | 2 |\n"
     said = results.explained("aisle", table)
@@ -126,3 +133,10 @@ def test_what_is_explained_is_there(results):
             assert f"| {column} |" in section, f"{name}: {column}"
         for picture in PICTURES.get(name, {}) if section else ():
             assert f"results/{name}_{picture}.png" in section, f"{name}: {picture}"
+
+
+def test_the_api_pages_list_what_their_modules_hold():
+    make = load_script("docs/make_api.py")
+    for page in make.PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert make.written(text) == text, f"docs/api/{page.name}: run python docs/make_api.py"

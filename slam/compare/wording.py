@@ -128,7 +128,7 @@ def beforehand(trials: int) -> str:
 def is_trifle(d: Difference) -> bool:
     """Whether two means are so near that nobody would choose by them, however sure their difference is.
 
-    Of shares, such as that of tracked frames, what they lack has to be nearly the same, too: 99.2 % is not all.
+    Shares such as that of tracked frames are judged by what they lack, too: 99.2 % is not equal to 100 %.
     """
     apart, larger = abs(d.other - d.reference), max(abs(d.reference), abs(d.other))
     if d.metric.better == "higher" and d.metric.unit == "%" and _shown(d, d.reference) != _shown(d, d.other):

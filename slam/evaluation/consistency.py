@@ -212,7 +212,7 @@ def verdict(figures: dict[str, float]) -> str:
         return ""
     judged, ratio = next(iter(ratios.items()))
     says = "are too small" if ratio**2 > 2 else "are too large" if ratio**2 < 0.5 else "hold"
-    text = f"covariances {says}: errors {judged} are {ratio:.2g} times what they claim"
+    text = f"covariances {says}: errors {judged} are {ratio:.2f} times what they claim"
     if judged == "from the start" or "from the start" not in ratios:
         return text
-    return f"{text}; from the start, where errors of the whole path add up, {ratios['from the start']:.2g} times"
+    return f"{text}; from the start, where errors of the whole path add up, {ratios['from the start']:.2f} times"

@@ -351,10 +351,10 @@ def _finish(
             if truth is not None:
                 files.write_truth(truth)
         with last.each():
-            estimate = system.estimate()
-            files.write_landmarks(estimate, system.landmarks, record.numbers)
-            if isinstance(system, StereoSlam):
-                files.write_old_landmarks(system.atlas, estimate.ids)
+            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+        if isinstance(system, StereoSlam):
+            with last.each():
+                files.write_old_landmarks(system.atlas, system.landmarks.ids)
         with last.each():
             summary.update(results_of(sequence, system, record, final, score))
     summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random

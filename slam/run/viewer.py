@@ -6,6 +6,8 @@ Rerun is an optional dependency (``pip install 'surf-stereo-slam[viewer]'``), lo
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -193,6 +195,11 @@ def _rerun() -> Any:
 
 def _open(rr: Any, target: str) -> Any:
     """A recording stream into a window or a file."""
+    if target == LIVE and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        raise SlamError(
+            "viewer live: there is no display for a window; give a file, such as run.rrd, in place of live, "
+            "and open it where there is one: rerun run.rrd"
+        )
     recording = rr.RecordingStream("surf-stereo-slam")
     try:
         if target == LIVE:

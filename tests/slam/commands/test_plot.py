@@ -146,6 +146,35 @@ def test_frames_that_were_not_tracked_are_told_from_others(runs, tmp_path):
     plot_runs([tmp_path / "a", runs / "b"], tmp_path / "a.png", "summary")
 
 
+def test_bodies_old_landmarks_and_the_final_path_are_in_the_map(runs):
+    from matplotlib.figure import Figure
+
+    data = RunData.read(runs / "a", "a")
+    shifted = Trajectory(data.final.stamps, data.final.poses + np.eye(4, k=3))
+    data = replace(data, final=shifted, bodies={"1": np.zeros((2, 3)), "2": np.ones((2, 3))}, old=np.ones((4, 3)))
+    axis = Figure().subplots()
+    draw_map(axis, data, None, "0.5")
+    labels = [line.get_label() for line in axis.lines]
+    for label in ("path, final", "moving bodies", "landmarks before"):
+        assert labels.count(label) == 1
+    marks = {line.get_marker() for line in axis.lines if str(line.get_label()).startswith("landmarks ")}
+    assert {"^", "."} <= marks  # told apart without colour
+
+
+def test_a_bar_ends_where_its_label_says_and_the_title_says_what_was_found(runs):
+    from matplotlib import rc_context
+
+    data = read_runs([runs / "a"])[0]
+    with rc_context(_STYLE):
+        (axis,) = KINDS["time"](data, None).axes
+        title = KINDS["summary"](data, None).get_suptitle()
+    (label,) = axis.texts
+    end = max(bar.get_x() + bar.get_width() for bar in axis.patches)
+    assert float(label.get_text().split()[0]) == pytest.approx(end, rel=0.01)
+    for words in ("m/s", "σ of the last position", "loops closed 0", "moving bodies"):
+        assert words in " ".join(title.split())
+
+
 def test_ellipses_are_inside_of_the_map(runs):
     from matplotlib.figure import Figure
 

@@ -118,9 +118,31 @@ def test_tables_fit_on_80_columns_and_are_whole(monkeypatch, capsys):
     }
     print_summary([summary, {**summary, "backend": "ekf"}], Path("results/aisle-smoother-1"))
     print_listing()
+    print_listing(options=True)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     assert not [line for line in lines if "…" in line]
+
+
+def test_names_are_listed_first_and_options_on_request():
+    names, options = invoke("list").output, invoke("list", "--options").output
+    assert "synthetic:aisle" in names
+    assert "return=0" not in names
+    assert "return=0" in options
+
+
+def test_lengths_below_a_metre_are_in_millimetres_and_bodies_are_in_the_table(capsys):
+    summary = {
+        "sequence": "aisle", "backend": "ekf", "frames": 9, "status": {"tracked": 9}, "bodies": 1,
+        "loops": {"closed": 2, "refused": 1}, "accuracy": {"online": {"ATE RMSE [m]": 0.0123, "ATE max [m]": 2.5}},
+        "objects": {"bodies": {"1": {"coverage": 0.5, "ME": {"translation median [m]": 0.002}}}},
+    }  # fmt: skip
+    print_summary([summary], Path("out"))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "online ATE RMSE [mm] │ 12.3 " in said
+    assert "online ATE max [m] │ 2.5 " in said
+    assert "loops closed, refused │ 2, 1 " in said
+    assert "its motion a frame [mm] │ 2 " in said
 
 
 def test_a_run_without_a_frame_has_no_table_and_no_picture(tmp_path, capsys):

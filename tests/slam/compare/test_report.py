@@ -172,17 +172,17 @@ def test_the_report_says_what_stages_do(text):
     assert re.search(r"<th[^>]*>whole frame</th><th[^>]*>features</th><th[^>]*>update</th>", text)
 
 
-def test_trials_are_counted_from_one(three):
+def test_trials_are_named_by_their_seeds(three):
     group = three[3][0]
     (axis,) = draw_pairs(group, BY_KEY["ate_online_m"]).axes
-    assert axis.get_xticks().tolist() == list(range(1, 13))
-    assert axis.get_xlabel() == "trial"
+    assert axis.get_xticks().tolist() == list(range(12))
+    assert axis.get_xlabel() == "seed"
     low, high = axis.get_ylim()
     points = [line for line in axis.lines if line.get_label() in group.runs]
     assert [line.get_color() for line in points] == backend_colours(list(group.runs))
     for line, backend in zip(points, group.runs):
         values = line.get_ydata()
-        assert np.round(line.get_xdata()).tolist() == list(range(1, 13))
+        assert np.round(line.get_xdata()).tolist() == list(range(12))
         np.testing.assert_array_equal(values, 1e3 * group.values(backend, "ate_online_m"))
         assert low < np.nanmin(values) <= np.nanmax(values) < high
     assert high - low > 0.1 * high  # equal values are not blown up

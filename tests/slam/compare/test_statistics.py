@@ -21,9 +21,11 @@ from slam.compare.statistics import (
 )
 from slam.compare.wording import (
     STRENGTH,
+    beforehand,
     caution,
     headline,
     honesty,
+    in_short,
     innovations,
     is_trifle,
     measurements,
@@ -201,7 +203,7 @@ def test_higher_is_better_where_it_is():
 
 def test_sentences_say_how_much_and_how_sure():
     text = sentence(difference(ATE, *pairs(6)), "ekf", "smoother")
-    for words in ("smoother is better than ekf", "mm", "% less", "6 of 6", "95 % interval", "certain"):
+    for words in ("smoother is better than ekf", "mm (−", "6 of 6", "95 % interval", "certain"):
         assert words in text
     few = adjusted([difference(ATE, *pairs(6, seed=k)) for k in range(3)])[0]
     assert "p = 0.031, Holm-adjusted 0.094: likely (p ≤ 0.05, not after" in sentence(few, "ekf", "smoother")
@@ -293,6 +295,21 @@ def test_a_headline_names_all_that_is_certain_in_both_directions_and_what_is_ope
     assert worse.startswith("smoother: RPE RMSE over 1 s ")
     assert "(+1" in worse
     assert rest == "smoother: landmark error median"
+
+
+def test_enormous_ratios_are_factors_and_the_verdict_is_one_sentence():
+    ones = np.linspace(0.9, 1.1, 12)
+    (found,) = adjusted([difference(ATE, 0.01 * ones, 5 * ones)])
+    (line,) = headline([found], "smoother")
+    assert "(500 times as much)" in line.text
+    assert "%" not in line.text
+    assert in_short([found], "ekf", "smoother") == "ekf is better than smoother in ATE RMSE online (certain)."
+    assert in_short([], "ekf", "smoother") == "No difference between ekf and smoother can be concluded."
+
+
+def test_what_trials_can_show_is_said_beforehand():
+    assert "same sign in all is certain where up to 102 are tested" in beforehand(12)
+    assert beforehand(3) == caution(3)
 
 
 def test_what_nobody_would_choose_by_is_no_headline_however_sure():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from slam.evaluation.consistency import consistency_figures, stretch_nees, verdict
+from slam.evaluation.summary import evaluate
 from slam.geometry.se3 import adjoint, exp, inverse
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
@@ -57,6 +60,27 @@ def test_covariances_that_are_too_small_are_said_to_be():
     assert "hold" in verdict(mean_over_seeds())
     assert "too large" in verdict(mean_over_seeds(claimed=5.0))
     assert verdict({}) == ""
+
+
+def test_the_verdict_says_what_it_was_judged_by():
+    drifts = {"NEES over 10 m": 6.0, "mean NEES": 600.0}
+    expected = "covariances hold: errors over 10 m are 1.00 times what they claim; from the start, where errors"
+    assert verdict(drifts).startswith(expected)
+    assert verdict(drifts).endswith(" 10.00 times")
+    few = {"NEES over 1 m": 0.5, "no covariance over 1 m": 0.98, "mean NEES": 6.0}
+    assert verdict(few) == "covariances hold: errors from the start are 1.00 times what they claim"
+
+
+def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
+    own, true, _ = odometry(0)
+    turned = Trajectory(true.stamps, true.poses @ exp(np.array([0.01, -0.02, 0.01, 0, 0, 0])))
+    noise = TruthNoise(mounting=0.02)
+    plain, exact, known = (
+        evaluate(own, SimpleNamespace(ground_truth=truth, truth_noise=noise))["rotation RMSE from start [deg]"]
+        for truth, noise in ((true, NONE), (turned, NONE), (turned, noise))
+    )
+    assert exact > 1.2 * plain
+    assert known < 1.05 * plain
 
 
 def test_scale_error_and_its_sigma():

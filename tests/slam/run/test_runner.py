@@ -30,7 +30,7 @@ from slam.run.warm_up import warm_up
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
-TABLES = {"landmarks.csv", "objects.csv", "frames.csv"}
+TABLES = {"landmarks.csv", "landmarks_old.csv", "objects.csv", "frames.csv"}
 FILES = {"trajectory.txt", "trajectory_final.txt", "summary.json", "config.json", "schema.json"} | TABLES
 WITH_TRUTH = FILES | {"truth.txt"}
 

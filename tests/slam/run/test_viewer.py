@@ -19,6 +19,15 @@ def test_without_rerun_one_line_says_what_to_install(monkeypatch, tmp_path):
         Viewer(str(tmp_path / "a.rrd"))
 
 
+def test_without_a_display_one_line_says_what_to_do(monkeypatch):
+    monkeypatch.setattr("slam.run.viewer._rerun", SimpleNamespace)
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(SlamError, match=r"no display for a window; give a file, such as run\.rrd"):
+        Viewer("live")
+
+
 def test_not_a_run(tmp_path):
     with pytest.raises(SlamError, match="finished run"):
         view_run(tmp_path, str(tmp_path / "a.rrd"))

@@ -1,0 +1,45 @@
+"""Lists of what the API pages hold, below the name of each module, so that they can be read where no site is built.
+
+    python docs/make_api.py
+
+Everything between a line ``::: module`` and the next one is written anew.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+
+PAGES = sorted((Path(__file__).parent / "api").glob("*.md"))
+
+
+def listed(name: str) -> str:
+    """A module in a sentence, and its public classes and functions, a line each, in the order of its source."""
+    module = import_module(name)
+    own = [
+        thing
+        for key, thing in vars(module).items()
+        if not key.startswith("_") and callable(thing) and getattr(thing, "__module__", "") == name
+    ]
+    lines = [f"`{name}`: {first_line(module)}", ""]
+    lines += [f"- `{thing.__name__}`: {first_line(thing)}" for thing in own if inspect.getdoc(thing)]
+    return "\n".join(lines).rstrip("\n")
+
+
+def first_line(thing: object) -> str:
+    """The first line of a docstring."""
+    return (inspect.getdoc(thing) or "").partition("\n")[0]
+
+
+def written(page: str) -> str:
+    """A page with the lists of its modules as they are now."""
+    head, *parts = re.split(r"^::: ", page, flags=re.MULTILINE)
+    names = [part.split()[0] for part in parts]
+    return head + "\n".join(f"::: {name}\n\n{listed(name)}\n" for name in names)
+
+
+if __name__ == "__main__":
+    for path in PAGES:
+        path.write_text(written(path.read_text(encoding="utf-8")), encoding="utf-8")
