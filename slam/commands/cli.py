@@ -20,6 +20,7 @@ from slam.commands.options import (
     BackendOption,
     CalibrationOption,
     ConfigOption,
+    DrawMapOption,
     DrawOption,
     FormatOption,
     FramesOption,
@@ -43,6 +44,7 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import catch_signals, leaving, whole_frames
+from slam.errors import SlamError
 from slam.runtime.memory import require_address_space
 
 if TYPE_CHECKING:
@@ -110,6 +112,7 @@ def run_command(
     mask: MaskOption = None,
     viewer: ViewerOption = None,
     draw: DrawOption = None,
+    draw_map: DrawMapOption = False,
     overlap: OverlapOption = True,
     live: LiveOption = False,
     picture: PictureOption = True,
@@ -130,6 +133,8 @@ def run_command(
     sequence = None if sequence is None else with_mask(sequence, mask)
     if sequence is None and mask is not None:
         raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
+    if draw_map and draw is None:
+        raise SlamError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     wanted = Wanted(
         sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
     )
@@ -143,7 +148,7 @@ def run_command(
         if options.config.objects.mode != "off":
             stack.enter_context(compiled_in_background(options.backend))
         options = replace(options, origin=origin.to_json(folder))
-        watches = _watches(stack, opened, viewer, draw)
+        watches = _watches(stack, opened, viewer, draw, draw_map)
         until = threading.Event() if live or is_live(opened) else None
         if until is not None and not quiet:
             print("slam: loading; then frames are taken until Ctrl-C ends the run", file=sys.stderr)
@@ -152,7 +157,7 @@ def run_command(
     _finish(summary, folder, picture, quiet)
 
 
-def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None) -> list[Watch]:
+def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path | None, draw_map: bool) -> list[Watch]:
     """What is shown of every frame: the viewer, and pictures in a folder or a video."""
     watches: list[Watch] = []
     if viewer is not None:
@@ -162,7 +167,7 @@ def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path 
     if draw is not None:
         from slam.run.drawing import FramePictures
 
-        watches.append(stack.enter_context(FramePictures(draw)).show)
+        watches.append(stack.enter_context(FramePictures(draw, draw_map)).show)
     return watches
 
 

@@ -72,7 +72,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     last = shown.get(True, shown.get(False))
     if last is not None:
         (frame,) = open_sequence(world).frames(last.index, last.index + 1)
-        write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, open_sequence(world).rig)))
+        write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, open_sequence(world).rig), last.objects))
     if not quiet:
         print_summary(summaries, out)
         print(_WHY)

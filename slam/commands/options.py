@@ -91,6 +91,7 @@ ViewerOption = Annotated[
 DrawOption = Annotated[
     Path | None, typer.Option(metavar="DIR|FILE.mp4", help="Draw landmarks and objects into the frames.")
 ]
+DrawMapOption = Annotated[bool, typer.Option("--draw-map", help="With --draw: the growing map beside each frame.")]
 OverlapOption = Annotated[
     bool, typer.Option(help="Extract the next frame's features while this one is estimated; same results.")
 ]

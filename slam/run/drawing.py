@@ -5,6 +5,7 @@ The colours are those of paper B, Fig. 10.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
 from slam.object_data import MovingObject
 from slam.outputs import Output
+from slam.run.growing_map import GrowingMap
+from slam.run.style import body_colour
 
 _BEACON, _NEW, _MOVING, _RING = (0, 230, 255), (80, 200, 80), (0, 0, 0), (255, 255, 255)  # BGR
 _AXES = ((40, 40, 230), (60, 180, 60), (230, 90, 40))  # x red, y green, z blue
-_BOXES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))
 _EDGES = [(i, i ^ bit) for i in range(8) for bit in (1, 2, 4) if i < i ^ bit]
 _FONT, _TEXT = 0, 0.5  # OpenCV's plain font, and its size
 _LEAST_RADIUS = 4  # of a feature's circle [px]
@@ -60,26 +62,29 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     return picture
 
 
-def with_legend(picture: np.ndarray) -> np.ndarray:
-    """A picture of `draw_objects` with a bar below it that says what is drawn, as far as there is room for it."""
+def with_legend(picture: np.ndarray, bodies: Sequence[MovingObject] = ()) -> np.ndarray:
+    """A picture of `draw_objects` with a bar below it that says what is drawn, as far as there is room for it.
+
+    Bodies are named by their numbers, in their colours; where there are none, what one would look like is said.
+    """
     import cv2
 
     bar = np.full((_LEGEND, picture.shape[1], 3), 255, np.uint8)
     at, middle = 12, _LEGEND // 2
-    marks = [(_BEACON, "landmark"), (_NEW, "new landmark"), (_MOVING, "feature that moves"), (None, "body"),
-             (False, "body, not seen")]  # fmt: skip
-    for colour, text in marks:
+    known = [(body_colour(body.id), f"body {body.id}", not body.estimate.measured) for body in bodies]
+    marks: list[tuple[tuple[int, int, int], str, bool | None]]
+    marks = [(_BEACON, "landmark", None), (_NEW, "new landmark", None), (_MOVING, "feature that moves", None)]
+    marks += known or [(body_colour(1), "body", False)]
+    for colour, text, dashed in [*marks, (body_colour(1), "body, not seen", True)]:
         (width, height), _ = cv2.getTextSize(text, _FONT, 0.8 * _TEXT, 1)
         if at + 20 + width > bar.shape[1]:
             break
-        if colour:
+        if dashed is None:
             cv2.circle(bar, (at, middle), 5, colour, 2, cv2.LINE_AA)
         else:
-            for left, right in ((-6, 6),) if colour is None else ((-6, -1), (2, 7)):
+            for left, right in ((-6, -1), (2, 7)) if dashed else ((-6, 6),):
                 for edge in (-5, 5):
-                    cv2.line(
-                        bar, (at + left, middle + edge), (at + right, middle + edge), _BOXES[0], 2 - (colour is False)
-                    )
+                    cv2.line(bar, (at + left, middle + edge), (at + right, middle + edge), colour, 2 - dashed)
         cv2.putText(bar, text, (at + 12, middle + height // 2), _FONT, 0.8 * _TEXT, _MOVING, 1, cv2.LINE_AA)
         at += width + 36
     return np.concatenate([picture, bar])
@@ -92,7 +97,7 @@ def _draw_object(
     T_left_object = inverse(result.estimate.T_world_left) @ thing.estimate.T_world_object
     lower, upper = thing.extent
     corners = np.array([[(lower, upper)[i >> k & 1][k] for k in range(3)] for i in range(8)])
-    colour = _BOXES[(thing.id - 1) % len(_BOXES)]
+    colour = body_colour(thing.id)
     measured = thing.estimate.measured
     thickness = 2 if measured else 1
     for a, b in _EDGES:
@@ -119,7 +124,7 @@ def _draw_label(
     text = f"{thing.id}  {state if thing.estimate.measured else 'not seen'}"
     at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
     cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
-    cv2.putText(picture, text, at, _FONT, _TEXT, _BOXES[(thing.id - 1) % len(_BOXES)], 1, cv2.LINE_AA)
+    cv2.putText(picture, text, at, _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
 
 
 def _clear_place(
@@ -177,13 +182,15 @@ class FramePictures:
 
     Args:
         path: folder or video.
+        with_map: beside each frame the map that grows, as wide as the frame is high.
 
     Raises:
         SlamError: the video cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, with_map: bool = False) -> None:
         self.path = path
+        self._map = GrowingMap() if with_map else None
         self._film = path.suffix.lower() == _FILM
         self._first: tuple[float, np.ndarray] | None = None
         self._video: Any = None
@@ -198,7 +205,12 @@ class FramePictures:
 
     def show(self, frame: StereoFrame, result: FrameResult, system: Any) -> None:
         """Append a step's picture; a `slam.run.runner.Watch`."""
-        self.add(frame.index, frame.stamp, with_legend(draw_objects(frame.left, result, system.rig)))
+        picture = draw_objects(frame.left, result, system.rig)
+        if self._map is not None:
+            estimate = system.estimate()
+            self._map.add(estimate)
+            picture = np.hstack([picture, self._map.draw(estimate, result, len(picture))])
+        self.add(frame.index, frame.stamp, with_legend(picture, result.objects))
 
     def add(self, number: int, stamp: float, picture: np.ndarray) -> None:
         """Append one picture, `number` in its sequence, taken at `stamp` [s]."""

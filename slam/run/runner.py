@@ -352,7 +352,7 @@ def _finish(
                 files.write_truth(truth)
         with last.each():
             files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-        if isinstance(system, StereoSlam):
+        if isinstance(system, StereoSlam) and system.landmarks is not None:
             with last.each():
                 files.write_old_landmarks(system.atlas, system.landmarks.ids)
         with last.each():

@@ -10,6 +10,8 @@ from slam.run.schema import STAGE_NAMES, STAGES
 _BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a"}
 _OTHERS = ("#00838f", "#2e7d32", "#c62828", "#5d4037", "#9e9d24")
 
+_BODIES = ((230, 90, 40), (40, 140, 255), (160, 60, 200), (60, 180, 60), (60, 60, 230))  # BGR
+
 #: Of lines around bands: where bands of two back ends are equal, both are seen.
 DASHES = ("-", "--", ":", "-.")
 
@@ -28,6 +30,11 @@ def backend_colours(backends: Sequence[str]) -> list[str]:
     left = cycle([*_OTHERS, *(colour for name, colour in _BACKENDS.items() if name not in backends)])
     own = dict(_BACKENDS)
     return [own.pop(name) if name in own else next(left) for name in backends]
+
+
+def body_colour(number: int) -> tuple[int, int, int]:
+    """The colour (BGR) of a moving body in images, by its number."""
+    return _BODIES[(number - 1) % len(_BODIES)]
 
 
 def stages(known: Iterable[str]) -> list[str]:

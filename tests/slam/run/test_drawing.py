@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from slam.config import SystemConfig
 from slam.errors import SlamError
 from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.drawing import FramePictures, _clear_place, draw_objects, with_legend
+from slam.run.style import body_colour
 from tests.fuzz.runs import disk_of
 
 
@@ -48,6 +50,19 @@ def test_pictures_and_video(steps, tmp_path, name):
     video = cv2.VideoCapture(str(tmp_path / name))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 2
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(1 / (frames[1][0].stamp - frames[0][0].stamp), rel=0.01)
+
+
+def test_the_growing_map_stands_beside_the_frame(steps, tmp_path):
+    system, ((frame, result), _) = steps
+    with FramePictures(tmp_path / "out", with_map=True) as pictures:
+        pictures.show(frame, result, system)
+    picture = cv2.imread(str(next((tmp_path / "out").iterdir())))
+    height = picture.shape[0] - 24
+    alone = draw_objects(frame.left, result, system.rig)
+    assert picture.shape[1] == alone.shape[1] + height
+    beside = picture[:height, alone.shape[1] :]
+    assert (beside == 255).all(axis=2).mean() > 0.5  # paper
+    assert np.ptp(beside, axis=2).max() > 60  # landmarks and the path, in colour
 
 
 def test_a_video_of_one_frame_is_written(steps, tmp_path):
@@ -110,6 +125,13 @@ def test_a_body_that_is_not_seen_is_drawn_otherwise(steps):
     )
     assert (seen != empty).any() and (unseen != empty).any()
     assert 0 < (unseen != empty).sum() < 0.7 * (seen != empty).sum()
+
+
+def test_bodies_are_in_the_legend_in_their_colours():
+    body = SimpleNamespace(id=2, estimate=SimpleNamespace(measured=True))
+    bar = with_legend(np.zeros((9, 960, 3), np.uint8), [body])[9:]
+    assert (bar == body_colour(2)).all(axis=2).any()
+    assert not (with_legend(np.zeros((9, 960, 3), np.uint8))[9:] == body_colour(2)).all(axis=2).any()
 
 
 def test_the_legend_stands_below_the_picture(steps):
