@@ -16,7 +16,7 @@ from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.outputs import RunFiles
 from slam.run.repeat import Origin
 from slam.run.runner import RunOptions, run
-from slam.run.schema import FILES, TABLES, TWIST, header, markdown
+from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, TWIST, header, markdown
 from slam.sequences import open_sequence
 
 PAGE = Path(__file__).parents[3] / "docs" / "files.md"
@@ -71,8 +71,8 @@ def test_the_schema_has_every_file_and_every_column(done):
     for name in TABLES:
         columns = schema["files"][name]["columns"]
         rows = rows_of(out / name)
-        assert rows, name
-        assert [column["name"] for column in columns] == list(rows[0])
+        if name != OLD_LANDMARKS or rows:  # so short a run may keep all its landmarks
+            assert [column["name"] for column in columns] == list(rows[0])
         assert all(column["meaning"] for column in columns)
 
 
