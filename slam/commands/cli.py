@@ -44,7 +44,6 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import catch_signals, leaving, whole_frames
-from slam.errors import SlamError
 from slam.runtime.memory import require_address_space
 
 if TYPE_CHECKING:
@@ -134,7 +133,7 @@ def run_command(
     if sequence is None and mask is not None:
         raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
     if draw_map and draw is None:
-        raise SlamError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
+        raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
     wanted = Wanted(
         sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
     )

@@ -59,6 +59,15 @@ class Broken:
         raise SequenceError("disk gone")
 
 
+def test_landmarks_that_have_left_the_map_are_kept_where_they_were(tmp_path):
+    few = SystemConfig.for_kind("handheld").with_settings(["map.max_landmarks=80", "atlas.keyframe_distance=0.05"])
+    run(open_sequence("synthetic:aisle?frames=30&speed=6"), RunOptions("ekf", "surf", few, tmp_path))
+    data = RunData.read(tmp_path, "a")
+    assert len(data.old) > 10
+    away = np.linalg.norm(data.old - data.online.positions.mean(axis=0), axis=1)
+    assert 0.5 < np.median(away) < 6.0  # on the shelves
+
+
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])
 def test_a_run_leaves_its_files(tmp_path, backend):
     seen = []
