@@ -91,7 +91,7 @@ def shortened(words):
         out.append(SHORTER.get(option) or word)
     for option in [option for option, value in SHORTER.items() if value is None and option in out]:
         del out[out.index(option) : out.index(option) + 2]
-    added = {"demo": ["--frames", "10"], "compare": ["--workers", "1"], "view": ["--to", "shown.rrd"]}
+    added = {"demo": ["--frames", "10"], "compare": ["--workers", "1", "--trials", "1"], "view": ["--to", "shown.rrd"]}
     return out + (added.get(out[1], []) if out[0] == "slam" else [])
 
 

@@ -42,7 +42,7 @@ def _left() -> dict[str, bytes]:
                     "--no-picture",
                     "--quiet",
                 ],
-                ["compare", SEQUENCE, "--out", "compared", "--workers", "1", "--quiet"],
+                ["compare", SEQUENCE, "--out", "compared", "--workers", "1", "--trials", "1", "--quiet"],
             ):
                 assert call(words)[0] == 0
         return {str(p.relative_to(folder)): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
@@ -91,7 +91,9 @@ def _words(rng: np.random.Generator) -> tuple[list[str], Any]:
     if kind == 3:
         more = choose(rng, ([], [], ["--trials", "2"], ["--no-replay"], ["--backends", "ekf"], ["--frames", "0:2"],
                             ["--set", "map.grid=[4, 3]"], ["--variant", choose(rng, NUMBERS)]))  # fmt: skip
-        return ["compare", SEQUENCE, "--out", "compared", "--workers", "1", "--quiet", *more], _below("compared")
+        return ["compare", SEQUENCE, "--out", "compared", "--workers", "1", "--trials", "1", "--quiet", *more], _below(
+            "compared"
+        )
     if kind == 4:
         given = choose(rng, ("run", "run/summary.json", "a.map", "compared", *RELATIVE))
         return ["run", SEQUENCE, "--calibration", given, "--out", "again", "--quiet", "--no-picture"], _below("run")
