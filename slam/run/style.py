@@ -7,8 +7,8 @@ from itertools import cycle
 
 from slam.run.schema import STAGE_NAMES, STAGES
 
-_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "batch": "#6a1b9a"}
-_OTHERS = ("#00838f", "#2e7d32", "#c62828", "#5d4037", "#9e9d24")
+_BACKENDS = {"ekf": "#1565c0", "smoother": "#ef6c00", "window": "#2e7d32", "batch": "#6a1b9a"}
+_OTHERS = ("#00838f", "#c62828", "#5d4037", "#9e9d24")
 
 #: Of lines around bands: where bands of two back ends are equal, both are seen.
 DASHES = ("-", "--", ":", "-.")

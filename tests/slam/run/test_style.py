@@ -10,9 +10,9 @@ from slam.run.style import backend_colours, stage_colour, stage_name, stages
 
 
 def test_a_back_end_has_one_colour_in_whatever_company():
-    names = ["ekf", "smoother", "batch"]
+    names = ["ekf", "smoother", "window", "batch"]
     own = {name: backend_colours([name])[0] for name in names}
-    assert len(set(own.values())) == 3
+    assert len(set(own.values())) == 4
     for order in itertools.permutations(["mine", *names]):
         shown = dict(zip(order, backend_colours(order)))
         assert {name: shown[name] for name in names} == own
