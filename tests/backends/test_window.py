@@ -73,6 +73,20 @@ def test_errors_are_as_large_as_the_covariances_say_all_along_a_path():
     assert np.mean((mean > low) & (mean < high)) > 0.8
 
 
+def test_a_landmark_that_is_seen_alone_is_used():
+    """It holds the pose by itself in some directions: there its residual is 0, and so is the variance of that."""
+    motion, reports = MotionModel(1.0, 1.0), []
+    poses = path(40, 0.1, np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.1, 0.0]))
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        backend = backends.create("window", RIG, models=EstimatorModels(motion, pixel_sigma=1.0))
+        points, known = cloud(poses[:1], 12, rng, 1.5, 4.0), set()
+        for k, T in enumerate(poses):
+            seen = observe(T, points, 1.0, rng)
+            reports.append(step(backend, 0.1 * k, seen.select(np.arange(len(seen)) < (12 if k < 5 else 1)), known))
+    assert all(report.status.value != "failed" and not len(report.rejected) for report in reports)
+
+
 def walk(backend, first, last, rng, known):
     """A corridor without end: landmarks come and go."""
     corridor = Corridor(density=4, speed=2.0)
