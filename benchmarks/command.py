@@ -24,10 +24,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.frame import BACKENDS, KITTI
+from benchmarks.frame import KITTI
 from experiments.common import script_options
 from experiments.tables import markdown, write_json
 from slam.errors import SlamError
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -110,7 +111,7 @@ def memory(name: str, frames: int) -> list[object]:
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "10 and 20 frames for the memory")
-    parser.add_argument("--backend", nargs="+", choices=BACKENDS, default=BACKENDS, help="these alone")
+    parser.add_argument("--backend", nargs="+", choices=ONLINE, default=ONLINE, help="these alone")
     parser.add_argument("--only", nargs="+", choices=("first", "memory"), default=("first", "memory"))
     given = parser.parse_args()
     if "first" in given.only:

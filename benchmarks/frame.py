@@ -38,11 +38,11 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import absolute_errors, associate
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
+from slam.registry import ONLINE
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
 KITTI = "kitti_odometry/sequences/06"
-BACKENDS = ("ekf", "smoother")
 HEADER = ("images", "what", "wall [ms]", "CPU [ms]", "wall / SIFT", "CPU / SIFT", "wall / ORB-SLAM3", "CPU / ORB-SLAM3",
           "frames lost", "ATE [mm]")  # fmt: skip
 SIFT, ORB, ORBSLAM3 = "cv2.SIFT, 800 features, left", "cv2.ORB and PnP", "ORB-SLAM3"
@@ -99,16 +99,16 @@ def measure(size: Size, orbslam3: str | None) -> dict[str, Times]:
     """Everybody's times on one recording."""
     sequence = open_sequence(size.sequence)
     frames = list(sequence.frames(0, size.skipped + size.counted))
-    systems = {name: StereoSlam(sequence.rig, backend=name, kind=sequence.kind) for name in BACKENDS}
+    systems = {name: StereoSlam(sequence.rig, backend=name, kind=sequence.kind) for name in ONLINE}
     sift, odometry = cv2.SIFT_create(800), OrbOdometry(sequence.rig, size.features)
-    times = {name: Times.none() for name in (*BACKENDS, SIFT, ORB)}
+    times = {name: Times.none() for name in (*ONLINE, SIFT, ORB)}
 
     for frame in frames:
         for name, system in systems.items():
             times[name].take(lambda s=system, f=frame: tracked(s.process(f)))
         times[SIFT].take(lambda f=frame: sift.detectAndCompute(f.left, None) and None)
         times[ORB].take(lambda f=frame: odometry.process(f.left, f.right).copy())
-    for name in BACKENDS:
+    for name in ONLINE:
         times[OVERLAP.format(name)] = overlapped(sequence, name, frames)
     if orbslam3 is not None:
         times[ORBSLAM3] = with_orbslam3(orbslam3, sequence, frames, size.features)

@@ -24,10 +24,10 @@ from experiments.common import script_options, timed
 from experiments.long_run import Corridor, run
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 HEADER = ("by", "what", "size", "CPU [ms]", "floor [ms]", "ratio")
 LANDMARKS, MEASURED, FEATURES, OBJECTS, FRAMES = (
     "landmarks in the map, 30 measured", "landmarks measured, of 240", "features, 320x240", "moving cars", "frame",
@@ -63,9 +63,10 @@ def by_size(by: str, name: str, landmarks: int, count: int, frames: int) -> Poin
     predict, update, gtsam = np.array(list(standing(name, landmarks, count, frames))).T
     with threadpool_limits(1, user_api="blas"):
         bare = bare_dsyrk(landmarks, count)
-        floor = np.median([seconds(bare) for _ in range(frames)]) if name == "ekf" else np.median(gtsam)
+        floors = {"ekf": [seconds(bare) for _ in range(frames)], "smoother": gtsam}
     size = landmarks if by == LANDMARKS else count
-    return Point(by, name, size, 1e3 * float(np.median(predict + update)), 1e3 * float(floor))
+    floor = 1e3 * float(np.median(floors[name])) if name in floors else None
+    return Point(by, name, size, 1e3 * float(np.median(predict + update)), floor)
 
 
 def by_features(name: str, count: int, frames: int) -> Point:
@@ -104,7 +105,7 @@ def points(quick: bool) -> list[Point]:
     features, cars = ((100, 400), (0, 2)) if quick else ((100, 200, 400, 800, 1600), (0, 1, 2, 3))
     repeats, images, length = (10, 6, 60) if quick else (20, 24, 300)
     found = []
-    for name in BACKENDS:
+    for name in ONLINE:
         found += [by_size(LANDMARKS, name, n, 30, repeats) for n in maps]
         found += [by_size(MEASURED, name, 240, m, repeats) for m in counts]
         found += [by_features(name, n, images) for n in features]
@@ -123,7 +124,7 @@ def draw(path: Path, found: list[Point]) -> None:
     kinds = list(dict.fromkeys(p.by for p in found))
     figure, axes = plt.subplots(1, len(kinds), figsize=(3.4 * len(kinds), 3.2))
     for kind, panel in zip(kinds, axes):
-        for name, colour in zip(BACKENDS, ("C0", "C1")):
+        for name, colour in zip(ONLINE, ("C0", "C1", "C2"), strict=True):
             mine = sorted((p for p in found if p.by == kind and p.what == name), key=lambda p: p.size)
             sizes = [p.size for p in mine]
             panel.plot(sizes, [p.milliseconds for p in mine], "o-", color=colour, label=name, markersize=3)

@@ -27,13 +27,13 @@ from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.evaluation.association_truth import AssociationScore, SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
+from slam.registry import ONLINE
 from slam.run.figures import draw_map_3d, draw_top_view
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.sequences import Sequence, open_sequence
 
-BACKENDS = ("ekf", "smoother")
 HEADER = (
     "back end", "tracked", "mean error [cm]", "peak [cm]", "end [cm]", "final mean [cm]", "final peak [cm]",
     "landmarks", "doubled", "right associations [%]", "NIS/dof",
@@ -152,12 +152,12 @@ def main() -> int:
     sequence = open_sequence(world)
     config = SystemConfig.for_kind(sequence.kind).with_settings(arguments.set)
     frontend = Remembered(create("surf", sequence.rig, **config.frontend))
-    rows = [row(sequence, backend, frontend, config, arguments.out) for backend in BACKENDS]
-    runs = [RunData.read(arguments.out / backend, backend) for backend in BACKENDS]
+    rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
+    runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
     draw_map_3d(runs, arguments.out / "map_3d.png")
     draw_top_view(runs, sequence.ground_truth, arguments.out / "top_view.png")
     plot(runs, arguments.out / "errors.png", "errors")
-    draw_map_over_time([arguments.out / backend for backend in BACKENDS], arguments.out / "map.png")
+    draw_map_over_time([arguments.out / backend for backend in ONLINE], arguments.out / "map.png")
     print(markdown(HEADER, rows, 2))
     write_json(arguments.out / "table.json", HEADER, rows)
     return 0

@@ -23,6 +23,7 @@ from experiments.loops import ate
 from experiments.tables import markdown, write_json
 from slam.calibration.posterior import RigPosterior
 from slam.config import SystemConfig
+from slam.registry import ONLINE
 from slam.run.calibrating import Targets, calibrate
 from slam.sequences import open_sequence
 from slam.showing import count
@@ -31,7 +32,6 @@ from slam.system import StereoSlam
 #: Worlds as features, so that a drive takes half a minute.
 WORLDS = {"street": "density=40", "town": "density=40&speed=2&frames=300", "aisle": "frames=400", "desk": ""}
 DRIVES = {f"raw {n}": f"kitti_raw/2011_09_26/2011_09_26_drive_{n}_sync" for n in ("0001", "0013")}
-BACKENDS = ("ekf", "smoother")
 FOCAL, TURN = 0.005, 0.5  # relative error of the focal length; turn of the right camera [mrad]
 
 #: What is wrong: the parameters, the correction that takes it away, the factor to the unit shown, and that unit.
@@ -111,7 +111,7 @@ def main() -> int:
     seeds = 1 if arguments.quick else arguments.seeds
     header = ("world", "back end", "ATE, right [m]", "ATE, wrong [m]", "ratio", "ATE, not calibrated [m]", *WRONG,
               "largest error [sigma]")  # fmt: skip
-    rows = [world_row(world, options, b, seeds) for world, options in worlds.items() for b in BACKENDS]
+    rows = [world_row(world, options, b, seeds) for world, options in worlds.items() for b in ONLINE]
     true = ", ".join(f"{name}: {true:g}" for name, (_, true, _) in WRONG.items())
     print(f"Worlds with a wrong calibration, medians of {count(seeds, 'seed')} (true corrections: {true}):\n")
     print(markdown(header, rows, 2))

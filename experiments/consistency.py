@@ -29,10 +29,11 @@ from scipy.stats import chi2
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
-from experiments.consistency_trials import BACKENDS, CASES, Trial, trials
+from experiments.consistency_trials import CASES, Trial, trials
 from experiments.tables import markdown
 from slam.evaluation.metrics import chi_square_band
 from slam.geometry.se3 import Array
+from slam.registry import ONLINE
 
 
 def rms(errors: Array) -> float:
@@ -74,7 +75,7 @@ def nis_band(case: str, dof: int, updates: int, gate: float = 0.999) -> tuple[fl
 
 
 def accuracy_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
-    for name in BACKENDS:
+    for name in ONLINE:
         cells = [case, name]
         for part, scale in ((slice(3, 6), 1e3), (slice(0, 3), np.rad2deg(1))):
             online, online_bound, final, final_bound = against_the_bound(done, name, part)
@@ -87,7 +88,7 @@ def consistency_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
     """Each mean beside its band; the mean over a run has the band of one frame, as its frames are correlated."""
     n = len(done)
     low, high = chi_square_band(6, n)
-    for name in BACKENDS:
+    for name in ONLINE:
         runs = [t.runs[name] for t in done]
         mean = np.mean([r.nees for r in runs], axis=0)
         inside = 100 * np.mean((mean > low) & (mean < high))
@@ -108,7 +109,7 @@ def consistency_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
 
 def wrong_match_rows(case: str, done: Sequence[Trial]) -> Iterator[list[str]]:
     done = [t for t in done if t.spoilt]
-    for name in BACKENDS if done else ():
+    for name in ONLINE if done else ():
         clean, spoilt = (
             [rms(np.array([getattr(r[name], path)[:, 3:] for r in runs])) for path in ("online", "final")]
             for runs in ([t.runs for t in done], [t.spoilt for t in done])
@@ -155,7 +156,7 @@ def write_csv(path: Path, results: dict[str, list[Trial]]) -> None:
         writer = csv.writer(file)
         writer.writerow(["world", "back_end", "frame", "rmse_m", "rmse_rad", "nees", "nis", "dof", "pixel_nis"])
         for case, done in results.items():
-            for name in BACKENDS:
+            for name in ONLINE:
                 runs = [t.runs[name] for t in done]
                 for k in range(len(runs[0].nees)):
                     errors = np.array([r.online[k] for r in runs])
@@ -172,7 +173,7 @@ def draw(path: Path, results: dict[str, list[Trial]]) -> None:
 
     figure, axes = plt.subplots(2, len(results), figsize=(4.2 * len(results), 6), sharex="col", squeeze=False)
     for (case, done), (top, bottom) in zip(results.items(), axes.T):
-        for name in BACKENDS:
+        for name in ONLINE:
             errors = np.array([t.runs[name].online[:, 3:] for t in done])
             top.plot(1e3 * np.sqrt((errors**2).sum(axis=2).mean(axis=0)), label=name)
             bottom.plot(np.mean([t.runs[name].nees for t in done], axis=0), label=name)

@@ -20,13 +20,13 @@ from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
+from slam.registry import ONLINE
 from slam.run.recorded import Recording
 from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.worlds import open_world
 from slam.worlds.sequence import WorldSequence
 
 CASES = ("desk", "aisle", "drawn")
-BACKENDS = ("ekf", "smoother")
 DRAWN = MotionModel(acceleration=0.15, angular_acceleration=0.15)
 WRONG = 0.1  # share of wrong matches
 _BOUNDS = 4  # frames at which the online bound is computed
@@ -143,9 +143,9 @@ def trial(case: str, seed: int, frames: int, wrong: bool) -> Trial:
     """All of one seed."""
     recording, sequence = simulated(case, seed, frames)
     points = sequence.landmarks.positions
-    runs = {name: run(recording, points, name, seed) for name in BACKENDS}
+    runs = {name: run(recording, points, name, seed) for name in ONLINE}
     spoilt = with_mismatches(recording, WRONG, seed) if wrong else None
-    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name, seed) for name in BACKENDS}
+    runs_spoilt = {} if spoilt is None else {name: run(spoilt, points, name, seed) for name in ONLINE}
     seen = [_all_seen(f.observed, f.added) for f in recording]
     truth = sequence.ground_truth
 

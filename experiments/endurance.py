@@ -1,6 +1,6 @@
 """The whole system for hours: memory, open files and time, and a camera that stops giving frames and comes back.
 
-    python experiments/endurance.py [--quick] [--backend ekf smoother] [--frames 20000] [--images 20000] [--out DIR]
+    python experiments/endurance.py [--quick] [--backend NAME ...] [--frames 20000] [--images 20000] [--out DIR]
                                     [--page docs/robustness.md]
 
 Two runs of each back end:
@@ -34,6 +34,7 @@ from experiments.long_run import DT, MODELS, RIG, Loop, measured, memory
 from experiments.tables import markdown
 from slam.config import SystemConfig
 from slam.data import FrameResult, FrameStatus, StereoFeatures, StereoFrame
+from slam.registry import ONLINE
 from slam.system import StereoSlam
 
 _HOUR = 3600.0
@@ -171,7 +172,7 @@ def write_csv(path: Path, parts: list[Part]) -> None:
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "two hundred frames of each")
-    parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"])
+    parser.add_argument("--backend", nargs="*", default=list(ONLINE))
     parser.add_argument("--frames", type=int, default=20_000, help="of observations; 0 for none")
     parser.add_argument("--images", type=int, default=20_000, help="frames of images; 0 for none")
     parser.add_argument("--page", type=Path, help="a page for the table")

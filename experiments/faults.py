@@ -27,10 +27,10 @@ from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
 from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.se3 import inverse
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 HEADER = (
     "fault", "back end", "states", "error before [cm]", "mean after [cm]", "peak after [cm]", "end [cm]",
     "frames until relocalised", "right associations [%]", "added while lost",
@@ -132,7 +132,7 @@ def draw(errors: dict[tuple[Fault, str], list[float]], path: Path) -> None:
     axes = figure.subplots(2, -(-len(names) // 2), sharey=True)
     for axis, fault in zip(axes.ravel(), names):
         axis.axvspan(fault.last_good, fault.over, color="0.85")
-        for backend in BACKENDS:
+        for backend in ONLINE:
             axis.semilogy(np.maximum(errors[fault, backend], 1e-2), lw=1, label=backend)
         axis.set_title(fault.name, fontsize=9)
         axis.set_xlabel("frame")
@@ -150,7 +150,7 @@ def main() -> int:
     rows, errors = [], {}
     for fault in faults(arguments.quick):
         features = extract(fault, 48 if arguments.quick else 300)
-        for backend in BACKENDS:
+        for backend in ONLINE:
             row, errors[fault, backend] = run(fault, backend, features)
             rows.append(row)
             print(row, file=sys.stderr, flush=True)

@@ -20,10 +20,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments.common import features_of, online_error, recordings, script_options
 from experiments.tables import markdown, write_json
 from slam.data import StereoFeatures
+from slam.registry import ONLINE
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 STEPS = (1, 2, 3, 5, 10, 15)
 WORLDS = ("aisle", "desk", "street")
 DRIVES = {"KITTI odometry 06": "kitti_odometry/sequences/06"}
@@ -54,7 +54,7 @@ def rows(name: str, same: list[Sequence], steps: tuple[int, ...]) -> Iterator[li
     """A row for each back end and rate."""
     features = [features_of(sequence) for sequence in same]
     rate = 1 / float(np.median(np.diff([seen.stamp for seen in features[0]])))
-    for backend in BACKENDS:
+    for backend in ONLINE:
         for step in steps:
             found = [run(sequence, backend, seen[::step]) for sequence, seen in zip(same, features)]
             tracked, error = np.median(found, axis=0)

@@ -22,10 +22,10 @@ from experiments.common import features_of, online_error, recordings, script_opt
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
+from slam.registry import ONLINE
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 COUNTS = (10, 20, 30, 50, None)  # None for all
 WORLDS = {"aisle": 90, "desk": 90, "street": 40}
 DRIVES = {
@@ -55,7 +55,7 @@ def run(sequence: Sequence, backend: str, features: list[StereoFeatures], settin
 def rows(name: str, same: list[Sequence], counts: tuple[int | None, ...]) -> Iterator[list[object]]:
     """A row for each back end and number of measurements."""
     features = [features_of(sequence) for sequence in same]
-    for backend in BACKENDS:
+    for backend in ONLINE:
         for count in counts:
 
             def found(setting: str, count: int | None = count, backend: str = backend) -> np.ndarray:
@@ -74,8 +74,8 @@ def draw(path: Path, table: list[list[object]]) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, len(BACKENDS), figsize=(9, 6), sharex=True, squeeze=False)
-    for backend, panels in zip(BACKENDS, axes.T):
+    figure, axes = plt.subplots(2, len(ONLINE), figsize=(9, 6), sharex=True, squeeze=False)
+    for backend, panels in zip(ONLINE, axes.T):
         for name in dict.fromkeys(row[0] for row in table):
             mine = [row for row in table if row[:2] == [name, backend]]
             errors, times = (np.array([float(str(row[k])) for row in mine]) for k in (3, 4))

@@ -1,6 +1,6 @@
 """A run of thousands of frames: what must not decay or grow.
 
-    python experiments/long_run.py [--quick] [--backend ekf smoother] [--world loop corridor] [--frames 20000]
+    python experiments/long_run.py [--quick] [--backend NAME ...] [--world loop corridor] [--frames 20000]
                                    [--set lag=200] [--out DIR]
 
 Two worlds without images, with true association and a map that stays bounded:
@@ -41,6 +41,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend
 from slam.models import EstimatorModels, MotionModel
+from slam.registry import ONLINE
 
 RIG = StereoRig.rectified_pair(f=400.0, u0=320.0, v0=240.0, baseline=0.3, width=641, height=481)
 MODELS = EstimatorModels(MotionModel(1.0, 1.0), pixel_sigma=0.5)
@@ -315,7 +316,7 @@ def setting(text: str) -> tuple[str, object]:
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "two hundred frames")
-    parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"], help="any registered ones")
+    parser.add_argument("--backend", nargs="*", default=list(ONLINE), help="any registered ones")
     parser.add_argument("--world", nargs="*", default=list(WORLDS), choices=list(WORLDS))
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -1,6 +1,6 @@
 """What closing loops gives on long drives that come back: the path's error with and without, and how sure it is.
 
-    SLAM_DATA=/path/to/data python experiments/loops.py [--quick] [--paths 00 05 …] [--backend ekf smoother]
+    SLAM_DATA=/path/to/data python experiments/loops.py [--quick] [--paths 00 05 …] [--backend NAME ...]
         [--set KEY=VALUE …] [--option KEY=VALUE …] [--out DIR]
 
 Features of streets along true roads (``kitti_paths`` of the data folder), or of the built-in town where there is no
@@ -30,10 +30,10 @@ from slam.geometry.alignment import align_positions
 from slam.geometry.se3 import inverse, log
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.atlas.atlas import Atlas
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 QUICK = ("map.target_in_view=40", "map.max_landmarks=100", "objects.mode=off")  # settings of quick runs
 ROW_TEXTS = 2
 ACCURACY = (
@@ -247,7 +247,7 @@ def draw(runs: dict[tuple[str, str], Drive], out: Path) -> None:
 def main() -> None:
     parser = script_options(__file__, __doc__)
     parser.add_argument("--paths", nargs="*", default=["06"])
-    parser.add_argument("--backend", nargs="*", default=list(BACKENDS))
+    parser.add_argument("--backend", nargs="*", default=list(ONLINE))
     parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
     parser.add_argument("--only-paths", action="store_true")
     parser.add_argument("--set", nargs="*", default=[])

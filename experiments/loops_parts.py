@@ -28,6 +28,7 @@ from slam.geometry.se3 import exp, inverse
 from slam.mapping.atlas.chain import Chain
 from slam.mapping.atlas.keyframes import Loop
 from slam.mapping.atlas.pose_graph import PoseGraph, solve
+from slam.registry import ONLINE
 from slam.runtime.blas import one_blas_thread
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
@@ -139,7 +140,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=5000)
     parser.add_argument("--folder", type=Path, default=Path("results/town"))
     parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--backend", nargs="*", default=["ekf", "smoother"])
+    parser.add_argument("--backend", nargs="*", default=list(ONLINE))
     given = parser.parse_args()
     parts = {
         "alike": lambda: alike(given.seeds),

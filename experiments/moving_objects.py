@@ -49,7 +49,7 @@ from slam.object_data import MovingObject
 from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
-BACKENDS = ("ekf", "smoother")
+BACKENDS = ("ekf", "smoother")  # those that estimate bodies
 PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti", "cyclists")
 TITLES = {
     "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",

@@ -31,6 +31,7 @@ from slam.data import FrameStatus, StereoFeatures, StereoFrame
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
+from slam.registry import ONLINE
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
@@ -41,8 +42,7 @@ DRIVES = {
     "raw 0013": f"{_DAY}0013_sync",
 }
 SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
-BACKENDS = ("ekf", "smoother")
-FIGURES = ("ATE ekf [m]", "ATE smoother [m]", "frames", "lost ekf", "lost smoother")
+FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "frames", *(f"lost {name}" for name in ONLINE))
 
 _FIRST = 5  # frames that may be left out at the beginning
 _FEATURES = 0.2  # by how much the number of features may differ
@@ -217,14 +217,14 @@ def run(sequence: Drive | Sequence, features: list[StereoFeatures], backend: str
 
 def figures(fault: Fault, sequence: Drive | Sequence, last: int, trials: int) -> list[object]:
     """The figures of a row, in the order of `FIGURES`."""
-    outcomes: dict[str, list[Outcome]] = {backend: [] for backend in BACKENDS}
+    outcomes: dict[str, list[Outcome]] = {backend: [] for backend in ONLINE}
     for trial in range(trials):
         features = extracted(sequence, fault, last, trial)
-        for backend in BACKENDS:
+        for backend in ONLINE:
             outcomes[backend].append(run(sequence, features, backend))
-    ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in BACKENDS]
-    lost = [sum(o.lost for o in outcomes[backend]) for backend in BACKENDS]
-    return [*ates, sum(o.frames for o in outcomes[BACKENDS[0]]), *lost]
+    ates = [quartiles([o.ate for o in outcomes[backend]]) for backend in ONLINE]
+    lost = [sum(o.lost for o in outcomes[backend]) for backend in ONLINE]
+    return [*ates, sum(o.frames for o in outcomes[ONLINE[0]]), *lost]
 
 
 def quartiles(values: list[float]) -> str:

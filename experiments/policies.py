@@ -36,10 +36,10 @@ from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.evaluation.association_truth import surface_points
 from slam.geometry.se3 import Array, inverse, transform
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 
-BACKENDS = ("ekf", "smoother")
 BARE = 950, 1120  # frames of the whole walk that show the bare wall
 HEADER = (
     "policy", "back end", "mean error [cm]", "peak [cm]", "worst peak [cm]", "right associations [%]",
@@ -139,7 +139,7 @@ def one_seed(seed: int, world: str, frames: range, folder: Path) -> Path:
         for adaptive in (True, False):
             seen = extract(name, adaptive, frames)
             for policy in (p for p in POLICIES if p.adaptive is adaptive):
-                for backend in BACKENDS:
+                for backend in ONLINE:
                     figures.append({"policy": policy.name, "backend": backend, **run(name, policy, backend, seen)})
                     print(f"seed {seed}: {figures[-1]}", file=sys.stderr, flush=True)
     part = path.with_suffix(".part")
@@ -163,7 +163,7 @@ def draw(found: dict[tuple[str, str], list[dict[str, float]]], path: Path) -> No
 
     figure = Figure((9, 0.9 + 0.42 * len(POLICIES)), layout="constrained")
     axis = figure.subplots()
-    for shift, backend in zip((-0.13, 0.13), BACKENDS):
+    for shift, backend in zip((-0.2, 0.0, 0.2), ONLINE, strict=True):
         values = [[one["mean"] for one in found[policy.name, backend]] for policy in POLICIES]
         places = np.arange(len(POLICIES)) + shift
         points = axis.plot(np.concatenate(values), np.repeat(places, [len(v) for v in values]), ".", alpha=0.45)
@@ -194,7 +194,7 @@ def main() -> int:
     for file in files:
         for one in json.loads(file.read_text())["figures"]:
             found.setdefault((one["policy"], one["backend"]), []).append(one)
-    rows = [row(policy, backend, found[policy.name, backend]) for policy in POLICIES for backend in BACKENDS]
+    rows = [row(policy, backend, found[policy.name, backend]) for policy in POLICIES for backend in ONLINE]
     print(f"{arguments.world}, frames {frames.start} to {frames.stop - 1}, {len(seeds)} seeds\n")
     print(markdown(HEADER, rows, 2))
     write_json(arguments.out / "table.json", HEADER, rows)

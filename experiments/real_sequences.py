@@ -24,6 +24,7 @@ from slam.compare.collect import Lifetimes
 from slam.config import SystemConfig
 from slam.evaluation.metrics import align, associate
 from slam.geometry.trajectory import Trajectory
+from slam.registry import ONLINE
 from slam.run.figures import widths
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
@@ -34,7 +35,6 @@ SEQUENCES = {
     "KITTI raw 0013": "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync",
     "EuRoC V1_01, 20 keyframes": "euroc/V1_01_keyframes_a",
 }
-BACKENDS = ("ekf", "smoother")
 HEADER = ("sequence", "back end", "tracked", "ATE online [m]", "ATE final [m]", "NEES over 1 m", "NEES over 10 m",
           "landmark lifetime, median [frames]", "ms per frame")  # fmt: skip
 
@@ -74,8 +74,8 @@ def draw(names: dict[str, Path], out: Path) -> None:
     for axis in axes[len(names) :]:
         axis.set_axis_off()
     for axis, (name, folder) in zip(axes, names.items()):
-        paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in BACKENDS]
-        for backend, path, width in zip(BACKENDS, paths, widths(len(BACKENDS), 1.5)):
+        paths = [Trajectory.read_tum(folder_of(name, backend, out) / "trajectory.txt") for backend in ONLINE]
+        for backend, path, width in zip(ONLINE, paths, widths(len(ONLINE), 1.5)):
             axis.plot(*path.positions[:, [0, 2]].T, lw=width, label=backend)
         truth = true_path(folder, paths[0])
         if truth is not None:
@@ -106,7 +106,7 @@ def main() -> int:
     if len(found) < len(SEQUENCES):
         print(f"left out, not there: {', '.join(sorted(set(SEQUENCES) - set(found)))}", file=sys.stderr)
     frames = 10 if arguments.quick else None
-    rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in BACKENDS]
+    rows = [row(n, run_one(n, folder, b, arguments.out, frames)) for n, folder in found.items() for b in ONLINE]
     print(markdown(HEADER, rows, 2))
     write_json(arguments.out / "table.json", HEADER, rows)
     draw(found, arguments.out)

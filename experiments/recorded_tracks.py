@@ -40,10 +40,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
+from slam.registry import ONLINE
 
 FILE = "kitti_raw_tracks/2011_09_30_drive_0020"
 SIZE = (1226, 370)  # of the rectified images [px]
-BACKENDS = ("ekf", "smoother")
 _WARM_UP = 15  # frames of a replay before the timed one: compiled loops are loaded
 HEADER = (
     "right pixels moved [px]", "wrong", "back end", "seeds", "ATE online [m]", "segment error online [%]",
@@ -230,7 +230,7 @@ def draw(found: dict[str, Run], path: Path) -> None:
 
 def main() -> int:
     parser = script_options(__file__, __doc__, "forty frames")
-    parser.add_argument("--backend", nargs="*", default=BACKENDS, metavar="NAME", help="back ends")
+    parser.add_argument("--backend", nargs="*", default=ONLINE, metavar="NAME", help="back ends")
     parser.add_argument("--frames", type=span, default=(0, 1000), metavar="A:B", help="from A to before B")
     parser.add_argument("--wrong", type=float, nargs="*", default=[0.0], metavar="FRACTION", help="of wrong matches")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the wrong matches")

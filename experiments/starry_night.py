@@ -34,10 +34,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels, MotionModel
+from slam.registry import ONLINE
 
 FILE = "starry_night/steps_0_950.npz"
 PARTS = [(0, 300), (130, 950), (300, 950), (500, 950)]
-BACKENDS = ("ekf", "smoother")
 HEADER = (
     "steps", "back end", "updates ok / empty / failed", "rejected", "RMSE online [m]", "[deg]", "RMSE final [m]",
     "ATE aligned [m]", "landmarks [m]", "median NEES", "within 3 sigma [%]",
@@ -142,7 +142,7 @@ class Part:
 
 def run_parts(data: Data, parts: list[tuple[int, int]], sigma: float) -> Iterator[Part]:
     for start, stop in parts:
-        for name in BACKENDS:
+        for name in ONLINE:
             models = EstimatorModels(
                 MotionModel(1.0, 1.0), pixel_sigma=sigma, T_world_left=data.poses[start],
                 initial_position_sigma=0.01, initial_rotation_sigma=0.01,

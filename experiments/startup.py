@@ -30,11 +30,11 @@ from slam.data import Observations, StereoFeatures
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap
 from slam.models import MotionModel
+from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 from slam.worlds.sequence import WorldSequence
 
-BACKENDS = ("ekf", "smoother")
 FACING = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  #: camera axes in the world's: looking along y, upright
 STARTS = {  #: where the state begins [m], and how far it is turned about the vertical [deg]
     "[0, 0, 0]": ((0.0, 0.0, 0.0), 0.0),
@@ -164,7 +164,7 @@ def draw(runs: list[StartUp], path: Path) -> None:
     for axis, (a, b), letters in zip(axes, ((0, 1), (0, 2)), ("xy", "xz")):
         for run in runs:
             p = 100 * run.positions
-            axis.plot(p[:, a], p[:, b], "o-" if run.backend == "ekf" else "x:", ms=4, lw=0.8)
+            axis.plot(p[:, a], p[:, b], {"ekf": "o-", "smoother": "x:"}.get(run.backend, "+--"), ms=4, lw=0.8)
         truth = 100 * runs[0].truth.mean(axis=0)
         axis.plot(truth[a], truth[b], "k^", ms=10, mfc="none", label="true place")
         axis.plot(100 * PAPER[a], 100 * PAPER[b], "rs", mfc="none", label="where paper B's stopped")
@@ -186,9 +186,9 @@ def main() -> int:
     sequence = open_sequence("synthetic:startup")
     assert isinstance(sequence, WorldSequence)
     known, frames = stored_map(sequence), 30 if arguments.quick else 150
-    cases = [(pixels, backend, start) for pixels in ("stereo", "left") for backend in BACKENDS for start in STARTS]
+    cases = [(pixels, backend, start) for pixels in ("stereo", "left") for backend in ONLINE for start in STARTS]
     runs = [start_up(sequence, known, backend, start, frames, pixels) for pixels, backend, start in cases]
-    runs += [by_itself(sequence, known, backend, start, frames) for backend in BACKENDS for start in STARTS]
+    runs += [by_itself(sequence, known, backend, start, frames) for backend in ONLINE for start in STARTS]
     text = markdown(HEADER, [row(run) for run in runs], 3) + "\n"
     print(f"{len(known)} stored features, {frames} frames\n\n{text}")
     arguments.out.mkdir(parents=True, exist_ok=True)

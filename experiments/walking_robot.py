@@ -20,6 +20,7 @@ from experiments.tables import markdown
 from slam.compare.plan import CLOSED_LOOP, Plan
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
+from slam.registry import ONLINE
 from slam.run.figures import draw_map_3d, draw_top_view
 from slam.run.plots import plot
 from slam.run.run_data import RunData
@@ -51,7 +52,7 @@ def main() -> int:
     parser = script_options(__file__, __doc__, "the first twenty frames")
     arguments = parser.parse_args()
     stop = 20 if arguments.quick else None
-    plan = Plan(("synthetic:field",), ("ekf", "smoother"), stop=stop, replay=False)
+    plan = Plan(("synthetic:field",), ONLINE, stop=stop, replay=False)
     shutil.rmtree(arguments.out / "runs", ignore_errors=True)  # those of another form or version
     runs = sweep(plan, arguments.out / "runs", LocalScheduler(available_cores()))
     text = markdown(HEADER, [row(run) for run in runs])

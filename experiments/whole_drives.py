@@ -17,12 +17,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import recordings, script_options
-from experiments.perturbations import BACKENDS, DRIVES, MEASURED, NONE, features_of, frames_of, quartiles
+from experiments.perturbations import DRIVES, MEASURED, NONE, features_of, frames_of, quartiles
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
 from slam.data import Estimate
 from slam.evaluation.summary import evaluate
 from slam.geometry.trajectory import Trajectory
+from slam.registry import ONLINE
 from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
@@ -56,7 +57,7 @@ def main() -> int:
     for name, folder in list(found.items())[: 1 if arguments.quick else None]:
         sequence = open_sequence(folder)
         last = 15 if arguments.quick else len(sequence)
-        for backend in BACKENDS:
+        for backend in ONLINE:
             runs = np.array([run(sequence, backend, trial, last) for trial in range(trials)])
             counts = [int(x) for x in runs[:, 2:].sum(axis=0)]
             rows.append([name, backend, quartiles(runs[:, 0].tolist()), quartiles(runs[:, 1].tolist()), *counts])

@@ -34,6 +34,9 @@ BUILT_IN = {
     "frontends": {"surf": "frontends.surf:SurfFrontend"},
 }
 
+#: Its back ends that estimate frame by frame: what is compared, shown and warmed up where nobody chose.
+ONLINE = ("ekf", "smoother", "window")
+
 #: What `slam.interfaces.Backend` and `slam.interfaces.Frontend` ask for.
 _METHODS = {
     "backends": ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"),

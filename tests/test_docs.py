@@ -23,6 +23,7 @@ from slam.commands.cli import app
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.evaluation.metrics import absolute_errors
+from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
@@ -98,6 +99,14 @@ def test_two_streams_of_arrays_are_followed(capsys):
     path = module.follow(lefts, rights, stamps, sequence.rig.left.K, sequence.rig.baseline)
     assert absolute_errors(path, sequence.ground_truth).translation_statistics.rmse < 0.01
     assert capsys.readouterr().out.count("tracked") == 3
+
+
+def test_a_pose_is_found_among_known_points():
+    found = runpy.run_path(str(DOCS / "examples" / "pose_from_points.py"))
+    solution = found["solution"]
+    error = se3.log(se3.inverse(solution.window.poses[0]) @ found["T_true"])
+    assert error @ np.linalg.solve(solution.pose_covariance, error) < 22.5  # χ²₆: 0.1 %
+    assert 45 < solution.cost < 130  # 90 measurements
 
 
 def raw_folder(folder):

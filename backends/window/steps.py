@@ -24,9 +24,12 @@ from slam.window.agreement import landmarks_pose
 from slam.window.gating import with_noise
 from slam.window.problem import Places, RelativePrior, Rows
 from slam.window.recovery import Agreement, agreement, world_covariance
-from slam.window.solver import Solution, solve
+from slam.window.solver import CLOSE, Solution, solve
 from slam.window.stereo import RectifiedStereo
 
+#: numerics: `close` for distances beyond the gate. Where a row alone tells something of the pose, its residual and the
+#: variance of that are nearly 0, and what the first solution leaves of them would decide.
+_CLOSER = 1e-8
 _SOLVED_AGAIN = 2  # numerics: how often an update is solved again without observations that disagree with the others
 
 
@@ -185,14 +188,18 @@ class Steps:
         for again in range(_SOLVED_AGAIN + 1):
             tried = replace(start, rows=s.rows.joined(self._rows(s, points[used], z[used])))
             p = problem(tried, self.stereo, self.models)
-            solution = solve(p.window)
-            local, world = solution.point_covariances(len(s.frames) - 1)
-            at = np.searchsorted(p.points, points[used])
-            distances = kernels.left_out_distances(
-                self.stereo.intrinsics, self.stereo.R_left, solution.window.poses[-1], solution.window.points[at],
-                z[used], local[at], self.sigma,
-            )  # fmt: skip
-            bad = distances > limits[used]
+            at, w = np.searchsorted(p.points, points[used]), p.window
+            for close in (CLOSE, _CLOSER):
+                solution = solve(w, close)
+                local, world = solution.point_covariances(len(s.frames) - 1)
+                w = solution.window
+                distances = kernels.left_out_distances(
+                    self.stereo.intrinsics, self.stereo.R_left, w.poses[-1], w.points[at], z[used], local[at],
+                    self.sigma,
+                )  # fmt: skip
+                bad = distances > limits[used]
+                if not bad.any():
+                    break
             if not bad.any() or again == _SOLVED_AGAIN:
                 break
             used[np.flatnonzero(used)[bad]] = False

@@ -44,6 +44,7 @@ from slam.commands.options import (
     ViewerOption,
 )
 from slam.commands.signals import catch_signals, leaving, whole_frames
+from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
 
 if TYPE_CHECKING:
@@ -255,7 +256,7 @@ def compare_command(
         typer.Option(
             metavar="A,B,...", help="Back ends; the first is the reference.", autocompletion=completion.backends
         ),
-    ] = "ekf,smoother",
+    ] = ",".join(ONLINE),
     frontends: Annotated[
         str,
         typer.Option(
@@ -381,9 +382,9 @@ def list_command(
 def warm_up_command(quiet: QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
     from slam.commands.background_compilation import compiled_in_background
-    from slam.run.warm_up import BACKENDS, warm_up
+    from slam.run.warm_up import warm_up
 
-    with compiled_in_background(BACKENDS[-1]):
+    with compiled_in_background(ONLINE[-1]):
         seconds = warm_up()
     if not quiet:
         print(f"kernels compiled in {seconds:.0f} s" if seconds else "all kernels were compiled already")

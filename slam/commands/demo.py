@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from slam.commands.background_compilation import compiled_in_background
 from slam.commands.display import Progress, print_summary
 from slam.config import SystemConfig
 from slam.data import FrameResult
 from slam.files import write_png
 from slam.outputs import Output, require_outputs
+from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
 from slam.run.figures import draw_map_3d, draw_top_view
 from slam.run.outputs import NAMES, write_json
@@ -17,8 +19,6 @@ from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
-
-BACKENDS = ("ekf", "smoother")
 
 #: As real cameras differ from their calibration; with exact ones errors would be a third of what covariances claim.
 _WORLD = "synthetic:aisle?frames={}&speed=2&box=1&focal_error=0.002&turn_error=0.7"
@@ -48,31 +48,33 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     import matplotlib
 
     own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME, _TOP, _MAP])
-    require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in BACKENDS)], (), overwrite)
+    require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
 
     matplotlib.use("Agg")
     world = _WORLD.format(frames)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
-    for backend in BACKENDS:
-        sequence = open_sequence(world)
-        config = SystemConfig.for_kind(sequence.kind, "surf", backend)
-        with Progress(len(sequence), f"aisle · {backend}", quiet) as progress:
+    sequence = open_sequence(world)
+    sequence.keep_images()  # type: ignore[attr-defined]
+    with compiled_in_background(ONLINE[-1]):
+        for backend in ONLINE:
+            config = SystemConfig.for_kind(sequence.kind, "surf", backend)
+            with Progress(len(sequence), f"aisle · {backend}", quiet) as progress:
 
-            def seen(result: FrameResult, progress: Progress = progress) -> None:
-                progress.frame(result)
-                shown[any(thing.estimate.measured for thing in result.objects)] = result
+                def seen(result: FrameResult, progress: Progress = progress) -> None:
+                    progress.frame(result)
+                    shown[any(thing.estimate.measured for thing in result.objects)] = result
 
-            summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
+                summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     write_json(out / "comparison.json", {"runs": summaries})
-    runs = [RunData.read(out / backend, backend) for backend in BACKENDS]
-    draw_top_view(runs, open_sequence(world).ground_truth, out / _TOP)
+    runs = [RunData.read(out / backend, backend) for backend in ONLINE]
+    draw_top_view(runs, sequence.ground_truth, out / _TOP)
     draw_map_3d(runs, out / _MAP)
     plot(runs, out / _FIRST)
     last = shown.get(True, shown.get(False))
     if last is not None:
-        (frame,) = open_sequence(world).frames(last.index, last.index + 1)
-        write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, open_sequence(world).rig), last.objects))
+        (frame,) = sequence.frames(last.index, last.index + 1)
+        write_png(out / _FRAME, with_legend(draw_objects(frame.left, last, sequence.rig), last.objects))
     if not quiet:
         print_summary(summaries, out)
         print(_WHY)

@@ -32,7 +32,7 @@ from slam.run.replay import replay
 from slam.run.schema import schema
 from slam.run.settings_reference import in_force
 from slam.run.summary import Replayed, RunRecord, live_frames, results_of
-from slam.run.warm_up import BACKENDS, warm_up
+from slam.run.warm_up import warm_up
 from slam.runtime.blas import one_blas_thread
 from slam.sequences import Sequence, is_live
 from slam.sequences.live import LiveFrames
@@ -144,7 +144,7 @@ def run(
         rig_prior=rig_prior,
     )
     if live is not None:  # before its clock starts, with its first frame
-        warm_up(options.backend if options.backend in BACKENDS else BACKENDS[0], until=until)
+        warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
     record = RunRecord()
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
     return _drive(sequence, options, system, results, record, on_frame, live)

@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from itertools import chain
 
 from slam.data import FrameResult
+from slam.registry import ONLINE
 from slam.runtime.compile_clock import compile_clock
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
-
-BACKENDS = ("ekf", "smoother")
 
 #: Pairs of images, from rectified cameras and from others.
 _IMAGES = "synthetic:desk?frames=3&width=160&height=120"
@@ -42,7 +41,7 @@ def warm_up(*backends: str, until: threading.Event | None = None) -> float:
         >>> seconds = slam.warm_up("ekf")
     """
     before = compile_clock.seconds()
-    for _ in chain.from_iterable(_frames(backend) for backend in backends or BACKENDS):
+    for _ in chain.from_iterable(_frames(backend) for backend in backends or ONLINE):
         if until is not None and until.is_set():
             break
     return compile_clock.seconds() - before

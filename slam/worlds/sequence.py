@@ -68,6 +68,7 @@ class WorldSequence:
         self._kept = np.flatnonzero(~self.faults.drop)
         self._stamps = (world.stamps + self.faults.delay)[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
+        self._images: list[StereoFrame] = []
         self._model = ObservationModel.of(values)
 
     @property
@@ -110,8 +111,14 @@ class WorldSequence:
 
     def frame(self, k: int) -> StereoFrame:
         """Images of frame k."""
+        if self._images:
+            return self._images[int(k)]
         frame = self._recorder.record(self._source(k), int(k), float(self._stamps[int(k)]))
         return replace(frame, left_mask=self.masks[0], right_mask=self.masks[1])
+
+    def keep_images(self) -> None:
+        """Render all images now and keep them, for several runs on the same ones."""
+        self._images = list(self)
 
     def depth(self, k: int) -> np.ndarray:
         """True distance along the left camera's axis in frame k (H, W) float32 [m], 0 where nothing is."""

@@ -1,0 +1,126 @@
+"""The window back end: against the optimum, its consistency over many runs, and memory that does not grow."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import backends
+from experiments.long_run import DT, MODELS, Corridor, measured
+from experiments.long_run import RIG as WALK
+from experiments.long_run import run as run_long
+from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
+from slam.geometry import se3
+from slam.models import EstimatorModels, MotionModel
+from slam.registry import BUILT_IN, ONLINE
+from tests.backends.scenes import RIG, cloud, observe, path, random_path, run, scene, step
+
+
+def test_the_online_back_ends_are_all_but_the_one_that_solves_at_the_end():
+    assert set(ONLINE) == set(BUILT_IN["backends"]) - {"batch"}
+
+
+def test_a_path_longer_than_the_window_is_the_optimum():
+    """Most poses have left the window: marginalised, and revised by those that stayed."""
+    sigma = 0.003  # the measurements are linear over their uncertainty
+    models = EstimatorModels(
+        MotionModel(0.3, 0.3), pixel_sigma=sigma, initial_position_sigma=1e-6, initial_rotation_sigma=1e-7
+    )
+    poses = path(25, 0.1, np.array([0.05, 0.0, 0.3]), np.array([0.0, 0.05, 0.0]))
+    data = scene(poses, points=60, sigma=sigma, limit=20)
+    window, batch = (backends.create(name, RIG, models=models) for name in ("window", "batch"))
+    for backend in (window, batch):
+        run(backend, data)
+    mine, optimum = window.estimate(), batch.estimate()
+    deviation = np.sqrt(np.diag(optimum.covariance))
+    off = se3.log(se3.inverse(optimum.T_world_left) @ mine.T_world_left) / deviation
+    assert np.abs(off).max() < 1e-3  # standard deviations
+    np.testing.assert_allclose(np.sqrt(np.diag(mine.covariance)), deviation, rtol=1e-3)
+    before, found = batch.trajectory().poses, window.trajectory().poses
+    assert np.abs(se3.log(se3.inverse(before[5:]) @ found[5:]) / deviation).max() < 1e-3
+    marginal = np.sqrt(np.diagonal(optimum.covariances, axis1=1, axis2=2))
+    assert (np.abs(mine.positions - optimum.positions) / marginal).max() < 5e-3
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_the_covariances_say_all_along_a_path():
+    """Paths and starts drawn from the models, over seeds: the mean NEES of a frame lies in its band, early and late."""
+    seeds, frames, motion, distances = 24, 40, MotionModel(0.3, 0.3), []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        models = EstimatorModels(
+            motion, pixel_sigma=0.5, initial_velocity_sigma=0.1, initial_angular_velocity_sigma=0.1
+        )
+        sigma = np.repeat([models.initial_rotation_sigma, models.initial_position_sigma], 3)
+        poses = random_path(frames, 0.1, 0.1 * rng.standard_normal(3), motion, rng)
+        start = poses[0] @ se3.exp(sigma * rng.standard_normal(6))
+        backend = backends.create("window", RIG, models=replace(models, T_world_left=tuple(map(tuple, start))))
+        points, known = cloud(poses, 120, rng), set()
+        for k, T in enumerate(poses):
+            step(backend, 0.1 * k, observe(T, points, 0.5, rng), known)
+            found = backend.estimate(landmarks=False)
+            error = pose_residuals(found.T_world_left[None], T[None])
+            distances.append(float(nees(error, found.covariance[None])[0]))
+    mean = np.array(distances).reshape(seeds, frames).mean(axis=0)
+    low, high = chi_square_band(6, seeds)
+    assert low < mean.mean() < high
+    for part in np.split(mean, 4):
+        assert low < part.mean() < high
+    assert np.mean((mean > low) & (mean < high)) > 0.8
+
+
+def test_a_landmark_that_is_seen_alone_is_used():
+    """It holds the pose by itself in some directions: there its residual is 0, and so is the variance of that."""
+    motion, reports = MotionModel(1.0, 1.0), []
+    poses = path(40, 0.1, np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.1, 0.0]))
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        backend = backends.create("window", RIG, models=EstimatorModels(motion, pixel_sigma=1.0))
+        points, known = cloud(poses[:1], 12, rng, 1.5, 4.0), set()
+        for k, T in enumerate(poses):
+            seen = observe(T, points, 1.0, rng)
+            reports.append(step(backend, 0.1 * k, seen.select(np.arange(len(seen)) < (12 if k < 5 else 1)), known))
+    assert all(report.status.value != "failed" and not len(report.rejected) for report in reports)
+
+
+def walk(backend, first, last, rng, known):
+    """A corridor without end: landmarks come and go."""
+    corridor = Corridor(density=4, speed=2.0)
+    for k in range(first, last):
+        ids, points = corridor.landmarks(DT * k)
+        gone = known - set(ids.tolist())
+        seen = measured(corridor.pose(DT * k), points, ids, rng)
+        old = np.isin(seen.ids, sorted(known))
+        backend.predict(DT * k)
+        backend.update(seen.select(old))
+        backend.remove(sorted(gone))
+        backend.add(seen.select(~old))
+        known -= gone
+        known |= set(seen.ids.tolist())
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_run():
+    """Of the process, beyond the trajectory, once the poses that are still revised are there."""
+    first, *_, last = run_long("window", 2400, 400, Corridor(density=4, speed=2.0))
+    assert last.frame - first.frame == 2000
+    assert 1e6 * (last.beyond - first.beyond) < 4096 * 2000
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda backend: pickle.loads(pickle.dumps(backend))])
+@pytest.mark.parametrize("after", [0, 1, 30])
+def test_a_copy_goes_on_to_the_same_bytes(copied, after):
+    backend, known = backends.create("window", WALK, models=MODELS), set()
+    walk(backend, 0, after, np.random.default_rng(0), known)
+    other = copied(backend)
+    for each in (backend, other):
+        walk(each, after, after + 12, np.random.default_rng(1), set(known))
+        each.revise(lambda z: z + np.array([0.1, 0.0, 0.0]))
+    mine, its = backend.estimate(), other.estimate()
+    for name in ("T_world_left", "covariance", "ids", "positions", "covariances"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
+    np.testing.assert_array_equal(backend.trajectory().poses, other.trajectory().poses)
