@@ -66,7 +66,7 @@ class WindowBackend:
         s, settled = self._steps.predicted(s, float(stamp)).settled(self.config.lag)
         rows, left, right, S = self._steps.in_view(s)
         frame = int(s.frames[-1])
-        self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1]]
+        self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1].copy()]
         for earlier, T in settled.items():
             self._final[earlier] = T
         self._done(s, "predicted", float(stamp))

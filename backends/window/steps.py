@@ -20,10 +20,10 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
 from slam.models import EstimatorModels
 from slam.window import kernels, pose_only
-from slam.window.agreement import landmarks_pose
+from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
 from slam.window.gating import with_noise
 from slam.window.problem import Places, RelativePrior, Rows
-from slam.window.recovery import Agreement, agreement, world_covariance
+from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
 from slam.window.solver import CLOSE, Solution, solve
 from slam.window.stereo import RectifiedStereo
 
@@ -176,7 +176,7 @@ class Steps:
             found = landmarks_pose(rectified.rig, position, rows, self.models, turned, int(s.frames[-1]))
             return None if found is None else found @ inverse(rectified.T_left_rectified)
 
-        return agreement(one, T if guess is None else guess, search, s.contradicted, lost=False)
+        return agreement(one, T if guess is None else guess, search, s.contradicted, _lost(s))
 
     def _solved(self, s: State, found: Agreement, points: IndexArray, z: Array) -> tuple[State, BoolArray, float]:
         """The state after an update, which observations were used, and their NIS."""
@@ -207,6 +207,13 @@ class Steps:
                 raise np.linalg.LinAlgError("no observation agrees with the others")
         nis = max(solution.cost - s.cost, 0.0) if found.jump is None else float("nan")
         return _after(tried, solution, p.points, local, world, points[used]), used, nis
+
+
+def _lost(s: State) -> bool:
+    """Whether the orientation in the world of the newest pose that measured landmarks is unknown."""
+    i = 6 * s.solved
+    enough = np.count_nonzero(s.rows.pose == s.solved) >= MIN_CONSENSUS
+    return bool(enough and unknown_turn(s.covariance[i : i + 6, i : i + 6]))
 
 
 def seen_from_newest(s: State, rows: IndexArray) -> tuple[Array, Array]:
