@@ -41,8 +41,8 @@ def outcome(
     Args:
         record: of the run. Its first frame is not counted: there is no map yet.
         rig: the cameras.
-        warnings: what looked wrong with the images and their times; the first is taken for a cause,
-            but for repeated images, which are counted.
+        warnings: what looked wrong with the images and their times; the first is taken for a cause.
+            Repeated images are counted instead.
         in_map: the run began in the map of an earlier one.
         dropped: frames of a live run that came too late.
         doubt: of the motion, see `motion_doubt`; a cause where nothing else is one.
@@ -53,14 +53,15 @@ def outcome(
     tracked = frames - len(untracked)
     if frames < 1 or len(untracked) <= _MANY * frames:
         return ""
-    others = [line for line in warnings if REPEATED not in line]
-    if 2 * record.repeated > len(untracked):
-        first = f"in {record.repeated} of them {REPEATED}"
-    else:
-        first = others[0] if others else _cause(record, untracked, rig, in_map) or doubt
-    if not first and dropped < frames:  # where most came, the gaps are hardly all of it
+    frozen = 2 * record.repeated > len(untracked)
+    first = next((line for line in warnings if REPEATED not in line), "")
+    if not first and not frozen:
+        first = _cause(record, untracked, rig, in_map) or doubt
+    if not first and not frozen and dropped < frames:  # where most came, the gaps are hardly all of it
         first = _any_cause(record, rig, driving)
     causes = [first] if first else []
+    if frozen:
+        causes.append(f"in {record.repeated} of them {REPEATED}")
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
         causes.append(
