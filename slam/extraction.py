@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from zlib import crc32
+
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
@@ -34,6 +37,34 @@ def as_frame(left: StereoFrame | np.ndarray, right: np.ndarray | None, stamp: fl
     return StereoFrame(index, stamp, left, right)
 
 
+@dataclass(frozen=True, eq=False)
+class Extracted:
+    """A frame and what the front end found in it.
+
+    Attributes:
+        frame: as given.
+        features: found in it.
+        milliseconds: wall time of the extraction.
+        checksum: of the images, see `checksum_of`.
+    """
+
+    frame: StereoFrame
+    features: StereoFeatures
+    milliseconds: dict[str, float]
+    checksum: tuple[int, int] | None
+
+
+def checksum_of(frame: StereoFrame) -> tuple[int, int] | None:
+    """Checksums of the bytes of left and right image, by which repeated images are known; None if left shows nothing.
+
+    Images of a camera that stands still differ by their noise.
+    """
+    left, right = frame.left, frame.right
+    if not isinstance(left, np.ndarray) or not left.size or left.min() == left.max():
+        return None
+    return crc32(left.tobytes()), crc32(right.tobytes()) if isinstance(right, np.ndarray) else 0
+
+
 class Extractor:
     """Extracts features of frames, in one thread at a time, which may differ from the system's.
 
@@ -51,13 +82,15 @@ class Extractor:
     @property
     def warnings(self) -> list[str]:
         """Warnings about the images so far, one line each (see `slam.tracking.input_warnings`)."""
-        return list(self._warnings.lines)
+        return [*self._warnings.lines, *filter(None, [self._warnings.repeated])]
+
+    def warn_of_repeated(self, number: int) -> None:
+        """Warn, the first time only, of a frame, by its number in its sequence, with the images of the one before."""
+        self._warnings.note_repeated(number)
 
     @one_blas_thread
-    def extract(
-        self, frontend: Frontend | None, frame: StereoFrame
-    ) -> tuple[StereoFrame, StereoFeatures, dict[str, float]]:
-        """A frame, its features, and the time of their extraction [ms].
+    def extract(self, frontend: Frontend | None, frame: StereoFrame) -> Extracted:
+        """A frame with its features.
 
         Raises:
             ConfigurationError: there is no front end.
@@ -74,4 +107,4 @@ class Extractor:
             if not (frame.left_mask is None and frame.right_mask is None):
                 features = features.outside(frame.left_mask, frame.right_mask)
         self._warnings.look(frame, features)
-        return frame, features, stages.milliseconds
+        return Extracted(frame, features, stages.milliseconds, checksum_of(frame))

@@ -14,6 +14,7 @@ from slam.mapping.mapper import MapChange
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
+from slam.tracking.input_warnings import REPEATED
 
 
 def frame_result(
@@ -88,7 +89,7 @@ def frame_status(step: Step, added: int, mapped_before: bool) -> tuple[FrameStat
         return FrameStatus.TRACKED, ""
     if not mapped_before:
         return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
-    reason = step.report.reason
+    reason = REPEATED if step.repeated else step.report.reason
     if step.matches.doubted:
         reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"
     reason = reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"

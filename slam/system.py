@@ -14,7 +14,7 @@ from slam.calibration import RemainingRigError, Revision, SavedCalibration, Self
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, IdArray, Prediction, StereoFeatures, StereoFrame, UpdateReport
 from slam.errors import ConfigurationError, MeasurementError, SlamError
-from slam.extraction import Extractor, as_frame
+from slam.extraction import Extracted, Extractor, as_frame
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
@@ -36,6 +36,7 @@ from slam.runtime.stages import Stages
 from slam.showing import count
 from slam.third_party import named_failures
 from slam.tracking.feature_check import usable
+from slam.tracking.input_warnings import REPEATED
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.patch_alignment import Aligner, PatchAnchors
 from slam.tracking.protocol_check import require_estimate, require_positions, require_prediction, require_report
@@ -170,9 +171,7 @@ class StereoSlam:
         """
         frame = as_frame(left, right, stamp, self._last.index + 1)
         with self._stepping:
-            _, features, milliseconds = self._extractor.extract(self.frontend, frame)
-            result = self._step(features, frame.index)
-            return replace(result, milliseconds={**milliseconds, **result.milliseconds})
+            return self._timed_step(self._extractor.extract(self.frontend, frame))
 
     def run(self, frames: Iterable[StereoFrame], overlap: bool = True) -> Iterator[tuple[StereoFrame, FrameResult]]:
         """Every frame with the result of its step.
@@ -189,10 +188,10 @@ class StereoSlam:
             raise MeasurementError(f"run: frames must be a sequence of frames, got {type(frames).__name__}")
         extracted = (self._extractor.extract(self.frontend, frame) for frame in frames)
         depth = 1 if getattr(frames, "live", False) else 2  # live frames must not wait
-        for frame, features, milliseconds in prefetch(extracted, depth) if overlap else extracted:
+        for found in prefetch(extracted, depth) if overlap else extracted:
             with self._stepping:
-                result = self._step(features, frame.index)
-            yield frame, replace(result, milliseconds={**milliseconds, **result.milliseconds})
+                result = self._timed_step(found)
+            yield found.frame, result
 
     def process_features(self, features: StereoFeatures) -> FrameResult:
         """One step from features: predict, associate, update, and manage the map (paper A, III and IV; paper B, 2).
@@ -209,25 +208,35 @@ class StereoSlam:
         with self._stepping:
             return self._step(features, self._last.index + 1)
 
-    def _step(self, features: StereoFeatures, number: int) -> FrameResult:
+    def _timed_step(self, found: Extracted) -> FrameResult:
+        """`_step` with what was found in images; the result has the time of extraction, too."""
+        result = self._step(found.features, found.frame.index, found.checksum)
+        if result.reason == REPEATED:
+            self._extractor.warn_of_repeated(found.frame.index)
+        return replace(result, milliseconds={**found.milliseconds, **result.milliseconds})
+
+    def _step(self, features: StereoFeatures, number: int, checksum: tuple[int, int] | None = None) -> FrameResult:
         """`process_features`, in the only thread; `number` is the frame's in its sequence."""
         with self._named(f"frame {number}"):
-            return self._whole_step(features)
+            return self._whole_step(features, checksum)
 
     def _named(self, place: str) -> AbstractContextManager[None]:
         """Make exceptions of third-party parts say what failed, and where."""
         return named_failures(place, self.backend, self.frontend)
 
     @one_blas_thread
-    def _whole_step(self, features: StereoFeatures) -> FrameResult:
-        """All stages of a step."""
+    def _whole_step(self, features: StereoFeatures, checksum: tuple[int, int] | None) -> FrameResult:
+        """All stages of a step; what images with the checksum of the last step's show was measured in that one."""
         features = usable(features, self.rig, self._last.dimensions, self._stamp)
         self._roll_back()
         index, stages, search = self._last.index + 1, self._stages, self._relocalizer.search
         backends = len(self.restarted)
         if search is not None and not self._locate(features, index):
-            self._last, self._stamp = replace(self._last, index=index), features.stamp
+            self._last, self._stamp = replace(self._last, index=index, checksum=None), features.stamp
             return search.lost(index, replace(features, images=None))
+        repeated = len(features) > 0 and checksum is not None and checksum == self._last.checksum
+        if repeated:
+            features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1], features.threshold)
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
             revision, prediction, dt = self._revise(), *self._predict(features.stamp)
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
@@ -244,7 +253,7 @@ class StereoSlam:
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(
                 index, seen.features, seen.prediction, seen.matches, seen.withheld, seen.withheld_rows, left_out,
-                report, state, estimate, labels,
+                report, state, estimate, labels, checksum=checksum, repeated=repeated,
             )  # fmt: skip
             change, anchors = self._manage(seen, step)
         with stages.stage("atlas"):  # a loop closure corrects the path

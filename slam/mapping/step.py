@@ -73,6 +73,8 @@ class Step:
         labels: which features move.
         common: the part of the pose's error that other frames share; included in the covariance of `estimate`.
         correction: of the calibration, with which the features were corrected.
+        checksum: of the images; None without images, or of images that show nothing.
+        repeated: the images are those of the frame before, so that its features were left out.
     """
 
     index: int
@@ -88,6 +90,8 @@ class Step:
     labels: MotionLabels
     common: CommonError = field(default_factory=CommonError)
     correction: Correction | None = None
+    checksum: tuple[int, int] | None = None
+    repeated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +105,7 @@ class Completed:
         mapped: whether there ever was a landmark.
         anchors: image patches of landmarks at first sight.
         measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
+        checksum: of the images; None without images, or of images that show nothing.
     """
 
     index: int = -1
@@ -109,10 +114,12 @@ class Completed:
     mapped: bool = False
     anchors: PatchAnchors = field(default_factory=PatchAnchors.none)
     measured_at: float = -np.inf
+    checksum: tuple[int, int] | None = None
 
     def after(self, step: Step, added: int, anchors: PatchAnchors, new_map: bool) -> Completed:
         """The state after one more step, in which `added` landmarks joined the map, or a new map was started."""
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
         known = not step.state.unmatched or not self.mapped or new_map
         measured_at = step.features.stamp if known else self.measured_at
-        return Completed(step.index, step.state, dimensions, self.mapped or added > 0, anchors, measured_at)
+        mapped = self.mapped or added > 0
+        return Completed(step.index, step.state, dimensions, mapped, anchors, measured_at, step.checksum)

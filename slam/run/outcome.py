@@ -12,7 +12,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, log
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
-from slam.tracking.input_warnings import baseline_doubt
+from slam.tracking.input_warnings import REPEATED, baseline_doubt
 from slam.tracking.state import ENOUGH_FEATURES
 
 _TRACKED = "tracked"
@@ -42,6 +42,7 @@ def outcome(
         record: of the run. Its first frame is not counted: there is no map yet.
         rig: the cameras.
         warnings: what looked wrong with the images and their times; the first is taken for a cause.
+            Repeated images are counted instead.
         in_map: the run began in the map of an earlier one.
         dropped: frames of a live run that came too late.
         doubt: of the motion, see `motion_doubt`; a cause where nothing else is one.
@@ -52,10 +53,15 @@ def outcome(
     tracked = frames - len(untracked)
     if frames < 1 or len(untracked) <= _MANY * frames:
         return ""
-    first = warnings[0] if warnings else _cause(record, untracked, rig, in_map) or doubt
-    if not first and dropped < frames:  # where most came, the gaps are hardly all of it
+    frozen = 2 * record.repeated > len(untracked)
+    first = next((line for line in warnings if REPEATED not in line), "")
+    if not first and not frozen:
+        first = _cause(record, untracked, rig, in_map) or doubt
+    if not first and not frozen and dropped < frames:  # where most came, the gaps are hardly all of it
         first = _any_cause(record, rig, driving)
     causes = [first] if first else []
+    if frozen:
+        causes.append(f"in {record.repeated} of them {REPEATED}")
     if dropped:
         few = "a frame was" if dropped == 1 else f"{dropped} frames were"
         causes.append(

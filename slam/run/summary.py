@@ -22,6 +22,7 @@ from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
 from slam.third_party import named_failures
+from slam.tracking.input_warnings import REPEATED
 from slam.tracking.protocol_check import require_estimate
 
 
@@ -44,6 +45,7 @@ class RunRecord:
     without_right: list[int] = field(default_factory=list)  # rows of frames without a right image
     depths: list[float] = field(default_factory=list)  # median of what each frame sees [m]
     bodies: set[int] = field(default_factory=set)
+    repeated: int = 0  # frames with the images of the one before
     rejected: int = 0
     used: int = 0
     returned: int | None = None  # the first frame in which landmarks of an old place came back
@@ -58,6 +60,7 @@ class RunRecord:
         self.statuses.append(result.status.value)
         self.milliseconds.append(dict(result.milliseconds))
         self.times.append(working_time())
+        self.repeated += result.reason == REPEATED
         self.features.append((len(result.features), int(result.features.has_stereo.sum())))
         self.bodies.update(thing.id for thing in result.objects)
         if not result.located:

@@ -18,6 +18,9 @@ from slam.tracking.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 
+#: Why a frame is no measurement though its images show enough.
+REPEATED = "the images are those of the frame before, byte for byte"
+
 #: guard: plausible times between frames [s]: a thousand frames a second to one in ten seconds.
 SHORTEST, LONGEST = 1e-3, 10.0
 
@@ -41,10 +44,12 @@ class InputWarnings:
 
     Attributes:
         lines: the warnings so far.
+        repeated: the warning of repeated images; empty without one.
     """
 
     def __init__(self, rig: StereoRig, models: EstimatorModels, rows: float) -> None:
         self.lines: list[str] = []
+        self.repeated = ""
         self._rig, self._rows = rig, rows
         self._farthest = farthest_apart(rig, models)
         self._stamps: list[float] = []
@@ -167,6 +172,15 @@ class InputWarnings:
         except CalibrationError:  # the rig cannot be rectified: a front end may not need that
             self._pair_is_known = self._moment_is_known = True
             return None
+
+    def note_repeated(self, number: int) -> None:
+        """Warn of a frame with the images of the frame before, by its number in its sequence."""
+        if not self.repeated:
+            self.repeated = (
+                f"frame {number}: {REPEATED}: the camera froze or its driver gave them twice; such frames are no "
+                "measurements (simulated images need noise)"
+            )
+            logger.warning("%s", self.repeated)
 
     def _warn(self, line: str) -> None:
         self.lines.append(line)

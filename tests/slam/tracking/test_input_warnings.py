@@ -181,7 +181,7 @@ def test_a_run_says_it_on_the_terminal_and_in_its_summary(slam_command, tmp_path
     for side, image in (("left", FRAME.right), ("right", FRAME.left)):
         (tmp_path / "mine" / side).mkdir(parents=True)
         cv2.imwrite(str(tmp_path / "mine" / side / "000000.png"), image)
-        cv2.imwrite(str(tmp_path / "mine" / side / "000001.png"), image)
+        cv2.imwrite(str(tmp_path / "mine" / side / "000001.png"), image ^ 1)  # as if by noise
     storage = cv2.FileStorage(str(tmp_path / "mine" / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
     for name, value in {"K1": RIG.left.K, "K2": RIG.right.K, "R": RIG.R, "T": RIG.R @ RIG.b}.items():
         storage.write(name, value)

@@ -1,0 +1,141 @@
+"""Images that come again, byte for byte, are no measurement: the pose is predicted, and frame and run say so."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+import slam
+from slam.config import SystemConfig
+from slam.data import FrameStatus, StereoFrame
+from slam.run.runner import RunOptions, run
+from slam.tracking.input_warnings import REPEATED
+
+SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
+FRAMES = list(SEQUENCE)
+FROZEN = [*range(12), *[11] * 7, *range(12, 20)]
+BACKENDS = ("ekf", "smoother")
+
+
+def shown(order: list[int], frames: list[StereoFrame] = FRAMES) -> list[StereoFrame]:
+    """These frames, one after the other."""
+    return [replace(frames[k], index=j, stamp=j / 30) for j, k in enumerate(order)]
+
+
+def system(backend: str = "ekf") -> slam.StereoSlam:
+    return slam.StereoSlam(SEQUENCE.rig, "surf", backend)
+
+
+def repeats(results) -> list[int]:
+    return [result.index for result in results if REPEATED in result.reason]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_frozen_images_are_predicted_and_said(backend, caplog):
+    s = system(backend)
+    results = [s.process(frame) for frame in shown(FROZEN)]
+    assert repeats(results) == list(range(12, 19))
+    before, frozen, after = results[11], results[12:19], results[19:]
+    assert {r.status for r in frozen} <= {FrameStatus.PREDICTED, FrameStatus.LOST}
+    assert all(len(r.features) == len(r.matched) == len(r.added) == len(r.erased) == 0 for r in frozen)
+    grown = [np.trace(r.estimate.covariance) for r in (before, *frozen)]
+    assert grown == sorted(grown)
+    assert {r.status for r in after} == {FrameStatus.TRACKED}
+    plain = system(backend)
+    alone = [plain.process(frame) for frame in shown(list(range(20)))][-1]
+    apart = np.linalg.norm((after[-1].estimate.T_world_left - alone.estimate.T_world_left)[:3, 3])
+    assert apart < 0.02
+    (line,) = s.warnings
+    assert line.startswith(f"frame 12: {REPEATED}") and [r.message for r in caplog.records].count(line) == 1
+
+
+def test_a_camera_that_stands_still_is_tracked_by_its_noise():
+    rng, last = np.random.default_rng(0), FRAMES[5]
+
+    def noisy(image: np.ndarray) -> np.ndarray:
+        return np.clip(image + np.rint(rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
+
+    still = [StereoFrame(0, 0.0, noisy(last.left), noisy(last.right)) for _ in range(6)]
+    s = system()
+    results = [s.process(frame) for frame in shown(list(range(12)), [*FRAMES[:6], *still])]
+    assert {r.status for r in results[1:]} == {FrameStatus.TRACKED} and s.warnings == []
+
+
+def test_a_driver_that_gives_each_image_twice_halves_the_rate():
+    s = system()
+    results = [s.process(frame) for frame in shown([k // 2 for k in range(20)])]
+    assert repeats(results) == list(range(1, 20, 2))
+    assert {r.status for r in results[2::2]} == {FrameStatus.TRACKED}
+
+
+def test_buffers_that_are_filled_again_are_new_images_and_copies_are_old_ones():
+    s, left, right = system(), FRAMES[0].left.copy(), FRAMES[0].right.copy()
+    results = []
+    for k in (0, 1, 2):
+        left[:], right[:] = FRAMES[k].left, FRAMES[k].right
+        results.append(s.process(left, right, k / 30))
+    assert repeats(results) == []
+    assert repeats([s.process(left.copy(), np.asfortranarray(right), 0.1)]) == [3]
+    assert repeats([s.process(FRAMES[3].left, right, 0.2)]) == []  # one image of the two is new
+
+
+def test_dark_images_show_nothing_whether_repeated_or_not():
+    dark = replace(FRAMES[0], left=np.zeros_like(FRAMES[0].left), right=np.zeros_like(FRAMES[0].right))
+    s = system()
+    results = [s.process(frame) for frame in shown([0, 1, 2, 3, 4, 4, 4], [*FRAMES[:4], dark])]
+    assert repeats(results) == []
+    assert {r.status for r in results[4:]} == {FrameStatus.PREDICTED}
+
+
+def test_what_another_thread_has_read_ahead_is_not_taken_for_the_frame_before():
+    frames = shown([0, 1, 2])
+    s = system()
+    for _ in s.run(iter(frames)):  # the frames after the first are extracted, but no step is made of them
+        break
+    assert repeats([s.process(frames[1]), s.process(frames[2])]) == []
+    s, t = system(), system()
+    overlapping = [result for _, result in s.run(shown(FROZEN), overlap=True)]
+    assert repeats(overlapping) == repeats(result for _, result in t.run(shown(FROZEN), overlap=False))
+    assert s.trajectory().poses.tobytes() == t.trajectory().poses.tobytes()
+
+
+def test_the_camera_is_looked_for_in_a_map_as_long_as_it_is_not_found():
+    first = system()
+    for frame in shown(list(range(8))):
+        first.process(frame)
+    s = slam.StereoSlam(SEQUENCE.rig, "surf", "ekf", prior_map=first.snapshot())
+    noise = [np.random.default_rng(k).integers(0, 255, FRAMES[0].left.shape, np.uint8) for k in range(2)]
+    results = [s.process(f) for f in shown([0, 0, 1, 1, 2], [StereoFrame(0, 0.0, *noise), *FRAMES[3:5]])]
+    assert [r.located for r in results] == [False, False, True, True, True]
+    assert repeats(results) == [3]
+
+
+@dataclass
+class Shown:
+    """A sequence of given frames."""
+
+    given: list[StereoFrame]
+    rig: slam.StereoRig = SEQUENCE.rig
+    name = "frozen"
+    format = "test"
+    kind = "handheld"
+    ground_truth = None
+    warnings: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.given)
+
+    def frames(self, start=0, stop=None):
+        yield from self.given[start:stop]
+
+
+def test_a_run_says_so_at_its_end(tmp_path):
+    options = RunOptions("ekf", "surf", SystemConfig.for_kind("handheld"), tmp_path)
+    run(Shown(shown(FROZEN)), options)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert [REPEATED in line for line in summary["warnings"]] == [True]
+    assert summary["tracking"] == f"7 of 26 frames were not tracked; likely cause: in 7 of them {REPEATED}"
+    assert (tmp_path / "frames.csv").read_text().count(REPEATED.split(",")[0]) == 7
