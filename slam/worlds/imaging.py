@@ -22,7 +22,6 @@ class ImagingModel:
     Attributes:
         noise: standard deviation of the sensor noise [grey levels].
         vignetting: loss of light in the corners.
-        exposure: amplitude of slow changes of brightness, as a share.
         shutter: time that the shutter is open, as a share of a frame.
         lens: standard deviation of the lens's blur [px].
         colour: whether images are BGR.
@@ -31,7 +30,6 @@ class ImagingModel:
 
     noise: float
     vignetting: float
-    exposure: float
     shutter: float
     lens: float
     colour: int
@@ -48,15 +46,10 @@ class ImagingModel:
         x, y = x / (width - 1) * 2 - 1, y / (height - 1) * 2 - 1
         return (1 - self.vignetting * (x * x + y * y) / 2).astype(np.float32)
 
-    def gain(self, time: float) -> float:
-        """Brightness at a time [s], as automatic exposure wanders."""
-        return 1.0 + self.exposure * float(0.6 * np.sin(0.9 * time) + 0.4 * np.sin(2.3 * time + 1))
-
 
 def sense(
-    image: np.ndarray, model: ImagingModel, shading: np.ndarray, gain: float, faults: Faults, frame: int,
-    rng: np.random.Generator,
-) -> np.ndarray:  # fmt: skip
+    image: np.ndarray, model: ImagingModel, shading: np.ndarray, faults: Faults, frame: int, rng: np.random.Generator
+) -> np.ndarray:
     """The image that the camera gives, uint8."""
     if faults.hand[frame]:
         image = _cover(image)
@@ -64,7 +57,7 @@ def sense(
         image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
     elif model.lens > 0.05:
         image = cv2.GaussianBlur(image, (0, 0), model.lens)
-    gain *= 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
+    gain = 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
     light = shading * np.float32(gain)
     out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
     noise = model.noise * (8.0 if faults.burst[frame] else 1.0)

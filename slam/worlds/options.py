@@ -66,13 +66,7 @@ RECORDING = (
     Option("height", 240, "image height [px]", 48, 4096),
     Option("baseline", 0.12, "distance between the cameras [m]", 0.01, 10),
     Option("focal_error", 0.0, "relative error of the focal length in the calibration; positive: too long", -0.2, 0.2),
-    Option(
-        "turn_error",
-        0.0,
-        "turn of the right camera about each of its axes that is not in the calibration [mrad]",
-        -50,
-        50,
-    ),
+    Option("turn_error", 0.0, "turn of the right camera about each axis, not in the calibration [mrad]", -50, 50),
 )
 
 #: Keys for observations made without images.
@@ -94,7 +88,6 @@ OBSERVATION = (
 IMAGING = (
     Option("noise", 2.0, "standard deviation of the sensor noise [grey levels]", 0, 100),
     Option("vignetting", 0.2, "loss of light in the image corners", 0, 1),
-    Option("exposure", 0.0, "amplitude of slow changes of brightness, as a share", 0, 0.9),
     Option("shutter", 0.0, "time that the shutter is open, as a share of a frame: motion blur", 0, 1),
     Option("lens", 0.5, "blur of the lens, standard deviation [px]", 0, 10),
     Option("colour", 0, "1 for colour images (BGR), 0 for grey ones", 0, 1),

@@ -36,7 +36,6 @@ class Recorder:
         self._model = ImagingModel.of(values)
         self._faults = faults
         self._seed: int = values["seed"]
-        self._pace: float = values["rate"]
 
     def record(self, frame: int, index: int, stamp: float) -> StereoFrame:
         """The images of one frame of the world, as frame `index` of the recording."""
@@ -56,8 +55,7 @@ class Recorder:
         else:
             image = self._picture(frame, lens, T_left_camera, 0.0)
         rng = np.random.default_rng([self._seed, frame, stream])
-        gain = self._model.gain(frame / self._pace)
-        return sense(image, self._model, self._shading, gain, self._faults, frame, rng)
+        return sense(image, self._model, self._shading, self._faults, frame, rng)
 
     def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
         """One camera's light, `ahead` of the frame's time by a share of a frame."""

@@ -16,11 +16,7 @@ from slam.worlds.textures.surfaces import Material, Shelves
 from slam.worlds.world import World
 
 TEXT = "a library aisle with bookshelves, walked through by hand (paper A, section V)"
-OPTIONS = (
-    Option("return", 0, "1 to walk there and back", 0, 1),
-    Option("bare", 1, "1 for a stretch of bare wall between the shelves", 0, 1),
-    Option("box", 0, "1 for a box that moves along the shelves, stops, and moves on", 0, 1),
-)
+OPTIONS = (Option("box", 0, "1 for a box that moves along the shelves, stops, and moves on", 0, 1),)
 DEFAULTS: dict[str, Any] = {}
 
 FOCAL = 260.0
@@ -37,28 +33,25 @@ EYE = 1.35  #: height of the camera
 
 def build(values: Mapping[str, Any]) -> World:
     """The world of these options."""
-    duration = DURATION * (2 if values["return"] else 1)
-    stamps, t = clock(values, duration)
-    rectangles = _room(values)
+    stamps, t = clock(values, DURATION)
+    rectangles = _room(values["layout"])
     boxes = None
     if values["box"]:
         size = np.array([0.34, 0.26, 0.28])
         rectangles += carton(size, -size / 2, 1, 100 + values["layout"])
         boxes = _box_poses(t)[None]
     rig = make_rig(values, FOCAL * values["width"] / 320)
-    poses = _walk(t, stamps, values["layout"], bool(values["return"]))
+    poses = _walk(t, stamps, values["layout"])
     return assemble("aisle", "handheld", values, rig, stamps, poses, rectangles, (0.3, 5.0), 640.0, boxes)
 
 
-def _walk(t: Array, stamps: Array, layout: int, there_and_back: bool) -> Array:
+def _walk(t: Array, stamps: Array, layout: int) -> Array:
     """Camera poses at path times t, shaken at times `stamps`: along the shelves, looking along and towards them."""
     rng = np.random.default_rng([layout, 41])
     offsets, angles = carried(stamps, rng)
-    progress = np.where(t > DURATION, 2 - t / DURATION, t / DURATION) if there_and_back else t / DURATION
-    far = LENGTH * _pace(progress)
-    turn = through(t, [DURATION - 1.5, DURATION + 1.5], [1.0, -1.0 if there_and_back else 1.0])
+    far = LENGTH * _pace(t / DURATION)
     across = 0.3 * np.tanh(0.6 * sway(t, rng, 0.03, 0.12, 3))  # the shelves stay more than 0.8 m away
-    heading = np.deg2rad(-42) * turn + np.deg2rad(6) * sway(t, rng, 0.03, 0.15, 4)
+    heading = np.deg2rad(-42) + np.deg2rad(6) * sway(t, rng, 0.03, 0.15, 4)
     pitch = np.deg2rad(-3) + np.deg2rad(2) * sway(t, rng, 0.05, 0.2, 4)
     positions = np.stack([far, across, np.full(len(t), EYE)], axis=1)
     positions += offsets[:, [1, 0, 2]]
@@ -77,9 +70,8 @@ def _pace(x: Array) -> Array:
     return (first + middle + np.where(x > 1 - ramp, last, 0)) / (1 - ramp)
 
 
-def _room(values: Mapping[str, Any]) -> list[Rectangle]:
-    """Shelves on both sides, floor, ceiling, end walls and, if asked for, a stretch of bare wall."""
-    layout = values["layout"]
+def _room(layout: int) -> list[Rectangle]:
+    """Shelves on both sides, floor, ceiling, end walls and a stretch of bare wall."""
     length, depth, behind = END_X - START_X, SHELF_Y - OTHER_Y, SHELF_Y + 0.2
     above = CEILING - HEIGHT
     out = [
@@ -94,15 +86,13 @@ def _room(values: Mapping[str, Any]) -> list[Rectangle]:
     end = Material(depth + 0.4, CEILING, "door_wall", layout + 1, 8)
     out.append(rectangle(end, (END_X, behind, CEILING), (0, -1, 0), (0, 0, -1)))
     out.append(rectangle(end, (START_X, OTHER_Y - 0.2, CEILING), (0, 1, 0), (0, 0, -1)))
-    stretches = [(START_X, BARE[0]), (BARE[1], END_X)] if values["bare"] else [(START_X, END_X)]
-    for number, (x0, x1) in enumerate(stretches):
+    for number, (x0, x1) in enumerate(((START_X, BARE[0]), (BARE[1], END_X))):
         out.append(_along_aisle(Shelves(x1 - x0, HEIGHT, 100 * layout + number), x0, SHELF_Y, HEIGHT, 1))
-    if values["bare"]:
-        wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
-        out.append(_along_aisle(wall, BARE[0] - 0.5, behind - 0.01, CEILING, 1))
-        side = Material(0.19, HEIGHT, "wood", layout)
-        out.append(rectangle(side, (BARE[0], SHELF_Y, HEIGHT), (0, 1, 0), (0, 0, -1)))
-        out.append(rectangle(side, (BARE[1], behind - 0.01, HEIGHT), (0, -1, 0), (0, 0, -1)))
+    wall = Material(BARE[1] - BARE[0] + 1.0, CEILING, "plaster", layout + 2, 0.6)
+    out.append(_along_aisle(wall, BARE[0] - 0.5, behind - 0.01, CEILING, 1))
+    side = Material(0.19, HEIGHT, "wood", layout)
+    out.append(rectangle(side, (BARE[0], SHELF_Y, HEIGHT), (0, 1, 0), (0, 0, -1)))
+    out.append(rectangle(side, (BARE[1], behind - 0.01, HEIGHT), (0, -1, 0), (0, 0, -1)))
     return out
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,14 +66,25 @@ def assemble(
     return World(name, kind, rig, stamps, T_world_left, surfaces, landmarks, objects, reach, texels, lasting=lasting)
 
 
+#: The axes along which the sides of a box are wide and high.
+SIDES = {"front": (0, 2), "back": (0, 2), "left": (1, 2), "right": (1, 2), "top": (0, 1), "bottom": (0, 1)}
+
+
+def crate(
+    size: Sequence[float] | Array, looks: Material, corner: Iterable[float] = (0, 0, 0), body: int = 0,
+    T_body_box: Array | None = None, sides: Iterable[str] = SIDES,
+) -> list[Rectangle]:  # fmt: skip
+    """The `sides` of a box, each a piece of its own like `looks`; thin ones are left out. See `cuboid`."""
+    faces = {}
+    for i, (side, wide, high) in enumerate((side, size[SIDES[side][0]], size[SIDES[side][1]]) for side in sides):
+        if min(wide, high) > 0.01:
+            faces[side] = replace(looks, width=wide, height=high, seed=looks.seed + i)
+    return cuboid(faces, size, corner, body, T_body_box)
+
+
 def carton(size: Array, lowest: Array, body: int, seed: int) -> list[Rectangle]:
     """All six sides of a printed carton with edges `size` (3,) [m] from its `lowest` corner (3,) in body axes."""
-    sides = {"front": (0, 2), "back": (0, 2), "left": (1, 2), "right": (1, 2), "top": (0, 1), "bottom": (0, 1)}
-    faces = {
-        name: Material(size[a], size[b], "carton", 10 * seed + i, 250, (0.01, 0.03))
-        for i, (name, (a, b)) in enumerate(sides.items())
-    }
-    return cuboid(faces, size, lowest, body)
+    return crate(size, Material(0, 0, "carton", 10 * seed, 250, (0.01, 0.03)), lowest, body)
 
 
 def laboratory(layout: int, floor: float) -> list[Rectangle]:

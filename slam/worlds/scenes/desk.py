@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Rectangle, cuboid, rectangle
+from slam.worlds.geometry import Rectangle, rectangle
 from slam.worlds.options import Option
 from slam.worlds.paths import camera_poses, carried, sway, yaw_pitch_roll
-from slam.worlds.scenes.common import assemble, clock, make_rig
+from slam.worlds.scenes.common import assemble, clock, crate, make_rig
 from slam.worlds.textures.surfaces import Material
 from slam.worlds.world import World
 
@@ -44,18 +44,8 @@ def build(values: Mapping[str, Any]) -> World:
     """The world of these options."""
     stamps, t = clock(values, DURATION)
     rig = make_rig(values, FOCAL * values["width"] / 320)
-    rectangles = _room(values["layout"])
-    return assemble(
-        "desk",
-        "handheld",
-        values,
-        rig,
-        stamps,
-        _orbit(t, stamps, values["layout"]),
-        rectangles,
-        (0.25, 4.0),
-        1000.0,
-    )
+    rectangles, poses = _room(values["layout"]), _orbit(t, stamps, values["layout"])
+    return assemble("desk", "handheld", values, rig, stamps, poses, rectangles, (0.25, 4.0), 1000.0)
 
 
 def _orbit(t: Array, stamps: Array, layout: int) -> Array:
@@ -85,13 +75,8 @@ def _room(layout: int) -> list[Rectangle]:
         rectangle(floor, (-4.5, WALL_Y, 0), (1, 0, 0), (0, -1, 0)),
         rectangle(top, (-0.75, WALL_Y - 0.05, TOP), (1, 0, 0), (0, -1, 0), occludes=True),
     ]
-    sides = {"front": (0, 2), "left": (1, 2), "right": (1, 2), "top": (0, 1)}
     for number, (material, size, place, turn, lift) in enumerate(_THINGS):
         T = pose(yaw_pitch_roll(np.deg2rad(turn), 0, 0), np.array([*place, TOP + lift]))
-        faces = {}
-        for i, (side, (a, b)) in enumerate(sides.items()):
-            if min(size[a], size[b]) > 0.01:
-                seed = 1000 * layout + 10 * number + i
-                faces[side] = Material(size[a], size[b], material, seed, 500, (0.006, 0.02))
-        out += cuboid(faces, size, T_body_box=T)
+        looks = Material(0, 0, material, 1000 * layout + 10 * number, 500, (0.006, 0.02))
+        out += crate(size, looks, T_body_box=T, sides=("front", "left", "right", "top"))
     return out

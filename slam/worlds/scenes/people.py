@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from slam.geometry.se3 import Array, pose
-from slam.worlds.geometry import Rectangle, cuboid
+from slam.worlds.geometry import Rectangle
 from slam.worlds.options import Option
 from slam.worlds.paths import camera_poses, sway, yaw_pitch_roll
 from slam.worlds.scenes import street
-from slam.worlds.scenes.common import assemble, clock, make_rig
+from slam.worlds.scenes.common import assemble, clock, crate, make_rig
 from slam.worlds.textures.surfaces import Material
 from slam.worlds.world import World
 
 TEXT = "a slow drive past parked cars, among cyclists and walkers whose legs swing"
-OPTIONS = (Option("people", 5, "cyclists and walkers", 0, 5),)
+OPTIONS: tuple[Option, ...] = ()
 DEFAULTS = street.DEFAULTS
 
 PACE = 5.0  #: driving speed [m/s]
@@ -47,7 +47,7 @@ def build(values: Mapping[str, Any]) -> World:
     positions = np.column_stack([xy, street.EYE + 0.01 * sway(stamps, rng, 0.8, 2)])
     poses = camera_poses(positions, yaw, 0.003 * sway(stamps, rng, 0.8, 2), 0.002 * sway(stamps, rng, 0.8, 2))
     rectangles, objects = street.surroundings(layout), np.zeros((0, len(t), 4, 4))
-    for number, (cycles, ahead, across, along, aside, pace) in enumerate(PEOPLE[: values["people"]]):
+    for number, (cycles, ahead, across, along, aside, pace) in enumerate(PEOPLE):
         rectangles += _person(cycles, 9000 + 50 * layout + 10 * number, PARTS * number + 1)
         place = _ways(t, ahead, across, along, aside)
         objects = np.concatenate([objects, _limbs(place, np.sin(2 * np.pi * pace * t + number))])
@@ -85,14 +85,6 @@ def _person(cycles: bool, seed: int, body: int) -> list[Rectangle]:
     return out
 
 
-def _clothed(
-    size: tuple[float, float, float], corner: tuple[float, float, float], seed: int, body: int
-) -> list[Rectangle]:
+def _clothed(size: Sequence[float], corner: Sequence[float], seed: int, body: int) -> list[Rectangle]:
     """A box of cloth."""
-    x, y, z = size
-    sides = {"front": (x, z), "back": (x, z), "left": (y, z), "right": (y, z), "top": (x, y), "bottom": (x, y)}
-    faces = {
-        name: Material(wide, high, "carton", 20 * seed + i, 60, (0.02, 0.08))
-        for i, (name, (wide, high)) in enumerate(sides.items())
-    }
-    return cuboid(faces, size, corner, body)
+    return crate(size, Material(0, 0, "carton", 20 * seed, 60, (0.02, 0.08)), corner, body)

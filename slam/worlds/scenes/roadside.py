@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import Rectangle, cuboid
+from slam.worlds.scenes.common import crate
 from slam.worlds.textures.surfaces import Material
 
 
@@ -25,19 +26,16 @@ def car(T: Array, seed: int, body: int = 0) -> list[Rectangle]:
 
 def trunk(T: Array, seed: int) -> list[Rectangle]:
     """The trunk of a tree, a square post; its frame: origin on the ground in its middle."""
-    return _post(T, (0.35, 0.35, 4.0), "wood", seed, 12)
+    return _post(T, (0.35, 0.35, 4.0), "wood", seed)
 
 
 def cabinet(T: Array, seed: int) -> list[Rectangle]:
     """A switch cabinet full of bills; its frame: origin on the ground in its middle."""
-    return _post(T, (1.0, 0.5, 1.4), "poster", seed, 12)
+    return _post(T, (1.0, 0.5, 1.4), "poster", seed)
 
 
-def _post(T: Array, size: tuple[float, float, float], material: str, seed: int, density: float) -> list[Rectangle]:
+def _post(T: Array, size: tuple[float, float, float], material: str, seed: int) -> list[Rectangle]:
     """A box that stands on the ground."""
-    x, y, z = size
-    faces = {
-        name: Material(wide, z, material, 10 * seed + i, density, (0.05, 0.25))
-        for i, (name, wide) in enumerate({"front": x, "back": x, "left": y, "right": y}.items())
-    }
-    return cuboid(faces, size, (-x / 2, -y / 2, 0), 0, T)
+    looks = Material(0, 0, material, 10 * seed, 12, (0.05, 0.25))
+    corner = (-size[0] / 2, -size[1] / 2, 0)
+    return crate(size, looks, corner, T_body_box=T, sides=("front", "back", "left", "right"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -108,11 +109,6 @@ def _carton(size: tuple[int, int], rng: np.random.Generator, density: float) -> 
     return canvas
 
 
-def _board(size: tuple[int, int], rng: np.random.Generator, density: float) -> np.ndarray:
-    """A white board."""
-    return paint.tinted(1 + 0.01 * paint.clouds(size, rng, 0.2 * density), (205.0, 212.0, 215.0))
-
-
 def _no_spot(canvas: np.ndarray, x: float, y: float, diameter: float, rng: np.random.Generator) -> None:
     """Nothing."""
 
@@ -157,7 +153,7 @@ RECIPES = {
     "ceiling": Recipe(_ceiling, _no_spot, 0.5),
     "door_wall": Recipe(_door_wall, _fleck),
     "carton": Recipe(_carton, _print),
-    "board": Recipe(_board, _print),
+    "board": Recipe(things.board, _print),
     "wood": Recipe(things.wood, _fleck),
     "pinboard": Recipe(things.pinboard),
     "cover": Recipe(things.cover, _print),
@@ -169,9 +165,9 @@ RECIPES = {
     "road": Recipe(outdoors.road, _fleck),
     "road_across": Recipe(outdoors.road_across, _fleck),
     "car_side": Recipe(outdoors.car_side),
-    "car_front": Recipe(outdoors.car_front),
-    "car_back": Recipe(outdoors.car_back),
-    "car_top": Recipe(outdoors.car_top),
+    "car_front": Recipe(partial(outdoors.car_end, lamp=(235.0, 240.0, 240.0))),
+    "car_back": Recipe(partial(outdoors.car_end, lamp=(45.0, 45.0, 200.0))),
+    "car_top": Recipe(outdoors.paintwork),
     "cabin_side": Recipe(outdoors.cabin_side),
     "cabin_end": Recipe(outdoors.cabin_end),
     "field": Recipe(outdoors.field, _fleck),

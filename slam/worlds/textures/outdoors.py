@@ -102,8 +102,7 @@ def _door(canvas: np.ndarray, size: Size, density: float, rng: np.random.Generat
 def road(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     """A street running down the picture: asphalt, kerbs, pavements, a dashed line and a few dark patches."""
     height, width = size
-    light = 1 + 0.05 * paint.clouds(size, rng, 2.0 * density, 4) + 0.06 * paint.clouds(size, rng, 2.0, 1)
-    canvas = paint.tinted(light, (88.0, 86.0, 85.0))
+    canvas = asphalt(size, rng, density)
     for left, right in ((0.0, 1.4), (width / density - 1.9, width / density)):
         x0, x1 = round(left * density), round(right * density)
         stones = 1 + 0.05 * paint.clouds((height, x1 - x0), rng, 0.3 * density)
@@ -131,7 +130,7 @@ def road_across(size: Size, rng: np.random.Generator, density: float) -> np.ndar
 
 def car_side(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     """The side of a car below its windows: doors, handles and wheels."""
-    canvas = _paintwork(size, rng, density)
+    canvas = paintwork(size, rng, density)
     height, width = size
     for x in (0.36, 0.60, 0.82):
         paint.bar(canvas, (x * width, 0, 0.02 * density, 0.8 * height), (25.0, 25.0, 28.0))
@@ -144,19 +143,9 @@ def car_side(size: Size, rng: np.random.Generator, density: float) -> np.ndarray
     return canvas
 
 
-def car_front(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
-    """The front of a car below its windscreen."""
-    return _car_end(size, rng, density, (235.0, 240.0, 240.0))
-
-
-def car_back(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
-    """The back of a car below its rear window."""
-    return _car_end(size, rng, density, (45.0, 45.0, 200.0))
-
-
-def _car_end(size: Size, rng: np.random.Generator, density: float, lamp: Colour) -> np.ndarray:
+def car_end(size: Size, rng: np.random.Generator, density: float, lamp: Colour) -> np.ndarray:
     """The front or the back of a car below its windows: lamps, number plate, bumper."""
-    canvas = _paintwork(size, rng, density)
+    canvas = paintwork(size, rng, density)
     height, width = size
     for x in (0.05, 0.77):
         paint.bar(canvas, (x * width, 0.18 * height, 0.18 * width, 0.2 * height), lamp)
@@ -172,7 +161,7 @@ def _car_end(size: Size, rng: np.random.Generator, density: float, lamp: Colour)
 
 def cabin_side(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     """The windows along a car's side."""
-    canvas = _paintwork(size, rng, density)
+    canvas = paintwork(size, rng, density)
     height, width = size
     for x0, x1 in ((0.04, 0.46), (0.50, 0.92)):
         paint.bar(canvas, (x0 * width, 0.18 * height, (x1 - x0) * width, 0.75 * height), (75.0, 65.0, 55.0))
@@ -182,7 +171,7 @@ def cabin_side(size: Size, rng: np.random.Generator, density: float) -> np.ndarr
 
 def cabin_end(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     """A car's windscreen or rear window."""
-    canvas = _paintwork(size, rng, density)
+    canvas = paintwork(size, rng, density)
     height, width = size
     paint.bar(canvas, (0.07 * width, 0.15 * height, 0.86 * width, 0.8 * height), (75.0, 65.0, 55.0))
     paint.bar(canvas, (0.15 * width, 0.25 * height, 0.2 * width, 0.3 * height), (130.0, 120.0, 110.0))
@@ -190,13 +179,8 @@ def cabin_end(size: Size, rng: np.random.Generator, density: float) -> np.ndarra
     return canvas
 
 
-def car_top(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
-    """A car's roof or bonnet."""
-    return _paintwork(size, rng, density)
-
-
-def _paintwork(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
-    """Car paint; its colour is the first thing drawn, so that all sides of a car have the same."""
+def paintwork(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
+    """Car paint (roof, bonnet); its colour is drawn first, so that all sides of a car have the same."""
     colour = _PAINTS[int(rng.integers(len(_PAINTS)))]
     light = 1.05 - 0.25 * np.linspace(0, 1, size[0], dtype=np.float32)[:, None]
     return paint.tinted(light + 0.02 * paint.clouds(size, rng, 0.3 * density), colour)

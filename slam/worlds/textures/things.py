@@ -150,6 +150,11 @@ def wood(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
     return paint.wood(size, rng, (105.0, 150.0, 190.0), density)
 
 
+def board(size: Size, rng: np.random.Generator, density: float) -> np.ndarray:
+    """A white board."""
+    return paint.tinted(1 + 0.01 * paint.clouds(size, rng, 0.2 * density), (205.0, 212.0, 215.0))
+
+
 def sign_board(area: Area, signs: Array, seed: int, density: float) -> np.ndarray:
     """A white board with signs: discs and squares with a pattern of their own around and on them.
 
@@ -161,7 +166,7 @@ def sign_board(area: Area, signs: Array, seed: int, density: float) -> np.ndarra
     """
     rng = np.random.default_rng([seed, 65])
     size = round(area[0] * density), round(area[1] * density)
-    canvas = paint.tinted(1 + 0.01 * paint.clouds(size, rng, 0.2 * density), (205.0, 212.0, 215.0))
+    canvas = board(size, rng, density)
     for x, y, diameter in signs * density:
         dark = rng.random() < 0.7
         ground, ink = ((215.0,) * 3, (30.0,) * 3) if dark else ((45.0,) * 3, (225.0,) * 3)

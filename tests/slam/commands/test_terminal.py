@@ -110,7 +110,7 @@ def test_tables_fit_on_80_columns_and_are_whole(monkeypatch, capsys):
 
     monkeypatch.setattr("slam.commands.display._console", Console(width=80))
     summary = {
-        "sequence": "aisle?frames=1500&speed=2&box=1&noise=3&width=640&height=480&layout=7&exposure=0.2&shutter=0.5",
+        "sequence": "aisle?frames=1500&speed=2&box=1&noise=3&width=640&height=480&layout=7&detect=0.8&shutter=0.5",
         "backend": "smoother",
         "frames": 1500,
         "status": {"failed": 1, "lost": 120, "predicted": 25, "started": 1, "tracked": 1353},

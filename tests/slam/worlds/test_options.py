@@ -23,7 +23,8 @@ def test_an_unknown_world_is_answered_with_the_known_ones():
 
 def test_an_unknown_key_is_answered_with_the_known_ones():
     with pytest.raises(
-        ConfigurationError, match=r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: bare, .*seed"
+        ConfigurationError,
+        match=r"world 'aisle' has no option 'sead' \(did you mean 'seed'\?\); known: baseline, .*seed",
     ):
         worlds.open_world("aisle?sead=3")
 

@@ -172,7 +172,7 @@ def test_object_image_is_where_the_object_is():
 
 
 def test_no_pixel_of_a_room_is_without_a_surface():
-    for query in ("aisle?return=1", "desk", "field", "boxes"):
+    for query in ("aisle", "desk", "field", "boxes"):
         sequence = open_world(query)
         for k in np.linspace(0, len(sequence) - 1, 5).astype(int):
             assert (sequence.depth(k) > 0).all(), query
@@ -200,8 +200,6 @@ def test_options_of_the_camera():
     moving = open_world("box?frames=400").object_ids(75) > 0
     change = np.abs(blurred - plain)
     assert change[moving].mean() > 3 * change[~moving].mean(), "the box moves, the camera hardly does"
-    wander = [open_world(f"box?noise=0&exposure={e}").frame(30).left.mean() for e in (0, 0.3)]
-    assert abs(wander[1] / wander[0] - 1) > 0.05
     colour = open_world("box?frames=2&colour=1").frame(0).left
     assert colour.shape == (240, 320, 3)
     assert np.ptp(colour.astype(int), axis=2).mean() > 5

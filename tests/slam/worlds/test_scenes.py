@@ -49,19 +49,10 @@ def test_the_aisle_is_paper_a_s():
     assert (forward[:, 0] > 0.3).all() and (forward[:, 1] > 0.3).all(), "along the shelves and towards them"
 
 
-def test_the_aisle_there_and_back_ends_where_it_began_and_looks_at_the_same_shelves():
-    sequence = open_world("aisle?return=1")
-    truth = sequence.ground_truth
-    assert len(truth) == 2 * 1524
-    assert abs(truth.positions[-1, 0] - truth.positions[0, 0]) < 0.1
-    assert (truth.poses[:, 1, 2] > 0.3).all()
-
-
 def test_bare_wall_starves_the_detector():
-    full, bare = open_world("aisle?bare=0"), open_world("aisle")
-    counts = [[len(s.simulate(k).features) for k in range(850, 1150, 50)] for s in (full, bare)]
-    assert max(np.array(counts[1]) / counts[0]) < 0.9
-    assert min(np.array(counts[1]) / counts[0]) < 0.5
+    sequence = open_world("aisle")
+    counts = [len(sequence.simulate(k).features) for k in range(0, len(sequence), 50)]
+    assert max(counts[20:25]) < 0.7 * np.median(counts), "the camera passes the wall in frames 1000 to 1200"
 
 
 def test_speed_shortens_the_recording_but_not_the_way():
@@ -156,7 +147,6 @@ def test_the_legs_of_people_swing_about_their_hips():
     assert 0.4 < rotation_angle(hips[:, :3, :3]).max() < 0.5
     assert np.allclose((inverse(trunk) @ right)[:, :3, :3], np.swapaxes(hips[:, :3, :3], 1, 2)), "legs alternate"
     assert np.linalg.norm(trunk[-1, :3, 3] - trunk[0, :3, 3]) == pytest.approx(1.4 * 13.9, rel=0.01)
-    assert len(open_world("people?people=0").objects(0).ids) == 0
 
 
 def test_another_layout_is_another_world_and_the_same_layout_is_the_same():
