@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from experiments.tables import markdown, write_json
 from frontends import create
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures, StereoFrame
-from slam.evaluation.association_truth import AssociationScore, SurfacePoints
+from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
@@ -33,6 +34,25 @@ from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
 from slam.sequences import Sequence, open_sequence
+
+
+@dataclass(frozen=True)
+class AssociationScore:
+    """Counts of associations.
+
+    Attributes:
+        right: the feature lies where the landmark's surface point is.
+        wrong: it lies elsewhere, or the landmark was first seen on something that moves.
+    """
+
+    right: int
+    wrong: int
+
+    @property
+    def precision(self) -> float:
+        """Share of the right ones; NaN where there is none."""
+        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
+
 
 HEADER = (
     "back end", "tracked", "mean error [cm]", "peak [cm]", "end [cm]", "final mean [cm]", "final peak [cm]",

@@ -15,6 +15,7 @@ import numpy as np
 
 import backends
 from experiments.cramer_rao import pose_bounds
+from experiments.simulated_recording import true_recording, with_mismatches
 from slam.data import Observations, Prediction
 from slam.evaluation.metrics import nees, pose_residuals
 from slam.geometry import se3
@@ -22,7 +23,6 @@ from slam.geometry.se3 import Array
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.registry import ONLINE
 from slam.run.recorded import Recording
-from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.worlds import open_world
 from slam.worlds.sequence import WorldSequence
 

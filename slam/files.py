@@ -89,56 +89,56 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT, error: type[SlamError] 
     return read_bytes(path, limit, error).decode("utf-8-sig", errors="replace")
 
 
-def read_object(path: str | Path, error: type[SlamError] = SlamError) -> dict[str, Any]:
+def read_object(path: str | Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
-        SlamError: of type `error`, where the file cannot be read, or holds something else.
+        SlamError: the file cannot be read, or holds something else.
     """
-    text = read_text(path, _JSON_LIMIT, error)
+    text = read_text(path, _JSON_LIMIT, SlamError)
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as fault:
-        raise error(f"{path}: no valid JSON: {fault}") from fault
+        raise SlamError(f"{path}: no valid JSON: {fault}") from fault
     if not isinstance(tree, dict):
-        raise error(f"{path}: must hold an object, not a {type(tree).__name__}")
+        raise SlamError(f"{path}: must hold an object, not a {type(tree).__name__}")
     return tree
 
 
-def read_numbers(path: str | Path, columns: int, error: type[SlamError] = SlamError) -> Array:
+def read_numbers(path: str | Path, columns: int) -> Array:
     """The rows of a CSV file below its header (N, columns), NaN for an empty cell.
 
     Raises:
-        SlamError: of type `error`, where the file cannot be read, or a row has another number of cells, or one that is
-            no number up to `_LARGEST`.
+        SlamError: the file cannot be read, or a row has another number of cells, or one that is no number up to
+            `_LARGEST`.
     """
     try:
         rows = [[float(cell or "nan") for cell in line.split(",")] for line in read_text(path).splitlines()[1:]]
         table = np.array(rows, float).reshape(len(rows), columns)
     except ValueError as fault:
-        raise error(f"{path}: no table of {columns} columns of numbers: {fault}") from fault
+        raise SlamError(f"{path}: no table of {columns} columns of numbers: {fault}") from fault
     if (np.abs(table) > _LARGEST).any():
-        raise error(f"{path}: a number is far too large")
+        raise SlamError(f"{path}: a number is far too large")
     return table
 
 
-def require_content(path: Path, error: type[SlamError] = SequenceError) -> None:
+def require_content(path: Path) -> None:
     """Raise where a path, for a library that opens it by itself, is no regular file with something in it.
 
     Raises:
-        SlamError: of type `error`.
+        SequenceError: there is none.
     """
     try:
         status = path.stat()
     except OSError as fault:
-        raise error(f"{path}: {reason(fault)}") from fault
+        raise SequenceError(f"{path}: {reason(fault)}") from fault
     except ValueError as fault:
-        raise error(f"{path}: no possible file name") from fault
+        raise SequenceError(f"{path}: no possible file name") from fault
     if not stat.S_ISREG(status.st_mode):
-        raise error(f"{path}: not a regular file")
+        raise SequenceError(f"{path}: not a regular file")
     if not status.st_size:
-        raise error(f"{path}: the file is empty")
-    require_utf8(path, error)
+        raise SequenceError(f"{path}: the file is empty")
+    require_utf8(path, SequenceError)
     note_input(path)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -34,24 +33,6 @@ class TrueWorld(Protocol):
     def object_ids(self, k: int) -> np.ndarray:
         """Object of every pixel of frame k's left image (H, W), 0 for the still world."""
         ...
-
-
-@dataclass(frozen=True)
-class AssociationScore:
-    """Counts of associations.
-
-    Attributes:
-        right: the feature lies where the landmark's surface point is.
-        wrong: it lies elsewhere, or the landmark was first seen on something that moves.
-    """
-
-    right: int
-    wrong: int
-
-    @property
-    def precision(self) -> float:
-        """Share of the right ones; NaN where there is none."""
-        return self.right / (self.right + self.wrong) if self.right + self.wrong else float("nan")
 
 
 class SurfacePoints:

@@ -97,11 +97,6 @@ class SegmentErrors:
         """Mean over all stretches of all lengths [%]; NaN where there is none."""
         return float(np.mean(self.translation)) if len(self.lengths) else float("nan")
 
-    def of_length(self, length: float) -> SegmentErrors:
-        """The stretches of one length."""
-        rows = self.lengths == length
-        return SegmentErrors(self.lengths[rows], self.translation[rows], self.rotation[rows])
-
 
 # ------------------------------------------------------------------------------------------- common stamps
 
@@ -210,12 +205,10 @@ def relative_errors(estimate: Trajectory, truth: Trajectory, delta: int = 1, ove
     return PathErrors(*_motion_errors(estimate, truth, first, first + delta))
 
 
-def segment_errors(
-    estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None, step: int = 10
-) -> SegmentErrors:
+def segment_errors(estimate: Trajectory, truth: Trajectory, lengths: Sequence[float] | None = None) -> SegmentErrors:
     """Errors over stretches of the true path of given lengths, as KITTI's odometry benchmark has them.
 
-    From every `step`-th frame a stretch reaches to the first frame that lies farther along the path than its length;
+    From every tenth frame a stretch reaches to the first frame that lies farther along the path than its length;
     starts from which the path is too short give none. `lengths` defaults to `segment_lengths` of the path.
 
     Raises:
@@ -223,10 +216,10 @@ def segment_errors(
     """
     _require_pairs(estimate, truth, 1)
     lengths = segment_lengths(truth.length) if lengths is None else lengths
-    if step < 1 or any(not length > 0 for length in lengths):
-        raise TrajectoryError(f"segments: lengths and step must be positive, got {list(lengths)} and {step}")
+    if any(not length > 0 for length in lengths):
+        raise TrajectoryError(f"segments: lengths must be positive, got {list(lengths)}")
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).cumsum()])
-    starts = np.arange(0, len(truth), step)
+    starts = np.arange(0, len(truth), 10)
     rows = []
     for length in lengths:
         ends = np.searchsorted(along, along[starts] + length, side="right")

@@ -165,9 +165,9 @@ class PinholeCamera:
             inside = (u >= margin) & (v >= margin)
             return inside & (u <= self.width - 1 - margin) & (v <= self.height - 1 - margin)
 
-    def in_view(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    def in_view(self, points: Array) -> NDArray[np.bool_]:
         """Which points (N, 3) are in the angle of view: in front and inside the image (paper A, Fig. 3)."""
-        return self.in_image(self.project(points), margin)
+        return self.in_image(self.project(points))
 
     def _distort(self, ab: Array, jacobian: bool) -> tuple[Array, Array | None]:
         """Distorted normalised coordinates (N, 2) and, if asked for, the Jacobian (N, 2, 2).

@@ -22,7 +22,7 @@ def known_features(view: MapView, landmarks: LandmarkTable, features: StereoFeat
     Positions are the same if they are within `same_distance`, or differ in depth by no more than stereo's uncertainty.
     """
     out = np.zeros(len(features), bool)
-    feature, rows = _near_landmarks(features.uv_left, view, config)
+    feature, rows = _near_landmarks(features.uv_left, view)
     offset = view.points[feature] - view.local[rows]
     along = np.abs(offset[:, 2]) < SIGMAS * view.depth_sigma[feature]
     same = along | (np.linalg.norm(offset, axis=1) < config.same_distance)
@@ -35,7 +35,7 @@ def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig
     """Which landmarks in view (N,) duplicate another one that was seen more often, or as often and is older."""
     out = np.zeros(len(landmarks), bool)
     shown = np.flatnonzero(view.in_image)
-    one, other = _near_landmarks(view.uv_left[shown], view, config)
+    one, other = _near_landmarks(view.uv_left[shown], view)
     one = shown[one]
     less = (landmarks.seen[one] < landmarks.seen[other]) | (
         (landmarks.seen[one] == landmarks.seen[other]) & (one > other)
@@ -47,7 +47,7 @@ def doubled_landmarks(view: MapView, landmarks: LandmarkTable, config: MapConfig
     return out
 
 
-def _near_landmarks(uv: Array, view: MapView, config: MapConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _near_landmarks(uv: Array, view: MapView) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pairs of pixels (P, 2) and landmarks in view that are near each other in the image, as rows of both."""
     shown = np.flatnonzero(view.in_image)
     if not len(uv) or not len(shown):

@@ -13,6 +13,7 @@ from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.solver import SolverError
+from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors
 from slam.geometry import se3
@@ -20,7 +21,6 @@ from slam.geometry.trajectory import Trajectory
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.run.replay import replay
-from slam.run.simulated_recording import true_recording
 from slam.system import StereoSlam
 from slam.worlds import open_world
 from tests.backends.scenes import RIG, path, run, scene, step

@@ -11,11 +11,11 @@ import zipfile
 import numpy as np
 import pytest
 
+from experiments.simulated_recording import true_recording
 from slam.archives import unpack
 from slam.errors import SequenceError, SlamError
 from slam.mapping.map_io import SavedMap, decode, encode
 from slam.run.recording import load_recording, save_recording
-from slam.run.simulated_recording import true_recording
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
 from tests.fuzz.saved import _map, hostile_header

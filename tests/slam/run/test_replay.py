@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import slam
+from experiments.simulated_recording import true_recording, with_mismatches
 from slam.calibration.posterior import Solution
 from slam.data import FrameStatus, Observations
 from slam.errors import MeasurementError, SequenceError
@@ -14,7 +15,6 @@ from slam.models import models_for
 from slam.run.recorded import RecordedRows, Recording, record
 from slam.run.recording import load_recording, save_recording
 from slam.run.replay import replay
-from slam.run.simulated_recording import true_recording, with_mismatches
 from slam.system import StereoSlam
 from tests.backends.fixed_map import FixedMapBackend
 

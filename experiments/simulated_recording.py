@@ -20,12 +20,9 @@ _LEAST_SIGMA = 0.01  # assumed pixel noise where there is none [px]: with none a
 
 def true_recording(
     sequence: WorldSequence,
-    start: int = 0,
-    stop: int | None = None,
     *,
     models: EstimatorModels | None = None,
     config: MapConfig | None = None,
-    false_stereo: bool = False,
     keep: int | None = None,
 ) -> Recording:
     """What a back end is given where every feature is known to be of its landmark.
@@ -35,17 +32,13 @@ def true_recording(
 
     Args:
         sequence: the recorded world.
-        start: first frame.
-        stop: end of the frames, itself left out; None for all.
         models: noise, priors and motion; default: those of the sequence's kind, with its pixel noise.
         config: which features become landmarks.
-        false_stereo: take also true features whose right pixel is false.
         keep: landmarks that were not seen for so many frames leave the map; None: they stay for ever.
     """
     if models is None:
         models = replace(models_for(sequence.kind), pixel_sigma=max(sequence.values["sigma"], _LEAST_SIGMA))
-    end = len(sequence) if stop is None else min(stop, len(sequence))
-    frames = _frames(sequence, range(start, end), models, config or MapConfig(), false_stereo, keep)
+    frames = _frames(sequence, models, config or MapConfig(), keep)
     return Recording.of(frames, sequence.rig, models, sequence.name, sequence.ground_truth)
 
 
@@ -76,18 +69,13 @@ def _deranged(rows: IdArray, rng: np.random.Generator) -> IdArray:
 
 
 def _frames(
-    sequence: WorldSequence,
-    numbers: range,
-    models: EstimatorModels,
-    config: MapConfig,
-    false_stereo: bool,
-    keep: int | None,
+    sequence: WorldSequence, models: EstimatorModels, config: MapConfig, keep: int | None
 ) -> Iterator[RecordedFrame]:
     """What is given, frame by frame."""
     last_seen: dict[int, int] = {}
-    for k in numbers:
+    for k in range(len(sequence)):
         seen = sequence.simulate(k)
-        good = (seen.ids >= 0) & (seen.objects == 0) & (false_stereo | ~seen.false_stereo)
+        good = (seen.ids >= 0) & (seen.objects == 0) & ~seen.false_stereo
         known = good & np.array([i in last_seen for i in seen.ids.tolist()], bool)
         occupied = seen.features.uv_left[known]
         new = new_landmarks(seen.features, good & ~known, occupied, sequence.rig, models.pixel_sigma, config)
