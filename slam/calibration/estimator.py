@@ -34,8 +34,6 @@ _FEW = 6  # with fewer pairs, an incomplete one counts provisionally
 _LATER = 1.25  # cost: an incomplete pair is solved again after so many times the frames: parallax grows no faster
 _MOST_ROWS = 250  # cost: features of a frame whose rows are used: more add little
 _MOST_FEATURES = 1000  # cost: of a view, the strongest ones; half of the usual 800 made drives worse by a half
-_KNOWN = 0.5  # pixels are first corrected once the prior variance of disparities has fallen to this share
-_LIKELIER = 1.0  # least gain in log likelihood by the correction: that of one fitted parameter (Akaike)
 _CONFIGURED = 4  # number of pairs that the configured noise counts for
 _RARER = 20  # cost: after this many pairs every second frame is used, after twice as many every third, and so on
 _TURN = 0.05  # but at least one per rotation by this angle [rad]: turns are rare, and they alone show the focal length
@@ -119,7 +117,7 @@ class SelfCalibration:
         if not self.config.enabled:
             return None
         variance = _mean_variance(self._far, self._solution.inner)
-        known = self._kept or (variance <= _KNOWN * self._unknown and self._motion_agrees())
+        known = self._kept or (variance <= 0.5 * self._unknown and self._motion_agrees())
         mean = self._solution.mean if known else np.zeros_like(self._solution.mean)
         step = mean - self.applied.parameters
         if not step.any():
@@ -136,7 +134,7 @@ class SelfCalibration:
         if not self.pairs and self._open is None:
             return False
         motion, mean = self._moved(), self._solution.mean
-        return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > _LIKELIER)
+        return bool(motion.e @ mean - 0.5 * mean @ motion.S @ mean > 1)  # a fitted parameter's gain (Akaike)
 
     def correct(self, features: StereoFeatures) -> StereoFeatures:
         """Features with the applied correction."""

@@ -22,7 +22,6 @@ _ITERATIONS = 20  # numerics: of Gauss-Newton at most
 _CONVERGED = 1e-3  # numerics: last change of a predicted point [px]; at 0.02 focal lengths were wrong by percents
 _NEARLY = 3e-3  # numerics: the same after the last iteration: in some pairs single points oscillate
 _EXACT = 1e-3  # numerics: least noise of pixels and disparities [px]
-_LEAST_NOISE = 0.2  # least noise, as a part of the configured one
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +105,7 @@ def fit_motion(first: Array, second: Array, R: Array, t: Array, focal: float, no
         distance = np.einsum("ni,ni->n", at.residual, at.residual)
         if not np.isfinite(distance).all():
             return None
-        weights = student_weights(distance, 3, _LEAST_NOISE)
+        weights = student_weights(distance, 3, 0.2)  # no less than a fifth of the configured noise
         J = at.motion.reshape(-1, 6)
         weighted = np.repeat(weights, 3) * J.T
         normal = weighted @ J

@@ -52,8 +52,6 @@ _SCALES = (0.02, 0.1, 0.3, 1.0)
 _OFFSETS = (0.03, 0.3, 1.0)  # the same of an offset of the disparity alone
 _FOCALS = (0.1, 1.0)  # the same of a common error of the focal lengths
 
-_NEAR = 0.05  # disparity [focal lengths] of points that are near
-
 
 @dataclass(frozen=True, eq=False)
 class Prior:
@@ -137,7 +135,7 @@ def systematic_variance(model: RigModel, error: float) -> Array:
     surfaces and moving shadows are matched with such a bias; it does not average out.
     """
     far = model.far()
-    near = far + np.array([0.0, 0.0, _NEAR * model.focal])
+    near = far + np.array([0.0, 0.0, 0.05 * model.focal])
     points = np.concatenate([far, near])
     effect = np.square(model.field(points)[:, 2]) + np.square(model.vertical(points))
     return np.asarray(error**2 / effect.mean(axis=0))

@@ -42,13 +42,9 @@ if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph
 
 _NEARBY = 4  # cost: keyframes compared because they are near the path, besides those that look alike
-_CONSISTENCY = 2.0  # times the usual reprojection error: a keyframe's points have the depth of one frame alone
 _VERIFIED = 3  # cost: keyframes whose geometry is checked, of those that are compared in detail
 _DIMENSIONS = 6  # fixed: mean of χ² of a pose
-_PATIENCE = 3  # keyframes within which another one must confirm a loop
 _MINIMAL = 6  # least number of features of a keyframe: enough for a pose with a covariance
-_UNKNOWN_WAY = 1000.0  # path length assumed between an earlier run and this one, or of a kidnapping [m]
-_UNKNOWN_MOTION = 1.0, 100.0  # standard deviations of that unknown motion [rad], [m]
 _LARGEST = 6e4  # guard: largest number in a keyframe's descriptors, which are half floats
 _HYPOTHESES = 300  # cost: poses tried, so that with a quarter of the matches right one place in a hundred is missed
 
@@ -94,7 +90,7 @@ class LoopCloser:
         self._config = config
         self._sigma, self._max_depth_error = models.pixel_sigma, max_depth_error
         self._file = FeatureFile() if config.on_disk else None
-        lax = _CONSISTENCY * association.consistency_sigmas
+        lax = 2 * association.consistency_sigmas  # a keyframe's points have the depth of one frame alone
         association = replace(association, wide_hypotheses=_HYPOTHESES, consistency_sigmas=lax)
         self._localizer = Localizer(self._rig, association, models)
 
@@ -200,10 +196,11 @@ class LoopCloser:
             return None
         T, P = step.estimate.T_world_left, step.estimate.covariance - step.common.covariance
         travelled = 0.0
-        added: Array = np.diag(np.repeat(_UNKNOWN_MOTION, 3) ** 2)
+        # Between an earlier run and this one, or in a kidnapping, the camera went 1 km, anywhere within 100 m, 1 rad.
+        added: Array = np.diag(np.repeat([1.0, 100.0], 3) ** 2)
         if len(atlas):
             last = atlas.keyframes[-1]
-            travelled = last.travelled + _UNKNOWN_WAY
+            travelled = last.travelled + 1000.0
         gaps = atlas.gaps[atlas.restarts :]
         if len(atlas) > atlas.prior_count and not gaps:
             last = atlas.keyframes[-1]
@@ -387,7 +384,7 @@ class LoopCloser:
 
     def _agree(self, chain: Chain, before: Loop, loop: Loop) -> bool:
         """Whether two loops, seen by keyframes shortly after each other, are consistent with each other."""
-        if loop.second - before.second > _PATIENCE:
+        if loop.second - before.second > 3:  # keyframes
             return False
         T_old, P_old = chain.motion(before.first, loop.first)
         T_new, P_new = chain.motion(before.second, loop.second)

@@ -17,9 +17,6 @@ from slam.mapping.relocalizer import nowhere
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere
 from slam.tracking.localizer import Localizer
 
-#: Shift of features over the surface when seen from another viewpoint, common to all features of a place [px].
-_SLIDE = 1.0
-
 _ROUNDS = 5  # numerics: most iterations of least squares
 _CONVERGED = 1e-6  # numerics: step [rad], [m]
 
@@ -81,7 +78,7 @@ def verify(
         T, noise = refined_pose(rig, points[ids], measured, found.T_world_left, localizer.pixel_sigma)
     except np.linalg.LinAlgError:  # points that fix no pose, such as those of a corrupt map
         return None
-    slide = _SLIDE / rig.left.fu
+    slide = 1 / rig.left.fu  # seen from another viewpoint, all features of a place shift by a pixel on the surface
     covariance = noise + np.diag(np.repeat([slide, slide * keyframe.depth], 3) ** 2)
     return Verified(keyframe, T, covariance, noise, Matches(ids.astype(np.intp), seen))
 
