@@ -127,8 +127,8 @@ def test_tables_fit_on_80_columns_and_are_whole(monkeypatch, capsys):
 def test_names_are_listed_first_and_options_on_request():
     names, options = invoke("list").output, invoke("list", "--options").output
     assert "synthetic:aisle" in names
-    assert "return=0" not in names
-    assert "return=0" in options
+    assert "box=0" not in names
+    assert "box=0" in options
 
 
 def test_lengths_below_a_metre_are_in_millimetres_and_bodies_are_in_the_table(capsys):
