@@ -136,6 +136,15 @@ class Backend(Protocol):
 
 
 @runtime_checkable
+class RestingBackend(Protocol):
+    """Additional method of a back end that can be told that the camera stands (a zero-velocity update)."""
+
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        """As `Backend.predict`, but the camera has not moved since the last stamp, and its velocity is zero."""
+        ...
+
+
+@runtime_checkable
 class ObjectBackend(Protocol):
     """Additional methods of a back end that estimates moving objects; back ends without them are given none.
 

@@ -7,7 +7,7 @@ coordinates does not depend on that choice: it takes a point of the body from it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,3 +158,7 @@ class MotionLabels:
     moving: NDArray[np.intp]
     undecided: NDArray[np.intp]
     landmarks: IdArray
+
+    def with_undecided(self, rows: NDArray[np.intp]) -> MotionLabels:
+        """The labels with other features undecided as well, unless they move."""
+        return replace(self, undecided=np.setdiff1d(np.union1d(self.undecided, rows), self.moving))

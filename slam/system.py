@@ -18,7 +18,7 @@ from slam.extraction import Extracted, Extractor, as_frame
 from slam.geometry.arrays import isin
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
-from slam.interfaces import Backend, Frontend
+from slam.interfaces import Backend, Frontend, RestingBackend
 from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas, TrackingGap
 from slam.mapping.atlas.loop_closer import LoopCloser
@@ -40,6 +40,7 @@ from slam.tracking.input_warnings import REPEATED
 from slam.tracking.localizer import LandmarkMatches, Localizer
 from slam.tracking.patch_alignment import Aligner, PatchAnchors
 from slam.tracking.protocol_check import require_estimate, require_positions, require_prediction, require_report
+from slam.tracking.standing import Standing
 from slam.tracking.state import TrackingState
 from slam.version import __version__
 
@@ -238,17 +239,20 @@ class StereoSlam:
         if repeated:
             features = StereoFeatures.empty(features.stamp, features.descriptors.shape[1], features.threshold)
         with stages.stage("predict"):  # the motion model (paper A, Eq. 11)
-            revision, prediction, dt = self._revise(), *self._predict(features.stamp)
+            standing = self._last.standing.after(self.rig, self.config.models.pixel_sigma, features)
+            revision, prediction, dt = self._revise(), *self._predict(features.stamp, standing)
         with stages.stage("associate"):  # landmarks in the angle of view, in size-variable windows (paper A, IV)
-            seen = self._associate(prediction, features, index)
+            seen = self._associate(prediction, features, standing, index)
         with stages.stage("update"):  # the measurement of the landmarks
             report, left_out, state = self._update(seen, dt)
-            if self._needs_new_map(state):
+            if not seen.standing.stands and self._needs_new_map(state):
                 seen, report, left_out = self._begin_new_map(features, index)
         with stages.stage("estimate"):
             estimate = self._estimate_pose(report)
         with stages.stage("objects"):  # what moves, and the moving bodies' poses (paper B, 3)
-            labels = self.objects.classify(seen.features, estimate, seen.matches.landmark_of(len(seen.features)))
+            landmark = seen.matches.landmark_of(len(seen.features))
+            labels = self.objects.classify(seen.features, estimate, landmark, seen.standing.witnesses)
+            labels = labels.with_undecided(seen.standing.leaving(len(seen.features)))
             objects = self.objects.update(self.backend, seen.features)
         with stages.stage("manage"):  # count, erase bad landmarks, add new ones (paper A, IV)
             step = Step(
@@ -262,34 +266,65 @@ class StereoSlam:
         result = frame_result(step, change, objects, self._last.mapped, revision, stages.milliseconds, atlas, common)
         # Commit the step in one statement, so that an interrupt finds all of it done or nothing.
         self._last, self.landmarks, self.atlas, self._stages = (
-            self._last.after(step, len(change.added), anchors, len(self.restarted) > backends), change.landmarks, atlas,
-            Stages(),
+            self._last.after(step, len(change.added), anchors, seen.standing, len(self.restarted) > backends),
+            change.landmarks, atlas, Stages(),
         )  # fmt: skip
         return result
 
-    def _predict(self, stamp: float) -> tuple[Prediction, float]:
+    def _predict(self, stamp: float, standing: Standing) -> tuple[Prediction, float]:
         """The back end's prediction for a time, and the time since the last one [s]."""
-        prediction = self.backend.predict(stamp)
+        if standing.stands and isinstance(self.backend, RestingBackend):
+            prediction = self.backend.predict_at_rest(stamp)
+        else:
+            prediction = self.backend.predict(stamp)
         require_prediction(prediction, self.backend)
         dt, self._stamp = stamp - self._stamp, stamp
         return prediction, dt
 
-    def _associate(self, prediction: Prediction, features: StereoFeatures, index: int) -> AssociatedFrame:
+    def _associate(
+        self, prediction: Prediction, features: StereoFeatures, standing: Standing, index: int
+    ) -> AssociatedFrame:
         """Match landmarks with features, and align the features if the front end can."""
         corrected = self.calibration.correct(features)
         landmarks = self.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
-        landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
+        if standing.stands:
+            standing, matches = self._at_rest(standing, prediction, landmarks, corrected, index)
+        if not standing.stands:
+            landmarks, prediction, matches = self._localize(prediction, landmarks, corrected, index)
         anchors, places = self._last.anchors, self.backend.positions
         aligned = self._aligner.align(self.frontend, anchors, features, matches, landmarks, places)
         if aligned.features is not features:
             corrected = self.calibration.correct(aligned.features)
         corrected = replace(corrected, images=None)
+        held = self._moving(corrected, landmarks, matches, prediction, standing, index)
+        rows = matches.rows[isin(matches.ids, held)]
+        return AssociatedFrame(aligned, corrected, landmarks, prediction, matches.without(held), held, rows, standing)
+
+    def _at_rest(
+        self, standing: Standing, prediction: Prediction, landmarks: LandmarkTable, features: StereoFeatures, index: int
+    ) -> tuple[Standing, LandmarkMatches]:
+        """Whether the camera stands in spite of the pose on which landmarks agree; then matches of what stays."""
+        positions, sigma = self._positions(landmarks.ids), self.config.models.pixel_sigma
+        found = self._localizer.match(prediction, landmarks, positions, features, index)
+        if found.T_world_left is not None:
+            standing = standing.contested(self.rig, sigma, features, found.rows, found.T_world_left)
+        if 2 * isin(found.rows, standing.witnesses).sum() > len(found):
+            return standing, found
+        at, witnessed = standing.T_world_left, standing.witnessed(features)
+        found = self._localizer.match_around(at, prediction, landmarks, positions, witnessed, index)
+        return standing, replace(found, rows=standing.witnesses[found.rows])
+
+    def _moving(
+        self, features: StereoFeatures, landmarks: LandmarkTable, matches: LandmarkMatches, prediction: Prediction,
+        standing: Standing, index: int,
+    ) -> IdArray:  # fmt: skip
+        """Ids of matched landmarks that may move; while the camera stands, all that do not stay where they are."""
+        if standing.stands:
+            return matches.ids[~isin(matches.rows, standing.witnesses)]
         pose = prediction.T_world_left if matches.T_world_left is None else matches.T_world_left
         ages = index - landmarks.last_seen[landmarks.rows(matches.ids)]
-        moving = self.objects.newly_moving(corrected, matches.ids, matches.rows, ages, self._positions, pose)
-        held = np.union1d(self.objects.suspects, moving)
-        rows = matches.rows[isin(matches.ids, held)]
-        return AssociatedFrame(aligned, corrected, landmarks, prediction, matches.without(held), held, rows)
+        moving = self.objects.newly_moving(features, matches.ids, matches.rows, ages, self._positions, pose)
+        return np.union1d(self.objects.suspects, moving)
 
     def _update(self, seen: AssociatedFrame, dt: float) -> tuple[UpdateReport, IdArray, TrackingState]:
         """Update the back end: its report, the ids of landmarks left out of the update, and the tracking state."""

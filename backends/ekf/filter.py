@@ -95,6 +95,19 @@ class EkfBackend:
 
     @one_blas_thread
     @all_or_nothing
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.RestingBackend.predict_at_rest`."""
+        if not self._stamps:
+            return self.predict(stamp)
+        require_stamp("ekf", stamp, self._stamps[-1])
+        self._state.rest()
+        self._stamps.append(float(stamp))
+        self._poses.append(self._state.pose())
+        self._measured = False
+        return self._prediction()
+
+    @one_blas_thread
+    @all_or_nothing
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
         self._require_started("update")

@@ -113,6 +113,11 @@ class FilterState:
             self._transition(dt / pieces)
             self._reanchor_if_needed()
 
+    def rest(self) -> None:
+        """A step of a camera that stands: the pose stays, and the velocity is zero for certain."""
+        self.camera = np.concatenate([self.camera[:POSE], np.zeros(POSE)])
+        self._transform_camera(np.diag(np.repeat([1.0, 0.0], POSE)))
+
     def _transition(self, dt: float) -> None:
         """``x ← f(x)`` and ``P ← A P Aᵀ + W Q Wᵀ`` with the printed A and W."""
         before = self.camera

@@ -93,11 +93,23 @@ class SmootherBackend:
     @one_blas_thread
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
+        return self._predict(stamp, rests=False)
+
+    @one_blas_thread
+    def predict_at_rest(self, stamp: float) -> Prediction:
+        """See `slam.interfaces.RestingBackend.predict_at_rest`."""
+        return self._predict(stamp, rests=self.measurement_log.path.count > 0)
+
+    def _predict(self, stamp: float, rests: bool) -> Prediction:
         path = self.measurement_log.path
         last = path.predicted.stamp if path.predicted is not None else float(path.stamps[-1]) if path.count else None
         require_stamp("smoother", stamp, last)
         self._graph.repair()
         self._commit()
+        path = self.measurement_log.path
+        path.rests.discard(path.count)
+        if rests:
+            path.rests.add(path.count)
         predicted = self._belief.predicted(stamp)
         in_view = self._in_view(predicted)
         self._answer, self._measured = None, False

@@ -82,6 +82,10 @@ class FactorMaker:
         noise = gtsam.noiseModel.Diagonal.Sigmas(dt * motion.first_velocity_sigmas(self.models, dt))
         return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise)
 
+    def rest(self, keys: tuple[int, int]) -> gtsam.NonlinearFactor:
+        """Between two successive poses of a camera that stands."""
+        return gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(motion.rest_sigmas()))
+
     def motion(self, keys: tuple[int, int, int], dt01: float, dt12: float) -> gtsam.NonlinearFactor:
         """Between three successive poses: constant velocity with a random impulse (see `motion`)."""
 

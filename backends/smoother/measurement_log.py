@@ -110,7 +110,7 @@ class MeasurementLog:
         """A copy; what is only ever replaced in the parts, such as tracks, belongs to both."""
         other = MeasurementLog()
         for name, part in vars(self).items():
-            mutable = {k: v.copy() for k, v in vars(part).items() if isinstance(v, (np.ndarray, list, dict))}
+            mutable = {k: v.copy() for k, v in vars(part).items() if isinstance(v, (np.ndarray, list, dict, set))}
             vars(getattr(other, name)).update({**vars(part), **mutable})
         return other
 

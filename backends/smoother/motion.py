@@ -22,6 +22,7 @@ from slam.models import EstimatorModels
 _inverse_right = gtsam.Rot3.LogmapDerivative  # inverse of SO(3)'s right Jacobian
 
 _LONGEST = 1000.0  # guard: time [s] after which a camera can be anywhere; more would only exhaust the digits
+_STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
 
 
 def bounded(dt: float) -> float:
@@ -33,6 +34,11 @@ def motion_sigmas(models: EstimatorModels, dt: float) -> Array:
     """Standard deviations (6,) of w = [w_ω, w_v] over `dt` [s]."""
     linear, angular = models.motion.velocity_variance(dt)
     return np.sqrt(np.repeat([angular, linear], 3))
+
+
+def rest_sigmas() -> Array:
+    """Standard deviations (6,) of a step of a camera that stands [rad], [m]."""
+    return np.full(6, _STANDS)
 
 
 def first_velocity_sigmas(models: EstimatorModels, dt: float) -> Array:

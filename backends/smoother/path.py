@@ -28,6 +28,7 @@ class Path:
         count: number of frames.
         measured: those in which landmarks were measured, ascending.
         jumps: those whose poses do not follow from the ones before; the camera goes on from there at an unknown speed.
+        rests: those in which the camera has not moved since the frame before.
         predicted: the newest pose while it is only predicted: it is not among the frames yet. None otherwise.
     """
 
@@ -35,6 +36,7 @@ class Path:
         self.count = 0
         self.measured: list[int] = []
         self.jumps: list[int] = []
+        self.rests: set[int] = set()
         self.predicted: PredictedPose | None = None
         self._stamps = np.zeros(64)
         self._poses = np.zeros((64, 4, 4))

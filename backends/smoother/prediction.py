@@ -23,7 +23,10 @@ def predict_pose(models: EstimatorModels, path: Path, window: PoseSet, stamp: fl
     stamps, poses = path.stamps, path.poses
     dt = motion.bounded(stamp - stamps[-1])
     J = np.zeros((6, 6 * len(window)))
-    if len(stamps) == 1 or path.jumped(path.count - 1):
+    if path.count in path.rests:
+        T, J[:, -6:], Jw = motion.predict_from_rest(poses[-1], 1.0)
+        sigmas = motion.rest_sigmas()
+    elif len(stamps) == 1 or path.jumped(path.count - 1):
         T, J[:, -6:], Jw = motion.predict_from_rest(poses[-1], dt)
         sigmas = motion.first_velocity_sigmas(models, dt)
     else:

@@ -61,6 +61,8 @@ def pose_factor(make: FactorMaker, path: Path, i: int) -> gtsam.NonlinearFactor:
     """The motion factor of the pose of frame `i`, or its prior."""
     if i == 0:
         return make.prior(pose_key(0))
+    if i in path.rests:
+        return make.rest((pose_key(i - 1), pose_key(i)))
     if i == 1 or path.jumped(i - 1):
         return make.first_motion((pose_key(i - 1), pose_key(i)), path.interval(i))
     keys = (pose_key(i - 2), pose_key(i - 1), pose_key(i))

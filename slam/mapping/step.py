@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from slam.object_data import MotionLabels
 from slam.rig_error import CommonError, Correction
 from slam.tracking.localizer import LandmarkMatches
 from slam.tracking.patch_alignment import Aligned, PatchAnchors
+from slam.tracking.standing import Standing
 from slam.tracking.state import TrackingState
 
 
@@ -29,6 +30,7 @@ class AssociatedFrame:
         matches: matched landmarks, without the withheld ones.
         withheld: ids of landmarks withheld from the back end's update, because they may move.
         withheld_rows: features matched with withheld landmarks.
+        standing: whether the camera stands.
     """
 
     aligned: Aligned
@@ -38,6 +40,7 @@ class AssociatedFrame:
     matches: LandmarkMatches
     withheld: IdArray
     withheld_rows: NDArray[np.intp]
+    standing: Standing
 
     @classmethod
     def of_nothing_known(
@@ -47,7 +50,7 @@ class AssociatedFrame:
         none, aligned = np.zeros(0, np.int64), Aligned(features, PatchAnchors.none())
         empty = LandmarkTable.empty(features.descriptors.shape[1])
         nothing = LandmarkMatches.nothing()
-        return cls(aligned, corrected, empty, prediction, nothing, none, nothing.rows)
+        return cls(aligned, corrected, empty, prediction, nothing, none, nothing.rows, Standing())
 
     @property
     def pose(self) -> Array:
@@ -106,6 +109,7 @@ class Completed:
         anchors: image patches of landmarks at first sight.
         measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
         checksum: of the images; None without images, or of images that show nothing.
+        standing: whether the camera stands.
     """
 
     index: int = -1
@@ -115,11 +119,13 @@ class Completed:
     anchors: PatchAnchors = field(default_factory=PatchAnchors.none)
     measured_at: float = -np.inf
     checksum: tuple[int, int] | None = None
+    standing: Standing = field(default_factory=Standing)
 
-    def after(self, step: Step, added: int, anchors: PatchAnchors, new_map: bool) -> Completed:
+    def after(self, step: Step, added: int, anchors: PatchAnchors, standing: Standing, new_map: bool) -> Completed:
         """The state after one more step, in which `added` landmarks joined the map, or a new map was started."""
+        standing = replace(standing, T_world_left=step.estimate.T_world_left)
         dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
         known = not step.state.unmatched or not self.mapped or new_map
         measured_at = step.features.stamp if known else self.measured_at
         mapped = self.mapped or added > 0
-        return Completed(step.index, step.state, dimensions, mapped, anchors, measured_at, step.checksum)
+        return Completed(step.index, step.state, dimensions, mapped, anchors, measured_at, step.checksum, standing)

@@ -48,7 +48,8 @@ class Body:
         missed: number of frames since it was measured.
         measured: whether it was in this frame.
         moving: whether it moves now.
-        confirmed: whether it has moved for certain.
+        evidence: that it has moved, given all that is uncertain; see `slam.objects.proof`.
+        proven: whether it has moved for certain.
         alike: number of frames in which it moved as an older body did, as a part of that would.
         age: number of frames since it was found.
         existence: probability that it exists, see `slam.objects.existence`.
@@ -81,7 +82,8 @@ class Body:
     missed: int = 0
     measured: bool = True
     moving: bool = True
-    confirmed: bool = False
+    evidence: float = 0.0
+    proven: bool = False
     alike: int = 0
     age: int = 0
     existence: float = EVEN
@@ -208,8 +210,9 @@ def continued(body: Body, known: Body) -> Body:
     shift[:3, 3] = body.middle - known.middle
     T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
-        body, id=known.id, T_body_estimate=T_body_estimate, confirmed=known.confirmed, existence=known.existence,
-        age=known.age, reported=known.reported, reported_unmeasured=known.reported_unmeasured,
+        body, id=known.id, T_body_estimate=T_body_estimate, evidence=known.evidence,
+        proven=known.proven, existence=known.existence, age=known.age,
+        reported=known.reported, reported_unmeasured=known.reported_unmeasured,
         measured_at=known.measured_at, estimate=None, refused=0,
     )  # fmt: skip
 

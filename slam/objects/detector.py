@@ -37,11 +37,13 @@ from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
 from slam.objects.measurement import measure
 from slam.objects.parts import moving_parts
+from slam.objects.proof import PROVEN, with_frame
 from slam.objects.recovery import locate
-from slam.objects.regions import classify_scene
+from slam.objects.regions import Scene, classify_scene
 from slam.objects.revision import CorrectRows, revise_tracks
 from slam.objects.tracks import Tracks, constant_velocity, fit_positions, fit_velocities, make_room, record
 
+NONE = np.zeros(0, np.intp)
 _PATIENCE = 2  # frames that a fresh body is remembered for, besides as many as it was seen
 _MERGES = 24  # frames in which a body turns out to be a part of another at once; later after so many
 _DISTINCT = 2.0  # distinctness from which two bodies are never one: they are asked in every frame
@@ -101,7 +103,9 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- a step, first part
 
-    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
+    def classify(
+        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, still: IndexArray = NONE
+    ) -> MotionLabels:
         """Follow all tracks into this frame, test them, and find bodies; see `slam.objects.modes.ObjectDetector`."""
         times = self._begin(features)
         local = self.rig.triangulate(features.uv_left, features.uv_right)
@@ -116,13 +120,15 @@ class MovingObjectDetector:
         )  # fmt: skip
         self._measure(tracks, features, local, T_world_left)
         tracks.assign_landmarks(landmark)
+        tracks.still[:] = tracks.seen & among(max(len(features), 1), still)[tracks.row]
         self._fit(tracks, times)
         initializer = BodyInitializer(
             self.rig, self.config, self.sigma, self.models, times, self.slot, features.stamp, T_world_left[:3, 3]
         )
         self._change_members(initializer)
-        self._find_bodies(initializer, T_world_left)
+        scene = self._find_bodies(initializer, T_world_left)
         self._follow_candidates(initializer, T_world_left)
+        self._prove(scene)
         self._begin_tracks(features, local, T_world_left, landmark)
         return self._motion_labels(features)
 
@@ -192,8 +198,35 @@ class MovingObjectDetector:
 
     # ------------------------------------------------------------------------------------------- bodies and members
 
-    def _find_bodies(self, initializer: BodyInitializer, T_world_left: Array) -> None:
-        """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body."""
+    def _prove(self, scene: Scene) -> None:
+        """Weigh what says that bodies move; those that do not for long, given how long they did, are dropped."""
+        c, tracks = self.config, self.tracks
+        assert tracks is not None
+        ages = (self.slot - np.arange(c.window)) % c.window
+        for body in list(self.bodies.values()):
+            if not body.measured:
+                continue
+            members = np.flatnonzero((tracks.body == body.id) & tracks.seen)
+            members = members[tracks.count(members) >= c.min_frames - 1]
+            moved = displacements(tracks, members, ages, self._poses[self.slot, :3, 3])
+            evidence = with_frame(body.evidence, moved, scene)
+            body = replace(body, evidence=evidence, proven=body.proven or evidence >= PROVEN)
+            self.bodies[body.id] = body
+            if evidence == 0.0 if body.proven else body.seen >= membership.PROBATION:
+                self._drop(body)
+
+    def _drop(self, body: Body) -> None:
+        """Let a body's tracks go; they need proof to become members of another one."""
+        assert self.tracks is not None
+        membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
+        del self.bodies[body.id]
+        self._forgotten.append(body.id)
+
+    def _find_bodies(self, initializer: BodyInitializer, T_world_left: Array) -> Scene:
+        """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body.
+
+        Returns the still scene.
+        """
         c, tracks, times = self.config, self.tracks, initializer.times
         assert tracks is not None
         free = np.flatnonzero(tracks.seen & (tracks.body < 0))
@@ -203,11 +236,12 @@ class MovingObjectDetector:
         scene = classify_scene(moved, place, c.suspect, c.min_support)
         parts = moving_parts(self.bodies, tracks, ages, T_world_left, self._dt(times), c)
         tracks.doubtful[:] = False
-        tracks.doubtful[rows] = scene.alone > c.doubtful
+        tracks.doubtful[rows] = (scene.alone > c.doubtful) & ~tracks.still[rows]
         alike = np.zeros(len(tracks), bool)
         suspects = [np.zeros(0, np.int64)]
         for group in scene.groups:
             members = rows[group.members]
+            members = members[~tracks.still[members]]
             tracks.doubtful[members] = True
             suspects.append(tracks.landmark[members])
             alike[members] = group.moves(c.group_test, LAG * self._dt(times) * c.min_speed)
@@ -217,6 +251,7 @@ class MovingObjectDetector:
         tracks.streak[:] = np.where(alike, tracks.streak + 1, np.maximum(tracks.streak - 1, 0))
         of_parts = among(len(tracks), np.concatenate([np.zeros(0, np.intp), *(members for _, members in parts)]))
         alone = [rows[group.members] for group in scene.groups]
+        alone = [members[~tracks.still[members]] for members in alone]
         alone = [members for members in alone if 2 * of_parts[members].sum() <= len(members)]
         for whole, members in [*parts, *((None, members) for members in alone)]:
             members = members[(tracks.body[members] == -1) | (tracks.body[members] == (-1 if whole is None else whole))]
@@ -226,15 +261,20 @@ class MovingObjectDetector:
                     self._found(new, initializer, whole)
         suspected = np.concatenate(suspects)
         self.suspects = suspected[suspected >= 0]
+        return scene
 
-    def _found(self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None) -> None:
+    def _found(
+        self, group: MovingGroup, initializer: BodyInitializer, whole: int | None = None, evidence: float = 0.0
+    ) -> None:
         """Make a body of tracks with a common twist, or add them to the body that they belong to.
+
+        There may be evidence already that it moves.
 
         If they are a part of the body `whole` with a motion of its own, they are not added to that one.
         """
         tracks, members = self.tracks, group.members
         assert tracks is not None
-        body = initializer.body(self._next_body, tracks, group)
+        body = replace(initializer.body(self._next_body, tracks, group), evidence=evidence, proven=evidence >= PROVEN)
         others = {id: other for id, other in self.bodies.items() if id != whole}
         known = membership.body_around(others, tracks, members, body)
         known = known or membership.body_with_part(others, tracks, members, body)
@@ -287,7 +327,7 @@ class MovingObjectDetector:
         """Follow the regions that may move; one that has moved for certain becomes a body."""
         c, tracks, times = self.config, self.tracks, initializer.times
         assert tracks is not None
-        rows = np.flatnonzero(tracks.seen & (tracks.body < 0))
+        rows = np.flatnonzero(tracks.seen & (tracks.body < 0) & ~tracks.still)
         rows = rows[tracks.count(rows) >= c.min_frames - 1]
         motion = constant_velocity(tracks, rows, times, c.max_speed)
         depth = (motion.position - T_world_left[:3, 3]) @ T_world_left[:3, 2]
@@ -303,7 +343,7 @@ class MovingObjectDetector:
             else:
                 centre = tracks.position[candidate.members].mean(axis=0)
                 twist, uncertainty = candidate.twist(self.models.initial_angular_velocity_sigma)
-                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer)
+                self._found(MovingGroup(candidate.members, centre, twist, uncertainty), initializer, evidence=PROVEN)
 
     def _shared_error(self, place: Array, T_world_left: Array) -> Array:
         """Covariance (3, 3) of a place (3,) as seen from the camera, given that of the camera's pose."""
@@ -320,16 +360,12 @@ class MovingObjectDetector:
         gains = membership.update_members(measured, resolved, tracks, self.slot, self.config)
         for id, body in list(self.bodies.items()):
             typical = median(gains[id]) if len(gains.get(id, ())) else 0.0
-            self.bodies[id] = with_evidence(body, typical)
-        for id, gain in gains.items():
-            kept = membership.confirmed(self.bodies[id], gain)
-            mine = np.flatnonzero(tracks.body == id)
-            if kept is None:
-                membership.remove_members(tracks, mine, self.bodies[id])
-                del self.bodies[id]
-                self._forgotten.append(id)
-            else:
-                self.bodies[id] = with_extent(kept, tracks.local[mine[tracks.sure[mine]]])
+            body = self.bodies[id] = with_evidence(body, typical)
+            if id in gains and typical <= 0 and not body.proven:
+                self._drop(body)
+            elif id in gains:
+                mine = np.flatnonzero((tracks.body == id) & tracks.sure)
+                self.bodies[id] = with_extent(body, tracks.local[mine])
         self._merge()
 
     def _merge(self) -> None:
@@ -398,8 +434,9 @@ class MovingObjectDetector:
         assert tracks is not None
         on, near = membership.tracks_on_bodies(self.bodies, tracks, self.config.margin)
         doubtful = np.flatnonzero(tracks.seen & tracks.doubtful)
-        landmarks = np.unique(tracks.landmark[tracks.body >= 0])
-        tracks.landmark[tracks.body >= 0] = -1
+        proven = np.isin(tracks.body, [body.id for body in self.bodies.values() if body.proven])
+        landmarks = np.unique(tracks.landmark[proven])
+        tracks.landmark[proven] = -1
         moving, undecided = np.zeros(len(features), bool), np.zeros(len(features), bool)
         moving[tracks.row[on]] = True
         undecided[tracks.row[near]] = undecided[tracks.row[doubtful]] = True

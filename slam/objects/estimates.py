@@ -69,7 +69,7 @@ class BodyEstimates:
                 continue
             bodies[body.id] = body
             membership.count_rejections(tracks, estimate.rejected)
-            if body.confirmed and self._worth_reporting(body, estimate):
+            if body.proven and self._worth_reporting(body, estimate):
                 bodies[body.id] = counted(body)
                 reported.append(_report(body, estimate, tracks))
         return tuple(reported)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from slam.chi_square import SIGMAS, chi_square_limit, chi_square_limits
 from slam.data import BoolArray, IdArray, StereoFeatures
-from slam.geometry.arrays import median
 from slam.geometry.se3 import Array, exp, points_by_pose, transform
 from slam.objects.bodies import Body, in_body_axes, with_extent
 from slam.objects.config import ObjectsConfig
@@ -34,8 +33,7 @@ _TURN, _SHIFT = 0.2, 0.2  # how far a pose may be from a constant velocity, befo
 _MERGED = 0.5  # how far outside a body's extent a group may lie that belongs to it, as a share of the diagonal
 _PART, _PART_EXPLAINED = 2.0, 0.05  # the same for what was found before of a body: margin, and share of χ² left
 _FREEDOM = 6.0  # fixed: of a body's pose in every frame
-_PROOF = 8.0  # median of the members' χ² from which a body has moved for certain
-_PROBATION = 12  # frames after which it must have, and in which it is not told from another body for certain
+PROBATION = 12  #: frames in which a body must have moved for certain, and is not told from another one
 _NEAR = SIGMAS**2  # of the distance from a body's extent up to which a track may join, and
 _INSIDE = 4.0  # up to which it counts as inside, the extent being widened by
 _EDGE = 0.1  # as a share of its diagonal: the outermost points lie beyond the percentiles
@@ -151,7 +149,7 @@ def update_members(
         gains[body.id] = _expel(body, tracks, config)
     if not bodies:
         return gains
-    free = np.flatnonzero((tracks.body < 0) & tracks.seen)
+    free = np.flatnonzero((tracks.body < 0) & tracks.seen & ~tracks.still)
     free = free[tracks.count(free) >= 2]
     best, whose = np.full(len(free), -np.inf), np.full(len(free), -1)
     for body in bodies.values():
@@ -191,7 +189,7 @@ def _expel(body: Body, tracks: Tracks, config: ObjectsConfig) -> Array:
     v, seen = membership_test(body, tracks, mine), tracks.seen[mine]
     most_fit = v.fits[seen].sum() > _MOST * seen.sum()
     unfit = ~v.fits & (v.count >= _ENOUGH) & most_fit
-    wrong = (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
+    wrong = tracks.still[mine] | (tracks.misfit[mine] >= MAX_REJECTIONS) | (seen & ((v.gain < _WORSE) | unfit))
     tracks.sure[mine] |= v.fits & (v.gain > _BETTER)
     if wrong.any():
         remove_members(tracks, mine[wrong & ~seen], body)
@@ -217,22 +215,22 @@ def tracks_on_bodies(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of seen tracks that lie on a body, members or not, and of those near one that may lie on it.
 
-    A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not confirmed
+    A track inside a body's extent lies on it, unless it is known to stand still. Tracks on a body that is not proven
     yet belong to the second group.
     """
     seen, known = tracks.seen, tracks.body >= 0
     on = np.zeros(len(tracks), bool)
     for body in bodies.values():
-        if body.confirmed:
+        if body.proven:
             on |= seen & (tracks.body == body.id)
-    near, free = seen & known & ~on, np.flatnonzero(seen & ~known)
+    near, free = seen & known & ~on, np.flatnonzero(seen & ~known & ~tracks.still)
     for body in bodies.values():
         if not body.measured:
             continue
         close = free[_distances(body, tracks, free, margin) < _NEAR]
         near[close] = True
         inside = close[_distances(body, tracks, close, _EDGE) < _INSIDE]
-        if len(inside) and body.confirmed:
+        if len(inside) and body.proven:
             asked = np.where(tracks.expelled[inside], _BETTER, _BETTER_INSIDE)
             on[inside[membership_test(body, tracks, inside).gain > asked]] = True
     return np.flatnonzero(on), np.flatnonzero(near & ~on)
@@ -264,7 +262,7 @@ def body_around(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.int
         still = float(_squares(tracks.p[rows], np.where(known[..., None, None], tracks.A[rows], 0.0)).sum())
         by_chance = chi_square_limit(6 * int(known.any(axis=0).sum()), 0.99)
         certain = _squares_with_pose_error(points, A, body)
-        apart = body.seen > _PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
+        apart = body.seen > PROBATION and certain - alone > _APART * by_chance and certain > 2 * _APART * alone
         if fixed < 2 * EXPLAINED * still and not apart:
             return body
     return None
@@ -301,7 +299,7 @@ def reappeared(bodies: Mapping[int, Body], new: Body) -> Body | None:
     """
     best, least = None, _RETURNED
     for body in bodies.values():
-        if body.measured or not body.confirmed:
+        if body.measured or not body.proven:
             continue
         y, R = 0.5 * (body.lower + body.upper), body.T[:3, :3]
         place = R @ _spread_of_place(body, y) @ R.T + (body.across**2 + new.across**2) / 12.0 * np.eye(3)
@@ -363,23 +361,6 @@ def body_with_part(bodies: Mapping[int, Body], tracks: Tracks, rows: NDArray[np.
         if body.measured and len(theirs) >= len(rows) and is_part_of(body, theirs, tracks, rows, own):
             return body
     return None
-
-
-def confirmed(body: Body, gain: Array) -> Body | None:
-    """The body, confirmed once its members show that it has moved; None if they show that it never did.
-
-    A body that is confirmed and older than `_PROBATION` stays so.
-
-    Args:
-        body: the body.
-        gain: by how much χ² it explains its members better than the still world (K,).
-    """
-    if body.confirmed and body.seen >= _PROBATION:
-        return body
-    typical = median(gain) if len(gain) else 0.0
-    if typical > _PROOF:
-        return replace(body, confirmed=True)
-    return body if typical > 0 and body.seen < _PROBATION else None
 
 
 def _distances(body: Body, tracks: Tracks, rows: NDArray[np.intp], margin: float) -> Array:

@@ -54,13 +54,16 @@ class ObjectDetector(Protocol):
         """
         ...
 
-    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
+    def classify(
+        self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, still: IndexArray = ...
+    ) -> MotionLabels:
         """Say which features move, before any of them becomes a landmark.
 
         Args:
             features: of the frame.
             estimate: the camera's pose after the update.
             landmark: id of the landmark that each feature was matched to (N,), -1 for none.
+            still: rows of features that stay at their pixels while the camera stands.
         """
         ...
 
@@ -87,7 +90,7 @@ class NoDetector:
     def revise(self, correct: CorrectRows) -> None:
         """There is nothing to revise."""
 
-    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
+    def classify(self, *_: object) -> MotionLabels:
         """Nothing moves, nothing is undecided."""
         none = np.zeros(0, np.intp)
         return MotionLabels(none, none, np.zeros(0, np.int64))

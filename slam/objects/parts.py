@@ -37,7 +37,7 @@ def moving_parts(
     """
     found = []
     for body in bodies.values():
-        if not (body.measured and body.confirmed):
+        if not (body.measured and body.proven):
             continue
         on = membership.tracks_on(body, tracks, config.margin)
         rows, place = known_well(tracks, on, T_world_left, config.min_frames)

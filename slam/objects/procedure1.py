@@ -271,7 +271,7 @@ class Procedure1Detector:
     def revise(self, correct: CorrectRows) -> None:
         """Nothing measured is kept."""
 
-    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray) -> MotionLabels:
+    def classify(self, features: StereoFeatures, estimate: Estimate, landmark: IdArray, *_: object) -> MotionLabels:
         """Recognise the object's features and find its motion; no other feature is classified."""
         c, d = self.config, self.database
         if d.descriptors.shape[1] != features.descriptors.shape[1]:

@@ -69,10 +69,14 @@ class Scene:
     Attributes:
         groups: those that moved on their own, the clearest first.
         alone: χ²(3) of every track's displacement against the rest's common motion (N,).
+        common: the motion ξ (6,) of the rest in a frame, by the error of the camera's motion, and
+        covariance: its covariance (6, 6).
     """
 
     groups: list[Group]
     alone: Array
+    common: Array
+    covariance: Array
 
 
 def limit(test: float, size: NDArray[np.intp] | int) -> Array:
@@ -93,7 +97,7 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
     """
     n = len(moved.d)
     if n < 3 * support:
-        return Scene([], np.zeros(n))
+        return Scene([], np.zeros(n), np.zeros(6), np.diag(1.0 / _PRIOR))
     problem = _Problem.of(moved)
     windows = _Windows.over(place, support)
     rest: BoolArray = np.ones(n, bool)
@@ -110,7 +114,8 @@ def classify_scene(moved: Displacements, place: Array, test: float, support: int
             break
     heavier = tail(alone[rest])  # of what is in no group: before, other groups would be part of it
     groups = [replace(group, test=group.test / heavier) for group in groups]
-    return Scene([group for group in groups if group.test > limit(test, len(group.members))], alone)
+    groups = [group for group in groups if group.test > limit(test, len(group.members))]
+    return Scene(groups, alone, problem.common_motion(rest), scale * heavier * problem.covariance(rest))
 
 
 def tail(alone: Array) -> float:
@@ -162,6 +167,13 @@ class _Problem:
     def common_motion(self, rows: BoolArray) -> Array:
         """The motion (6,) on which tracks agree, by robust least squares."""
         return np.asarray(kernels.common_motion(self.L, self.eta, self.dWd, rows, _PRIOR, _PULL, *_ROUNDS))
+
+    def covariance(self, rows: BoolArray) -> Array:
+        """Covariance (6, 6) of the common motion of some tracks."""
+        information = np.zeros((6, 6))
+        information[np.tril_indices(6)] = self.L[rows].sum(axis=0)
+        information += np.tril(information, -1).T + np.diag(_PRIOR)
+        return np.linalg.inv(information)
 
     def squares(self, common: Array) -> Array:
         """χ²(3) of every displacement (N,) against a common motion."""

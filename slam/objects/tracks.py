@@ -52,6 +52,7 @@ class Tracks:
         misfit: how often lately it disagreed with its body (N,).
         sure: whether its motion with the body is certain (N,).
         expelled: whether it was removed from a body (N,): then it needs proof of its motion to become a member again.
+        still: whether its feature stays at its pixel while the camera stands (N,): it belongs to no body.
     """
 
     ids: IdArray
@@ -79,6 +80,7 @@ class Tracks:
     misfit: IdArray
     sure: BoolArray
     expelled: BoolArray
+    still: BoolArray
 
     @classmethod
     def empty(cls, dimensions: int, window: int, rows: int = _ROOM) -> Tracks:
@@ -92,6 +94,7 @@ class Tracks:
             np.zeros(rows),
             vector.copy(), matrix.copy(), vector.copy(), matrix.copy(), zero.copy(), np.zeros(rows, bool),
             vector.copy(), matrix.copy(), zero.copy(), np.zeros(rows, bool), np.zeros(rows, bool),
+            np.zeros(rows, bool),
         )  # fmt: skip
 
     def __len__(self) -> int:

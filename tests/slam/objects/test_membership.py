@@ -57,7 +57,7 @@ def seen_from(poses: Array, local: Array, seed: int) -> Array:
 def body_along(poses: Array, members: Array, tracks: Tracks, id: int = 1) -> Body:
     """A settled body with these poses whose members are these rows."""
     body = new_body(id, poses[SLOT, :3, 3], np.zeros(6), TIMES, 0.0, 0.0)
-    body = replace(body, T=poses[SLOT], history=poses, seen=50, confirmed=True)
+    body = replace(body, T=poses[SLOT], history=poses, seen=50, proven=True)
     membership.add_members(body, tracks, members, sure=True)
     return with_extent(body, tracks.local[members])
 
@@ -181,29 +181,6 @@ def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
     assert again.id == 1
     frame = again.T @ again.T_body_estimate
     assert np.allclose(frame, body.T @ body.T_body_estimate), "the back end's frame goes on"
-
-
-def test_poses_fitted_to_still_points_prove_nothing() -> None:
-    """A body that is made of still tracks fits their noise better than the still world does, for its poses are free."""
-    proofs = []
-    for seed in range(20):
-        tracks = table(seen_from(STILL, corners(6, seed) + AHEAD, 100 + seed))
-        body = new_body(1, AHEAD, np.zeros(6), TIMES, 0.0, 0.0)
-        body = membership.fitted(body, tracks, np.arange(6), SLOT)
-        membership.add_members(body, tracks, np.arange(6), sure=True)
-        gain = membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1]
-        kept = membership.confirmed(body, gain)
-        proofs.append(kept is not None and kept.confirmed)
-    assert sum(proofs) <= 1  # 5 % of the bodies
-
-
-def test_poses_fitted_to_moving_points_prove_a_body() -> None:
-    tracks = table(seen_from(path(MOVING), corners(6, 7), 8))
-    body = new_body(1, AHEAD, MOVING, TIMES, 0.0, 0.0)
-    body = membership.fitted(body, tracks, np.arange(6), SLOT)
-    membership.add_members(body, tracks, np.arange(6), sure=True)
-    kept = membership.confirmed(body, membership.update_members({1: body}, {1}, tracks, SLOT, ObjectsConfig())[1])
-    assert kept is not None and kept.confirmed
 
 
 def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:

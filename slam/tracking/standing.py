@@ -1,0 +1,199 @@
+"""Whether the camera stands: a test of what its images show, whatever moves in front of it.
+
+A camera stands if most features stay at their pixels and no small motion explains the rest of what is left of noise.
+Once it stands, features that stay where they were are witnesses, however few a passing body leaves of them: a motion of
+the camera would move them too. It is over as soon as some motion of the camera explains witnesses and moving features
+alike. While the camera stands, only features that stay are used to measure its pose and to make landmarks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from slam.chi_square import SIGMAS, chi_square_limit
+from slam.data import BoolArray, StereoFeatures
+from slam.geometry.arrays import median
+from slam.geometry.pnp import MINIMAL_POINTS, measurement_rows
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, inverse, points_by_pose, transform
+
+_FRAMES = 3  # in which a feature stays at its pixel, and in which most do, before that counts
+_LOOKALIKE = 0.5  # largest distance of descriptors of one feature in unchanged light
+_LEAST_NOISE = 0.05  # [px] of a pixel: no feature is found more precisely
+_GATE = chi_square_limit(3, 0.997)  # of the displacement of a feature that stays
+_MOVES = chi_square_limit(6, 1 - 1e-4)  # of a common motion; asked in every frame
+_MEDIAN = chi_square_limit(3, 0.5)
+_SOME = 0.1  # share of landmarks that a motion must move, for it to be one
+_SHARED = 0.25  # of the variance of a pixel, that features may share: light moves them alike, too
+_FEW = 2 * MINIMAL_POINTS  # features that tell nothing of a motion
+_ROUNDS = 3  # numerics: of reweighting
+_AVERAGED = 10  # sights whose mean is a feature's place; later ones would follow a slow motion
+_BLIND = (
+    10  # frames without enough features that stay, for which a rest is believed to last: the camera may be carried off
+)
+_REMEMBERED = 3000  # cost: features
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Features that may stay at their pixels, a row each.
+
+    Attributes:
+        z: mean (uL, vL, uR) of their first sights (K, 3) [px].
+        descriptors: at first sight (K, D).
+        sights: number of frames in which each was there (K,).
+        missed: frames since (K,).
+    """
+
+    z: Array
+    descriptors: NDArray[np.float32]
+    sights: NDArray[np.int64]
+    missed: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, z: Array, descriptors: NDArray[np.float32]) -> Places:
+        """Features seen for the first time."""
+        return cls(z, descriptors, np.ones(len(z), np.int64), np.zeros(len(z), np.int64))
+
+    def find(self, z: Array, descriptors: NDArray[np.float32], radius: float) -> tuple[NDArray, NDArray]:
+        """Rows of those that are found again less than `radius` [px] away among features (N,), and the features."""
+        none = np.zeros(0, np.intp)
+        if not len(self.z) or not len(z):
+            return none, none
+        distance, nearest = cKDTree(self.z[:, :2]).query(z[:, :2], distance_upper_bound=radius)
+        rows = np.flatnonzero(np.isfinite(distance))
+        places = nearest[rows]
+        alike = np.linalg.norm(self.descriptors[places] - descriptors[rows], axis=1) < _LOOKALIKE
+        rows, places = rows[alike], places[alike]
+        order = np.argsort(distance[rows], kind="stable")
+        _, first = np.unique(places[order], return_index=True)
+        kept = order[first]
+        return places[kept], rows[kept]
+
+    def after(self, places: NDArray, rows: NDArray, z: Array, descriptors: NDArray[np.float32]) -> Places:
+        """The places after a frame with features (N,), of which `rows` were found at `places` again."""
+        sights, missed, mean = self.sights.copy(), self.missed + 1, self.z.copy()
+        sights[places] += 1
+        missed[places] = 0
+        share = np.where(sights[places] <= _AVERAGED, 1.0 / sights[places], 0.0)
+        mean[places] += share[:, None] * (z[rows] - mean[places])
+        keep = np.flatnonzero((missed <= sights) | (sights > _FRAMES))
+        keep = np.sort(keep[np.argsort(missed[keep], kind="stable")][:_REMEMBERED])
+        new = np.delete(np.arange(len(z)), rows)
+        return Places(
+            np.concatenate([mean[keep], z[new]]), np.concatenate([self.descriptors[keep], descriptors[new]]),
+            np.concatenate([sights[keep], np.ones(len(new), np.int64)]),
+            np.concatenate([missed[keep], np.zeros(len(new), np.int64)]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """What is known of a camera at rest.
+
+    Attributes:
+        places: features that may stay; None before the first frame.
+        frames: number of frames in which most features stayed where they were in the first of them.
+        witnesses: rows of the present features that stay (M,); meaningful if the camera stands.
+        variance: of a pixel of a feature that stays [px²], as seen so far; infinite before anything was.
+        T_world_left: the camera's last pose (4, 4).
+        blind: number of frames in which too little of what stays was seen to tell, as something hides it.
+    """
+
+    places: Places | None = None
+    frames: int = 0
+    witnesses: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    variance: float = np.inf
+    T_world_left: Array = field(default_factory=lambda: np.eye(4))
+    blind: int = 0
+
+    @property
+    def stands(self) -> bool:
+        """Whether the camera stands for certain."""
+        return self.frames > _FRAMES
+
+    def leaving(self, features: int) -> NDArray[np.intp]:
+        """Rows of a frame's N = `features` features that do not stay, if the camera stands."""
+        return np.setdiff1d(np.arange(features), self.witnesses) if self.stands else np.zeros(0, np.intp)
+
+    def after(self, rig: StereoRig, sigma: float, features: StereoFeatures) -> Standing:
+        """What a frame's features with a right pixel say; `sigma` is the pixel noise [px]."""
+        stereo = np.flatnonzero(features.has_stereo)
+        z = measurement_rows(features.uv_left[stereo], features.uv_right[stereo])
+        descriptors = features.descriptors[stereo]
+        begun = Standing(Places.of(z, descriptors), T_world_left=self.T_world_left)
+        if self.places is None or self.places.descriptors.shape[1] != descriptors.shape[1]:
+            return begun
+        places, rows = self.places.find(z, descriptors, SIGMAS * np.sqrt(2.0) * sigma)
+        stay, at_rest, variance = _staying(rig, self.places.z[places], z[rows], sigma, self.variance)
+        places, rows = places[stay], rows[stay]
+        most = 2 * len(rows) > min(len(z), int((self.places.missed == 0).sum()))
+        witnesses = stereo[rows[self.places.sights[places] >= _FRAMES]]
+        known = self.places.after(places, rows, z, descriptors)
+        if at_rest and (self.stands or most):
+            return Standing(known, self.frames + 1, witnesses, variance, self.T_world_left)
+        if self.stands and len(rows) <= _FEW and self.blind < min(self.frames, _BLIND):
+            return replace(self, places=known, witnesses=witnesses, blind=self.blind + 1)
+        return begun
+
+    def contested(
+        self, rig: StereoRig, sigma: float, features: StereoFeatures, matched: NDArray[np.intp], T_world_left: Array
+    ) -> Standing:
+        """At rest no more if a motion of the camera explains all: some landmarks move with it, and few witnesses would.
+
+        Args:
+            rig: the cameras.
+            sigma: pixel noise [px].
+            features: of the frame.
+            matched: rows of those that agree on a pose, and
+            T_world_left: that pose (4, 4).
+        """
+        motion = inverse(T_world_left) @ self.T_world_left
+        landmarks, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
+        return replace(self, frames=0) if landmarks > _SOME and witnesses < 0.5 else self
+
+    def witnessed(self, features: StereoFeatures) -> StereoFeatures:
+        """Those of the features that stay."""
+        rows = self.witnesses
+        parts = {f.name: getattr(features, f.name)[rows] for f in fields(features)[1:8]}
+        return replace(features, **parts)
+
+
+def _moved(rig: StereoRig, sigma: float, features: StereoFeatures, rows: NDArray[np.intp], motion: Array) -> float:
+    """Share of some features that a motion (4, 4) of what they see would move by more than noise."""
+    local = rig.triangulate(features.uv_left[rows], features.uv_right[rows])
+    seen = np.isfinite(local).all(axis=1)
+    z = measurement_rows(features.uv_left[rows[seen]], features.uv_right[rows[seen]])
+    moved, _ = rig.project_stereo(transform(motion, local[seen]), jacobian=False)
+    return float((((moved - z) ** 2).sum(axis=1) > _GATE * 2.0 * sigma**2).mean()) if seen.any() else 0.0
+
+
+def _staying(rig: StereoRig, before: Array, now: Array, sigma: float, variance: float) -> tuple[BoolArray, bool, float]:
+    """Which features (M,) stay, of (uL, vL, uR) (M, 3) before and now [px], whether the camera does, and the variance.
+
+    The camera stays unless a common motion moves those that stay by more than noise; `variance` is that of a pixel.
+    """
+    d = now - before
+    stay = (d**2).sum(axis=1) <= _GATE * min(variance, 2.0 * sigma**2)
+    local = rig.triangulate(before[:, :2], np.column_stack([before[:, 2], before[:, 1]]))
+    used = np.flatnonzero(stay & np.isfinite(local).all(axis=1))
+    if len(used) <= _FEW:
+        return stay, False, variance
+    _, J = rig.project_stereo(local[used])
+    J = J @ points_by_pose(local[used])
+    d, weight = d[used], np.ones(len(used))
+    for _ in range(_ROUNDS):
+        WJ = weight[:, None, None] * J
+        information = np.einsum("nij,nik->jk", WJ, J)
+        xi = np.linalg.lstsq(information, np.einsum("nij,ni->j", WJ, d), rcond=1e-12)[0]
+        squares = ((d - J @ xi) ** 2).sum(axis=1)
+        variance = max(median(squares) / _MEDIAN, _LEAST_NOISE**2)
+        weight = 1.0 / np.maximum(1.0, squares / (_MEDIAN * variance))
+    by_motion = J @ xi
+    test = float(np.einsum("n,nij,nij->", weight, by_motion[:, :, None], by_motion[:, :, None])) / variance
+    within_noise = float((by_motion**2).mean()) < _SHARED * variance
+    return stay, test < _MOVES or within_noise, variance
