@@ -10,7 +10,7 @@ import numpy as np
 
 from backends.window.config import WindowConfig
 from backends.window.history import Call, History, state_corrected
-from backends.window.state import State
+from backends.window.state import State, settle
 from backends.window.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_stamp
 from slam.data import Estimate, IdArray, Observations, Prediction, UpdateReport
@@ -63,7 +63,8 @@ class WindowBackend:
         """See `slam.interfaces.Backend.predict`."""
         s = self._state
         require_stamp("window", stamp, float(s.stamps[-1]) if len(s.stamps) else None)
-        s, settled = self._steps.predicted(s, float(stamp)).settled(self.config.lag)
+        before, s = s, self._steps.predicted(s, float(stamp))
+        s, settled = settle(before, s, self.config.lag)
         rows, left, right, S = self._steps.in_view(s)
         frame = int(s.frames[-1])
         self._stamps[frame:], self._final[frame:] = [float(stamp)], [s.poses[-1].copy()]
@@ -82,9 +83,9 @@ class WindowBackend:
         require_not_measured("window", s.measured)
         ids, z = observations.ids.copy(), self._steps.stereo.measure(observations)
         after, report = self._steps.updated(s, ids, z, guess)
-        if after.begun != s.begun:  # a restart: what was before is final
-            for frame, T in s.revised_poses().items():
-                self._final[frame] = T
+        after, settled = settle(s, after, self.config.lag)
+        for frame, T in settled.items():
+            self._final[frame] = T
         self._done(after, "updated", ids, z, None if guess is None else guess.copy())
         return report
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from backends.window.state import State
+from backends.window.state import State, settle
 from backends.window.steps import Steps
 from slam.errors import MeasurementError
 from slam.geometry.se3 import Array
@@ -85,11 +85,7 @@ class History:
             for call in part.calls:
                 before, s = s, getattr(steps, call.step)(s, *call.arguments)
                 s = s[0] if isinstance(s, tuple) else s
-                settled: dict[int, Array] = {}
-                if call.step == "predicted":
-                    s, settled = s.settled(steps.config.lag)
-                elif s.begun != before.begun:
-                    settled = before.revised_poses()
+                s, settled = settle(before, s, steps.config.lag)
                 for frame, T in settled.items():
                     final[frame] = T
         return s, final

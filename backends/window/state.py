@@ -149,3 +149,10 @@ class State:
         poses = self.revised_poses()
         final = {one.frame: poses[one.frame] for one in self.past.left[:surplus]}
         return replace(self, past=self.past.without(surplus)), final
+
+
+def settle(before: State, after: State, lag: int) -> tuple[State, dict[int, Array]]:
+    """The state after a step, with a past of `lag` frames, and the poses (4, 4) by frame that are final with it."""
+    if after.begun != before.begun:  # the problem was begun anew: what was before is final
+        return after, before.revised_poses()
+    return after.settled(lag)

@@ -66,7 +66,10 @@ class Steps:
             prior = RelativePrior.of_pose(T, P)
             return replace(s, frames=np.zeros(1, np.int64), stamps=one, poses=T[None], covariance=P, prior=prior)
         if len(s.frames) >= self.config.poses:
-            s = slid(s, self.stereo, self.models, self.config)
+            try:
+                s = slid(s, self.stereo, self.models, self.config)
+            except np.linalg.LinAlgError:  # covariances that differ by more than their digits, as after long gaps
+                s = _begun_anew(s, s.poses[-1], s.covariance[-6:, -6:])
         K, t = len(s.frames), s.stamps
         dt = min(stamp - t[-1], motion.LONGEST)
         before = None if s.frames[-1] == s.begun else min(t[-1] - t[-2], motion.LONGEST)
@@ -261,16 +264,20 @@ def _places(s: State, points: IndexArray, local: Array, covariances: Array) -> P
     return Places(np.full(len(points), len(s.frames) - 1), points, basis, origin, np.ascontiguousarray(root))
 
 
-def _restarted(s: State, T: Array, points: IndexArray) -> State:
-    """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
-    P = world_covariance(s.covariance[-6:, -6:])
-    local, own = seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
+def _begun_anew(s: State, T: Array, P: Array) -> State:
+    """A window of the newest pose alone, which is T (4, 4) with covariance P (6, 6); landmarks stay as they are."""
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
-    one = replace(
+    return replace(
         s, frames=s.frames[-1:], stamps=s.stamps[-1:], poses=T[None], covariance=P, solved=0, begun=int(s.frames[-1]),
         rows=Rows.none(), places=Places.none(), prior=RelativePrior.of_pose(T, P), cost=0.0, past=Past(),
         landmarks=replace(s.landmarks, local=turn @ s.landmarks.local @ turn.T),
     )  # fmt: skip
+
+
+def _restarted(s: State, T: Array, points: IndexArray) -> State:
+    """A window of one pose T (4, 4), where the landmarks say; they are placed relative to it."""
+    local, own = seen_from_newest(replace(s, poses=np.concatenate([s.poses[:-1], T[None]])), points)
+    one = _begun_anew(s, T, world_covariance(s.covariance[-6:, -6:]))
     return replace(one, places=_places(one, points, local, own))
 
 
@@ -282,6 +289,8 @@ def _after(s: State, solution: Solution, points: IndexArray, local: Array, world
     by_pose = points_by_pose(h)
     own += by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
     position, whole, last = marks.position.copy(), marks.world.copy(), marks.last.copy()
-    position[points], own[points], whole[points], last[seen] = w.points, local, world, s.frames[-1]
+    position[points], last[seen] = w.points, s.frames[-1]
+    definite = (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
+    own[points[definite]], whole[points[definite]] = local[definite], world[definite]
     marks = replace(marks, position=position, local=own, world=whole, last=last)
     return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)
