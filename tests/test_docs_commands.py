@@ -49,6 +49,7 @@ def reader(tmp_path_factory):
     for name, file, unit in (("recording", "calibration.yaml", 1), ("mine", "stereo.yml", 1000)):
         (root / name).mkdir()
         write_calibration(root / name / file, sequence.rig, unit)
+    write_side_by_side(sequence, root)
     for side in ("left", "right"):
         images = [getattr(frame, side) for frame in sequence]
         (root / "recording" / side).mkdir()
@@ -63,6 +64,21 @@ def reader(tmp_path_factory):
     straight[:, 2, 3] = np.arange(60)
     Trajectory(0.1 * np.arange(60), straight).write_kitti(root / "poses" / "00.txt")
     return root
+
+
+def write_side_by_side(sequence, root):
+    """A folder of images that hold both cameras' side by side, and two videos of them, with a calibration each."""
+    (root / "images").mkdir()
+    for folder in (root, root / "images"):
+        write_calibration(folder / "calibration.yaml", sequence.rig, 1)
+    both = [np.hstack([frame.left, frame.right]) for frame in sequence]
+    for k, image in enumerate(both):
+        cv2.imwrite(str(root / "images" / f"{k:06}.png"), image)
+    for name in ("walk", "both"):
+        video = cv2.VideoWriter(str(root / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, both[0].shape[1::-1])
+        for image in both:
+            video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+        video.release()
 
 
 def write_calibration(path, rig, unit):
