@@ -27,6 +27,7 @@ from slam.geometry import se3
 from slam.geometry.camera import PinholeCamera
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend
+from slam.registry import ONLINE
 from slam.sequences.calibration_files import write_opencv
 from slam.testing import check_backend, findings
 from tests.scripts import load_script
@@ -211,8 +212,8 @@ def test_the_figures_in_the_readme_are_those_of_the_results_page():
     section = page.split("\n## Real sequences")[1].split("\n## ")[0]
     measured = {(row[0], row[1]): [*row[2:5], row[6]] for row in table_rows(section, 9)}
     readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
-    shown = [row for row in table_rows(readme, 6) if row[1] in ("ekf", "smoother")]
-    assert len(shown) == 8
+    shown = [row for row in table_rows(readme, 6) if row[1] in ONLINE]
+    assert len(shown) == 4 * len(ONLINE)
     for name, backend, *cells in shown:
         own = next(values for (short, other), values in measured.items() if name.startswith(short) and other == backend)
         for cell, value in zip(cells, own):
