@@ -42,15 +42,6 @@ def test_errors_are_those_measured(slam_data, tmp_path, case, backend):
         assert error_of(Trajectory.read_tum(tmp_path / PATHS[path]), sequence) < allowed, path
 
 
-@pytest.mark.parametrize(("name", "allowed"), [("raw 0013", 1.0), ("V1_01", 0.15)])
-def test_window(slam_data, tmp_path, name, allowed):
-    """Wider bars, as there are no medians of this back end yet."""
-    (case,) = [c for c in RECORDED if c.name == name]
-    _, summary = run_defaults(slam_data, case, "window", tmp_path)
-    assert summary["status"].get("tracked", 0) >= (16 if name == "V1_01" else case.frames - 1)
-    assert summary["accuracy"]["online"]["ATE RMSE [m]"] < allowed
-
-
 def test_the_same_run_twice_is_the_same_to_the_byte(slam_data, tmp_path):
     for name in ("a", "b"):
         run_defaults(slam_data, CASES[0], "smoother", tmp_path / name, 12)
