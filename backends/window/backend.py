@@ -53,7 +53,7 @@ class WindowBackend:
         self._stamps: list[float] = []
         self._final: list[Array] = []  # poses by frame; those of the window and of its past are in the state
         self._history = History()
-        self._revised = False  # whether the history's measurements are not those that the states come from
+        self._revised = -1  # number of the newest frame when measurements were revised last, −1 for never
         self._path: tuple[State, Trajectory] | None = None  # the last answer, and the state that it is of
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -117,6 +117,7 @@ class WindowBackend:
         marks = self._state.landmarks
         return marks.position[marks.rows_of(ids)]
 
+    @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: poses of the last `lag` frames are revised, others are final.
 
@@ -125,7 +126,7 @@ class WindowBackend:
         """
         if self._path is None or self._path[0] is not self._state:
             s, final, M = self._state, self._final, np.eye(4)
-            if self._revised:
+            if self._revised >= max(self._history.begins, 0):  # states since then come from revised measurements
                 s, final = self._history.repeated(self._steps, final)
                 M = M if self._history.anchored else self._state.poses[-1] @ inverse(s.poses[-1])
             poses = np.array(final).reshape(-1, 4, 4)
@@ -173,7 +174,7 @@ class WindowBackend:
         if len(self._state.frames):
             s = state_corrected(self._state, self._steps.stereo, correct)
             self._history = self._history.corrected(self._steps.stereo, correct)
-            self._state, self._revised = replace(s, measured=True), True
+            self._state, self._revised = replace(s, measured=True), int(s.frames[-1])
 
     # --- parts ---
 

@@ -30,7 +30,10 @@ class Call:
         if self.step not in ("updated", "added"):
             return self
         ids, z, *rest = self.arguments
-        return Call(self.step, (ids, _corrected(z, correct), *rest))
+        out = _corrected(z, correct)
+        if self.step == "added":  # what has no depth any more was placed as it was
+            out = np.where((out[:, 0] > out[:, 2])[:, None], out, z)
+        return Call(self.step, (ids, out, *rest))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,11 @@ class History:
         """The state before the first call."""
         return self.parts[0].state
 
+    @property
+    def begins(self) -> int:
+        """Number of the newest frame before the first call, −1 for none."""
+        return int(self.start.frames[-1]) if len(self.start.frames) else -1
+
     def then(self, call: Call, after: State, lag: int) -> History:
         """With one more call, after which the state is `after`; without calls that are more than `lag` frames old."""
         last, parts = self.parts[-1], self.parts[:-1]
@@ -75,8 +83,10 @@ class History:
         Raises:
             MeasurementError: a corrected measurement is not finite.
         """
-        parts = [replace(part, calls=tuple(call.corrected(correct) for call in part.calls)) for part in self.parts]
-        return replace(self, parts=(replace(parts[0], state=state_corrected(self.start, stereo, correct)), *parts[1:]))
+        return replace(self, parts=tuple(
+            Part(state_corrected(part.state, stereo, correct), tuple(call.corrected(correct) for call in part.calls))
+            for part in self.parts
+        ))  # fmt: skip
 
     def repeated(self, steps: Steps, final: Sequence[Array]) -> tuple[State, list[Array]]:
         """The state after all calls, and all frames' final poses."""
@@ -107,6 +117,7 @@ def state_corrected(s: State, stereo: RectifiedStereo, correct: Callable[[Array]
     local = (marks.position - T[:3, 3]) @ T[:3, :3]
     z, _ = stereo.project(local)
     seen = np.isfinite(z).all(axis=1) & stereo.rectified_rig.rig.left.in_image(z[:, :2])
+    seen &= marks.information[:, 0, 0] == 0  # what is known in the world stays
     there = local.copy()
     there[seen] = stereo.triangulate(_corrected(z[seen], correct))
     there = np.where(np.isfinite(there), there, local)

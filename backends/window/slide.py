@@ -29,6 +29,7 @@ def slid(s: State, stereo: RectifiedStereo, models: EstimatorModels, config: Win
         numpy.linalg.LinAlgError: the information of what leaves is not positive definite.
     """
     leaving = 0 if s.frames[-1] - s.frames[0] > config.reference else 1
+    leaving += leaving == s.solved  # landmarks are known relative to that one
     marks, rows, places, count = s.landmarks, s.rows, s.places, len(s.landmarks)
     here, there = np.zeros(count, bool), np.zeros(count, bool)
     here[rows.point[rows.pose == leaving]] = True

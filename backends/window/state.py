@@ -10,7 +10,7 @@ import numpy as np
 from backends.window.past import Past
 from slam.data import IdArray, IndexArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, adjoint, inverse
 from slam.window.problem import Places, RelativePrior, Rows
 
 
@@ -81,7 +81,7 @@ class Landmarks:
         return self.order[at]
 
     def require_new(self, ids: IdArray) -> None:
-        """Raise MeasurementError if one of the ids is in the map, or occurs twice."""
+        """Raise MeasurementError if one of the ids is in the map."""
         taken = np.isin(ids, self.ids)
         if taken.any():
             raise MeasurementError(f"window: landmark {ids[taken][0]} is in the map already")
@@ -156,3 +156,14 @@ def settle(before: State, after: State, lag: int) -> tuple[State, dict[int, Arra
     if after.begun != before.begun:  # the problem was begun anew: what was before is final
         return after, before.revised_poses()
     return after.settled(lag)
+
+
+def between(s: State, earlier: int, later: int | None = None) -> Array:
+    """Covariance (6, 6) of a pose of the window (the newest) relative to another one, both perturbed on the right."""
+    later = len(s.frames) - 1 if later is None else later
+    if earlier == later:
+        return np.zeros((6, 6))
+    i, j = slice(6 * earlier, 6 * earlier + 6), slice(6 * later, 6 * later + 6)
+    A = adjoint(inverse(s.poses[later]) @ s.poses[earlier])
+    P, cross = s.covariance, A @ s.covariance[i, j]
+    return P[j, j] + A @ P[i, i] @ A.T - cross - cross.T

@@ -12,12 +12,12 @@ from backends.window.config import WindowConfig
 from backends.window.past import Past
 from backends.window.problem import problem
 from backends.window.slide import slid
-from backends.window.state import Landmarks, State
+from backends.window.state import Landmarks, State, between
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
+from slam.geometry.se3 import Array, inverse, points_by_pose
 from slam.models import EstimatorModels
 from slam.window import kernels, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
@@ -94,7 +94,9 @@ class Steps:
         rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
         local, own = seen_from_newest(s, rows)
         by_pose = points_by_pose(local)
-        C = own + by_pose @ between(s, s.solved) @ np.swapaxes(by_pose, 1, 2)
+        in_world = (marks.information[rows, 0, 0] > 0)[:, None, None]
+        by_motion = np.where(in_world, s.covariance[-6:, -6:], between(s, s.solved))
+        C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
         uv, J = rig.left.project_with_jacobian(local)
         S = with_noise(J @ C @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
         return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
@@ -108,7 +110,7 @@ class Steps:
             found = self._agreement(s, points, z, guess)
             s = replace(s, contradicted=found.contradicted)
             if not found.used.any():
-                return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids)
+                return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
             s, used, nis = self._solved(s, found, points, z)
         except np.linalg.LinAlgError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"window: the pose cannot be solved for: {error}")
@@ -142,7 +144,7 @@ class Steps:
 
     def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
         """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
-        R = s.poses[-1][:3, :3] if len(s.poses) else np.eye(3)
+        R = (s.poses[s.solved] if len(s.poses) else self.models.initial_pose)[:3, :3]
         information = np.linalg.inv(covariances)
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
         new = Landmarks(
@@ -224,16 +226,6 @@ def seen_from_newest(s: State, rows: IndexArray) -> tuple[Array, Array]:
     T, marks = s.poses[-1], s.landmarks
     turn = T[:3, :3].T @ s.poses[s.solved][:3, :3]
     return (marks.position[rows] - T[:3, 3]) @ T[:3, :3], turn @ marks.local[rows] @ turn.T
-
-
-def between(s: State, earlier: int) -> Array:
-    """Covariance (6, 6) of the newest pose relative to another one of the window, both perturbed on the right."""
-    if earlier == len(s.frames) - 1:
-        return np.zeros((6, 6))
-    i = 6 * earlier
-    A = adjoint(inverse(s.poses[-1]) @ s.poses[earlier])
-    P, cross = s.covariance, A @ s.covariance[i : i + 6, -6:]
-    return P[-6:, -6:] + A @ P[i : i + 6, i : i + 6] @ A.T - cross - cross.T
 
 
 def _with(s: State, new: Landmarks) -> State:

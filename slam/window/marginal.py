@@ -62,8 +62,8 @@ def marginalised(w: Window, pose: int, leaving: BoolArray) -> tuple[RelativePrio
     points = np.concatenate([leaving, np.zeros(len(w.joining), bool)])
     gone = np.concatenate([np.repeat(points, 3), np.repeat(np.arange(len(w.poses)) == pose, 6)])
     information, vector, mean, gain = kernels.schur_complement(e.H, e.b, np.flatnonzero(gone), np.flatnonzero(~gone))
-    if not np.isfinite(mean).all():
-        raise np.linalg.LinAlgError("the information of what leaves a window is not positive definite")
+    if not (np.isfinite(mean).all() and np.isfinite(e.cost)):
+        raise np.linalg.LinAlgError("what leaves a window cannot be marginalised")
     E = e.E[w.members]
     conditional = Conditional(mean, gain, E[points], E[~points])
 

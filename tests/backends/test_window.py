@@ -13,6 +13,7 @@ import backends
 from experiments.long_run import DT, MODELS, Corridor, measured
 from experiments.long_run import RIG as WALK
 from experiments.long_run import run as run_long
+from slam.data import Observations
 from slam.evaluation.metrics import chi_square_band, nees, pose_residuals
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
@@ -124,3 +125,46 @@ def test_a_copy_goes_on_to_the_same_bytes(copied, after):
     for name in ("T_world_left", "covariance", "ids", "positions", "covariances"):
         np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
     np.testing.assert_array_equal(backend.trajectory().poses, other.trajectory().poses)
+
+
+def test_a_revision_that_takes_a_depth_away_leaves_a_path():
+    rig = RIG
+    backend = backends.create("window", rig, models=EstimatorModels(pixel_sigma=0.5))
+    backend.predict(0.0)
+    depth = rig.left.fu * rig.baseline / 0.15  # of a disparity of 0.15 px
+    points = np.array([[0.1 * depth, 0.0, depth], [0.3, 0.2, 4.0], [-0.4, 0.1, 5.0], [0.2, -0.3, 6.0], [0.0, 0.3, 3.0]])
+    left, right = rig.project(points)
+    seen = Observations(np.arange(5), left, right)
+    backend.add(seen)
+    backend.predict(0.1)
+    backend.update(seen)
+    backend.revise(lambda z: z + np.array([0.0, 0.0, 0.5]))
+    assert len(backend.trajectory()) == 2
+
+
+def test_a_landmark_known_in_the_world_is_as_uncertain_as_the_pose():
+    pose = np.eye(4)
+    pose[:3, :3] = se3.so3_exp(np.array([0.0, np.pi / 2, 0.0]))
+    models = EstimatorModels(initial_position_sigma=0.3, initial_rotation_sigma=0.05, T_world_left=pose.tolist())
+    covariances = np.diag([0.04, 1e-4, 1e-4])[None]  # along what the camera sees as depth
+    deviations = []
+    for name in ("ekf", "window"):
+        backend = backends.create(name, RIG, models=models)
+        backend.insert(np.array([7]), (pose[:3, :3] @ [0.1, 0.1, 5.0])[None], covariances)
+        prediction = backend.predict(0.0)
+        deviations.append(np.sqrt(np.trace(prediction.innovation[0])))
+    assert deviations[1] == pytest.approx(deviations[0], rel=0.05)
+
+
+def test_blind_for_longer_than_the_window_landmarks_become_as_uncertain_as_in_the_smoother():
+    deviations = {}
+    for name in ("smoother", "window"):
+        backend = backends.create(name, RIG, models=EstimatorModels(MotionModel(0.1, 0.02), pixel_sigma=0.5))
+        points = np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 8), (40, 3))
+        seen = Observations(np.arange(40), *RIG.project(points))
+        for k in range(30):
+            prediction = backend.predict(0.1 * k)
+            if k < 8:
+                backend.add(seen) if not k else backend.update(seen)
+        deviations[name] = np.median(np.sqrt(np.trace(prediction.innovation, axis1=1, axis2=2)))
+    assert deviations["window"] == pytest.approx(deviations["smoother"], rel=0.05)
