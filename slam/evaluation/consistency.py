@@ -198,6 +198,11 @@ def _mean(values: Array) -> float:
 _JUDGED = {"NEES over 10 m": "over 10 m", "NEES over 1 m": "over 1 m", "mean NEES": "from the start"}
 
 
+def _is_number(figure: float | None) -> bool:
+    """Whether a figure could be had; files have null where not."""
+    return figure is not None and bool(np.isfinite(figure))
+
+
 def verdict(figures: dict[str, float]) -> str:
     """One line in words on what the figures say, by which of them and why; empty where there are none.
 
@@ -206,7 +211,7 @@ def verdict(figures: dict[str, float]) -> str:
     ratios = {
         where: float(np.sqrt(figures[key] / _DOF))
         for key, where in _JUDGED.items()
-        if np.isfinite(figures.get(key, np.nan)) and figures.get(f"no covariance {where}", 0.0) <= 0.5
+        if _is_number(figures.get(key)) and (figures.get(f"no covariance {where}") or 0.0) <= 0.5
     }
     if not ratios:
         return ""

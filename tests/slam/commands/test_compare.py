@@ -10,10 +10,10 @@ def test_the_command_leaves_report_and_tables_and_says_what_follows(slam_command
         "--workers", 1, "--quick", "--out", tmp_path / "out",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("2 runs, 12 frames in all, 1 at a time on this machine\n")
+    assert done.stdout.startswith("4 runs, 24 frames in all, 1 at a time on this machine: about ")
     assert "ATE RMSE" in done.stdout
-    assert "One trial cannot tell" in done.stdout
-    assert "2 runs, 0 failed" in done.stdout
+    assert "With 2 trials nothing can be certain" in done.stdout
+    assert "4 runs, 0 failed" in done.stdout
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "report.html", "runs.csv", "means.csv", "differences.csv", "timings.csv", "sweep.json", "runs",
