@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import slam
 from experiments.ablation_parts import ALL_ON, CASES, GROUPS, Case, Variant, error_of, opened
 from experiments.common import script_options, timed
-from experiments.perturbations import BACKENDS, NONE, features_of, frames_of
+from experiments.perturbations import NONE, features_of, frames_of
 from experiments.tables import markdown
 from frontends import create
 from slam.data import StereoFeatures
@@ -35,6 +35,8 @@ from slam.interfaces import Frontend
 from slam.run.summary import RunRecord
 from slam.sequences import Sequence
 from slam.system import StereoSlam
+
+BACKENDS = ("ekf", "smoother")  # whose parts are switched off
 
 _LONG = 100  # frames from which a sequence comes last
 #: What was decided by these tables, without figures: they are above it.
