@@ -11,19 +11,25 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg.blas import dsyrk
 from threadpoolctl import threadpool_limits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.backends import bare_dsyrk, seconds, standing
+import backends
 from experiments.common import script_options, timed
-from experiments.long_run import Corridor, run
+from experiments.long_run import DT, MODELS, RIG, Corridor, measured, run
 from experiments.tables import markdown, write_json
 from slam.config import SystemConfig
+from slam.geometry import se3
+from slam.geometry.se3 import Array
+from slam.interfaces import Backend
 from slam.registry import ONLINE
 from slam.sequences import open_sequence
 from slam.system import StereoSlam
@@ -56,6 +62,60 @@ class Point:
         """As `HEADER`."""
         ratio = None if not self.floor else self.milliseconds / self.floor
         return [self.by, self.what, self.size, self.milliseconds, self.floor, ratio]
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """CPU time of one call."""
+    start = time.thread_time()
+    call()
+    return time.thread_time() - start
+
+
+def mapped(
+    name: str, size: int, ahead: int, rng: np.random.Generator, **options: object
+) -> tuple[Backend, Array, set[int], float]:
+    """A back end that has turned once around, with `size` landmarks in its map, `ahead` of them in front.
+
+    Returns the back end, which is back where it started and still, all points (N, 3), those of the map, and the time.
+    """
+    direction = rng.standard_normal((8 * size + 20 * ahead, 3)) * (1, 0.4, 1)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = direction * rng.uniform(4, 12, (len(direction), 1))
+    backend, known, turns = backends.create(name, RIG, models=MODELS, **options), set[int](), 40
+    for k in range(turns + 5):
+        T = se3.exp(np.array([0, 2 * np.pi * min(k, turns) / turns, 0, 0, 0, 0]))
+        seen = measured(T, points, np.arange(len(points)), rng)
+        seen = seen.select(rng.permutation(len(seen)))
+        backend.predict(DT * k)
+        old = np.array([i in known for i in seen.ids.tolist()])
+        backend.update(seen.select(np.flatnonzero(old)[:20]))
+        wanted = ahead if k == 0 else -(-(size - len(known)) // max(1, turns - 8 - k))
+        new = seen.select(np.flatnonzero(~old)[: min(wanted, size - len(known))])
+        backend.add(new)
+        known.update(new.ids.tolist())
+    assert len(known) == size
+    return backend, points, known, DT * (turns + 4)
+
+
+def standing(name: str, size: int, count: int, frames: int, **options: object) -> Iterator[tuple[float, float, float]]:
+    """CPU seconds of predict, of update and of gtsam in both, where `count` of a map of `size` are measured."""
+    rng = np.random.default_rng(0)
+    backend, points, known, stamp = mapped(name, size, count + 10 + count // 10, rng, **options)
+    ids = np.array(sorted(known))
+    for k in range(1, frames + 1):
+        seen = measured(np.eye(4), points[ids], ids, rng).select(np.arange(count))
+        before = getattr(backend, "solver_seconds", 0.0)
+        predict = seconds(partial(backend.predict, stamp + k * DT))
+        update = seconds(partial(backend.update, seen))
+        yield predict, update, getattr(backend, "solver_seconds", 0.0) - before
+
+
+def bare_dsyrk(landmarks: int, count: int) -> Callable[[], object]:
+    """The one thing that a filter of this size cannot do without."""
+    n = 12 + 3 * landmarks
+    P = np.asfortranarray(np.eye(n))
+    W = np.asfortranarray(1e-3 * np.random.default_rng(0).standard_normal((n, 3 * count)))
+    return lambda: dsyrk(-1.0, W, beta=1.0, c=P, lower=1, overwrite_c=1)
 
 
 def by_size(by: str, name: str, landmarks: int, count: int, frames: int) -> Point:

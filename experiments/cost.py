@@ -47,10 +47,6 @@ PARTS = (
         "alone, the same frames without the detector.",
     ),
     Part(
-        "backends", "The filter over the bare update of its covariance",
-        "Medians of a camera that stands still, means of one that turns around once (last column).",
-    ),
-    Part(
         "command", "Whole runs",
         "`slam run` with nothing compiled and once more, and its peak memory.", ("--only", "memory"),
     ),

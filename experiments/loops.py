@@ -6,7 +6,7 @@
 Features of streets along true roads (``kitti_paths`` of the data folder), or of the built-in town where there is no
 such folder. The system is told a focal length that is 0.5 % too long, so that the path drifts. Prints a Markdown table
 and draws the paths. A loop is false where its two frames are farther apart than it may see (``_FAR``), or its pose is
-wrong by more than a tenth of that. Tables of `experiments.loops_parts` follow.
+wrong by more than a tenth of that.
 """
 
 from __future__ import annotations
@@ -249,7 +249,6 @@ def main() -> None:
     parser.add_argument("--paths", nargs="*", default=["06"])
     parser.add_argument("--backend", nargs="*", default=list(ONLINE))
     parser.add_argument("--memory", action="store_true", help="measure it; takes twice the time")
-    parser.add_argument("--only-paths", action="store_true")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--option", nargs="*", default=[])
     given = parser.parse_args()
@@ -265,17 +264,6 @@ def main() -> None:
     print(tables(rows))
     write_json(given.out / "loops.json", HEADER, rows)
     draw(runs, given.out)
-    if given.only_paths:
-        return
-    from experiments import loops_parts as parts
-
-    print("\nTowns where half of the stretches of the streets look like another one, driven with `ekf`:\n")
-    print(parts.alike(1 if given.quick else 10))
-    if not given.quick:
-        print("\n`smoother`, bounded as by default, against the full one, on the same features, six seeds each:\n")
-        print(parts.bounded())
-    print("\nA path of laps, with loops back to the first one:\n")
-    print(parts.cost(500 if given.quick else 5000))
 
 
 if __name__ == "__main__":

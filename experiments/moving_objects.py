@@ -4,10 +4,9 @@
         [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
-paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
-movers), street, people (cyclists, walkers), kitti (two overtaking cars), cyclists (KITTI raw 0001, several starts).
-Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
-they give noisy observations without images.
+boxes, occlusion (the box's id after it was hidden), still (no false movers), people (cyclists, walkers), kitti (two
+overtaking cars), cyclists (KITTI raw 0001, several starts). Prints Markdown tables, leaves them in DIR as JSON. Worlds
+are rendered and SURF runs on them; with `--observations` they give noisy observations without images.
 """
 
 from __future__ import annotations
@@ -36,25 +35,20 @@ from experiments.object_runs import (
     system_for,
 )
 from experiments.tables import markdown
-from experiments.twins import Twins
-from slam import registry
-from slam.compare.measure import Metric
-from slam.compare.statistics import difference
-from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.object_data import MovingObject
-from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
+from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
 BACKENDS = ("ekf", "smoother")  # those that estimate bodies
-PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti", "cyclists")
+PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")
 TITLES = {
     "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
-    "paired": "Both back ends on the same measurements", "boxes": "Four boxes", "occlusion": "The box is hidden",
-    "still": "Nothing moves", "street": "A street", "people": "People", "kitti": "Cars of KITTI raw 0013",
+    "boxes": "Four boxes", "occlusion": "The box is hidden",
+    "still": "Nothing moves", "people": "People", "kitti": "Cars of KITTI raw 0013",
     "cyclists": "Cyclists of KITTI raw 0001",
 }  # fmt: skip
 # The box moves in frames 60 to 105: from which frame it is watched, when it vanishes, and for how many frames.
@@ -161,38 +155,6 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     plt.close(figure)
 
 
-def paired(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Both back ends on identical measurements, bodies included: the filter drives, the smoother is given the same."""
-    seeds, frames = (1, 90) if quick else (6, 200)
-    values: dict[str, list[list[float]]] = {}
-    for seed in range(seeds):
-        name = f"box?density=300&camera=moving&seed={seed}"
-        sequence = slam.open_sequence(f"synthetic:{name}")
-        config = SystemConfig.for_kind(sequence.kind, "surf" if images else None, "ekf")
-        pair = [registry.create("backends", name, sequence.rig, models=config.models) for name in BACKENDS]
-        twins = Twins(*pair)
-        system = slam.StereoSlam(sequence.rig, "surf" if images else None, twins, config=config)
-        scores = [score_for(sequence) for _ in BACKENDS]
-        for k, result, labels in steps(name, system, images, frames):
-            scores[0].add(k, result, labels)
-            scores[1].add(k, twins.seen_by_follower(result), labels)
-        bodies = [score.body(1) for score in scores]
-        for key in ("ME", "relative, 10 frames"):
-            for part, scale in (("rotation median [deg]", 1.0), ("translation median [m]", 1e3)):
-                both = [scale * body.get(key, {}).get(part, np.nan) for body in bodies]
-                values.setdefault(f"{key}, {part.replace('[m]', '[mm]')}", []).append(both)
-    rows = []
-    for name, pairs in values.items():
-        first, second = np.array(pairs).T
-        found = difference(Metric(name, name, "lower"), first, second)
-        rows.append({
-            "figure": name, "pairs": found.pairs, "ekf": found.reference, "smoother": found.other,
-            "smoother less ekf": f"{found.mean:.3g} ({found.low:.3g} to {found.high:.3g})", "p": found.p,
-            "verdict": found.verdict.value,
-        })  # fmt: skip
-    return rows
-
-
 def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     """Three boxes and an articulated one, in three rooms: one run tells little of how they are counted."""
     frames, seeds = (20, 1) if quick else (300, 3)
@@ -239,11 +201,6 @@ def still(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
     seeds, frames = (1, 15) if quick else (10, 100)
     worlds = ("aisle?speed=2&", "desk?density=200&", "field?", "street?cars=0&")
     return [scored_run(f"{w}seed={seed}", "ekf", images, frames)[0] for w in worlds for seed in range(seeds)]
-
-
-def street(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Cars that drive ahead and come towards the camera."""
-    return [scored_run("street?density=3", backend, images, 20 if quick else 10**6)[0] for backend in BACKENDS]
 
 
 def people(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
@@ -432,26 +389,14 @@ def main() -> int:
     parser.add_argument("--resume", action="store_true", help="parts that are in the folder already are not run again")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    parts = {
-        "table1": table1,
-        "moving": moving,
-        "paired": paired,
-        "boxes": boxes,
-        "occlusion": occlusion,
-        "still": still,
-        "street": street,
-        "people": people,
-        "kitti": kitti,
-        "cyclists": cyclists,
-    }
     for name in arguments.only.split(","):
         kept = arguments.out / f"{name}.json"
         if arguments.resume and kept.exists():
             rows = json.loads(kept.read_text())
         else:
-            rows = parts[name](not arguments.observations, arguments.quick, arguments.out)
+            rows = globals()[name](not arguments.observations, arguments.quick, arguments.out)
         shown = worlds_together(rows) if name == "still" else rows
-        print(f"\n# {TITLES[name]}\n\n{parts[name].__doc__}\n\n{table(shown)}", flush=True)
+        print(f"\n# {TITLES[name]}\n\n{globals()[name].__doc__}\n\n{table(shown)}", flush=True)
         kept.write_text(json.dumps(rows, indent=2, default=str) + "\n")
     return 0
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+import re
 import sys
 import tokenize
 from dataclasses import dataclass
@@ -28,8 +29,8 @@ ROOMS = (
 
 INTRODUCTION = """# Parameters
 
-Every number in the algorithms that is not a setting, with what it is and where it comes from. Settings are listed by
-`slam run --help` and in the [reference](running.md). The table is made by `python experiments/parameters.py`.
+The numbers in the algorithms that are not settings (`slam settings` lists those): how many there are of each kind, and
+every one that was chosen. The others stand with their reasons in the code. Made by `python experiments/parameters.py`.
 """
 
 #: What kinds of numbers there are; a constant's comment begins with its kind, and is a choice where it does not.
@@ -44,17 +45,11 @@ KINDS = {
 }
 
 SENSITIVITY = """\
-The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position,
-and that of the bodies' motion, each as a ratio to the error with the default. It is the worse of both back ends, and
-the geometric mean over short runs of {cases} (`python experiments/sensitivity.py`).
-Under small perturbations of the pixels the errors scatter by factors of {camera:.2f} and {bodies:.2f}: a number whose
-ratios lie within does not matter there. The words for what else may happen:
-
-- "same": the same bytes. Such a choice acts only on input that these runs do not have: degenerate geometry, wrong
-  matches, a kidnapped camera, bodies that hide each other.
-- "fails": a run did not end, or lost the camera or the bodies.
-- "not read": none of these runs comes to the code that reads the number, as that for faults and long runs.
-- Empty: not measured, as it is compiled into a kernel, read on import, part of the front end{rest}.
+The columns ½ and 2 say what happens where the number is half and twice as large: the error of the camera's position and
+of the bodies' motion, as ratios to that with the default, the worse of two back ends, geometric mean over short runs of
+{cases} (`python experiments/sensitivity.py`). Under small perturbations of the pixels errors scatter by factors of
+{camera:.2f} and {bodies:.2f}. "same": the same bytes; "fails": a run did not end, or lost the camera or the bodies;
+"not read": none of these runs comes to the code; empty: not measured.
 """
 
 #: What a number does at half or twice its value, by column of the summary.
@@ -147,30 +142,27 @@ def _comment(comments: dict[int, tuple[str, bool]], first: int, last: int | None
 
 
 def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
-    """The page as Markdown."""
+    """The page as Markdown: how many numbers of each kind there are, and the choices, one by one."""
     ratios, scatter = sensitivity.get("ratios", {}), sensitivity.get("scatter", {})
     measured = {p: ratios.get(f"{p.module}:{p.name}") for p in parameters}
-    lines = [INTRODUCTION, _row(["kind", "what it is", "numbers", *(OUTCOMES if ratios else [])])]
-    lines.append(_row(["---", "---", "---:", *(["---:"] * len(OUTCOMES) if ratios else [])]))
+    lines = [INTRODUCTION, _row(["kind", "what it is", "numbers", *OUTCOMES])]
+    lines.append(_row(["---", "---", "---:", *["---:"] * len(OUTCOMES)]))
     for kind, meaning in KINDS.items():
         chosen = [p for p in parameters if p.kind == kind]
-        outcomes = [_outcome(measured[p], scatter) for p in chosen] if ratios else []
-        counts = [str(outcomes.count(o)) for o in OUTCOMES] if ratios else []
-        lines.append(_row([f"[{kind}](#{kind})", meaning, str(len(chosen)), *counts]))
-    lines.append("")
+        outcomes = [_outcome(measured[p], scatter) for p in chosen]
+        lines.append(_row([kind, meaning, str(len(chosen)), *(str(outcomes.count(o)) for o in OUTCOMES)]))
     if ratios:
-        rest = "" if sensitivity["complete"] else ", or to be run still"
         cases = ", ".join(f"`{case}`" for case in sensitivity["cases"])
-        lines.append(SENSITIVITY.format(cases=cases, rest=rest, **scatter))
-    titles = ["file", "name", "value", "what it is", *(["½", "2"] if ratios else [])]
-    rule = ["---", "---", "---:", "---", *(["---:", "---:"] if ratios else [])]
-    for kind in KINDS:
-        lines += [f"## {kind}\n", _row(titles), _row(rule)]
-        for p in (p for p in parameters if p.kind == kind):
-            cells = [p.file, f"`{p.name}`", str(p.value), p.comment.replace("|", "\\|")]
-            lines.append(_row([*cells, *(map(_ratio, measured[p] or [{}, {}]) if ratios else [])]))
-        lines.append("")
-    return "\n".join(lines)
+        lines += ["", SENSITIVITY.format(cases=cases, **scatter)]
+    lines += ["## Choices", "", _row(["name", "value", "what it is", "½", "2"]), "| --- | ---: | --- | ---: | ---: |"]
+    file = ""
+    for p in (p for p in parameters if p.kind == "choice"):
+        if p.file != file:
+            file = p.file
+            lines.append(_row([f"**{file}**", "", "", "", ""]))
+        text = re.split(r"(?<!\d)[.:;]\s", p.comment)[0].removesuffix(".").replace("|", "\\|")
+        lines.append(_row([f"`{p.name}`", str(p.value), text, *map(_ratio, measured[p] or [{}, {}])]))
+    return "\n".join(lines) + "\n"
 
 
 def _outcome(measured: list[dict[str, Any]] | None, scatter: dict[str, float]) -> str:

@@ -1,21 +1,18 @@
-"""The results page and the gallery: every experiment in one command, its tables and figures with what the papers had.
+"""The results: every experiment in one command, its tables and figures with what the papers had, a page per question.
 
     SLAM_DATA=/path/to/data python experiments/results.py [--quick] [--only NAME …] [--out DIR] [--page FILE]
-        [--processes N] [--resume]
+        [--processes N]
 
-Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of the
-page, and the pictures that it leaves are copied beside the page. A script that fails is said on the page, and the exit
-status is 1; the others run all the same. ``--processes 2`` runs two at once, which spoils their times. ``--only``
-replaces the sections of some scripts and leaves the others of the page as they are. ``--resume`` takes from its folder
-what ran to its end in an earlier call with the same code and versions, and runs the rest. The
-pictures make up the gallery, ``gallery.md`` beside the page.
+Runs the scripts beside this one, each with a folder of its own; what a script prints as Markdown is its section of a
+page in the folder ``results`` beside the first page, and the pictures that it leaves are copied there. A script that
+fails is said on its page, and the exit status is 1; the others run all the same. ``--processes 2`` runs two at once,
+which spoils their times. ``--only`` replaces the sections of some scripts and leaves the others as they are.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import json
 import os
 import shutil
 import subprocess
@@ -29,8 +26,6 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments import loops
-from experiments.explanations import caption, explained
-from slam.compare.revision import made_with
 from slam.run.repeat import versions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,16 +37,18 @@ class Experiment:
 
     Attributes:
         name: of the script, without ``.py``.
+        page: one of `PAGES`.
         title: heading of its section.
         paper: what the paper had; empty for our own.
-        pictures: of those that it leaves, the ones to be shown, as patterns.
+        pictures: captions of those that are shown, by name.
         arguments: of its long form.
     """
 
     name: str
+    page: str
     title: str
     paper: str = ""
-    pictures: tuple[str, ...] = ("*.png",)
+    pictures: dict[str, str] | None = None
     arguments: tuple[str, ...] = ()
 
     def command(self, quick: bool) -> list[str]:
@@ -59,100 +56,99 @@ class Experiment:
         return [f"experiments/{self.name}.py", *(["--quick"] if quick else self.arguments)]
 
 
+#: Title and question of each page, by its name.
+PAGES = {
+    "recordings": ("Real recordings", "How far from the truth are paths on real drives, and what is each part worth?"),
+    "honesty": ("Covariances", "Do the back ends know how sure they are, also with a wrong calibration?"),
+    "papers": ("The papers' experiments", "What did the papers find, and what is found here?"),
+    "objects": ("Moving objects", "Are bodies found without being told, and how well are their motions known?"),
+    "loops": ("Loops", "What does closing loops give on long drives that come back?"),
+    "faults": ("Faults", "What do blackouts, lost frames, a kidnapped camera, and spoilt images do?"),
+    "cost": ("Cost", "What does a frame cost, next to others, and how does that grow?"),
+}
+ERRORS = "Error of the position along the world's axes, and three times its claimed standard deviation."
 EXPERIMENTS = (
     Experiment(
-        "detector", "D_threshold, octaves, radius (A, III.A)",
+        "real_sequences", "recordings", "Real sequences", pictures={"paths": "From above, aligned with the true ones."}
+    ),
+    Experiment("ablation", "recordings", "What each part is worth"),
+    Experiment(
+        "consistency", "honesty", "Do the back ends know how sure they are?", arguments=("--seeds", "30"), pictures={
+            "consistency": "Above: error of the newest position and the bound. Below: NEES of its pose and the band."
+        },
+    ),
+    Experiment("calibration", "honesty", "Self-calibration: wrong rigs, and one rig on two drives"),
+    Experiment(
+        "detector", "papers", "D_threshold, octaves, radius (A, III.A)",
         "One 320x240 webcam image: 837 features at D_threshold 0, 41 at 10000; "
         "radii grow with the octave and numbers fall; octaves 3 and 4 are left out.",
+        {"detector": "Left: features found with a threshold, by octave. Middle: time to detect them. Right: radii."},
     ),
     Experiment(
-        "descriptors", "16 and 64 dimensions, known points (A, III.B, first experiment)",
+        "descriptors", "papers", "16 and 64 dimensions, known points (A, III.B, first experiment)",
         "16-D takes 45 % less time for 100 to 800 features, and is best in the estimation of known points; no figures "
         "of the latter are printed.",
+        {"descriptors": "Left: time of description. Right: error of the map's points, a line for each seed."},
     ),
     Experiment(
-        "aisle", "The bookshelf aisle (A, V, Figs. 5 and 6)",
+        "aisle", "papers", "The bookshelf aisle (A, V, Figs. 5 and 6)",
         "1524 frames, 318 landmarks, about 10 features used per frame; mean pose deviation under 1.5 cm, peak 3 cm; no "
         "ground truth is named.",
+        {
+            "errors": ERRORS,
+            "map_3d": "The map at the end with ellipsoids of two standard deviations (paper A, Fig. 5).",
+            "top_view": "The map from above with ellipses of two standard deviations (paper A, Fig. 6).",
+        },
     ),
     Experiment(
-        "startup", "Start-up from stored features (B, 4.2, Fig. 6)",
+        "startup", "papers", "Start-up from stored features (B, 4.2, Fig. 6)",
         "Camera truly at [3, −70, 2.7] cm, started at [0, 0, 0]: stopped at [0, −55.8, 3.7], 15 cm off.",
+        {"startup": "Left and middle: from three wrong starts to the true place in one frame. Right: the error then."},
     ),
     Experiment(
-        "walking_robot", "Walking robot (B, 4.3, Fig. 8)", "Map and states in 3D; no ground truth, no figures.",
-        ("map_3d.png", "errors.png"),
+        "walking_robot", "papers", "Walking robot (B, 4.3, Fig. 8)",
+        "Map and states in 3D; no ground truth, no figures.", {"map_3d": "The map at the end.", "errors": ERRORS},
     ),
     Experiment(
-        "moving_objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
+        "moving_objects", "objects", "Moving box, moving objects (B, 4.4, Table 1, Fig. 10)",
         "A box at four places by three features; Table 1 prints roll, pitch, yaw and translation, no ground truth.",
+        {"box": "Error of the box's pose while it moves and rests, body frames aligned once."},
     ),
-    Experiment("consistency", "Do the back ends know how sure they are?", arguments=("--seeds", "30")),
-    Experiment("long_run", "Cost growth: time and memory along a walk", arguments=("--frames", "4000")),
-    Experiment("cost", "What a frame costs, next to others", "", ("growth.png",)),
     Experiment(
-        "policies", "Policies of map management", arguments=("--frames", "930:1050", "--seeds", "6", "--processes", "1")
-    ),
-    Experiment("faults", "Blackout, dropped frames, a kidnapped camera"),
-    Experiment("frame_rate", "What a frame rate costs in accuracy"),
-    Experiment("informative", "How many measurements a frame needs", "", ("informative.png",)),
-    Experiment("ablation", "What each part is worth"),
-    Experiment("starry_night", "Starry Night: stereo observations and a known state"),
-    Experiment(
-        "loops", "Long drives that come back: loops closed",
+        "loops", "loops", "Long drives that come back: loops closed",
         arguments=("--paths", "00", "05", "06", "07", "09", "--set", *loops.QUICK),
+        pictures={"loops": "From above: true, without loops, and at the end with loops; circles: loops closed."},
     ),
     Experiment(
-        "recorded_tracks", "Recorded tracks of a drive, with more and more wrong matches",
-        arguments=("--wrong", "0", "0.05", "0.1", "0.2", "--seeds", "5", "--moved", "0", "-0.19"),
+        "faults", "faults", "Blackout, dropped frames, a kidnapped camera",
+        pictures={"faults": "Error of the position, frame by frame; the fault is grey."},
     ),
-    Experiment("calibration", "Self-calibration: wrong rigs, and one rig on two drives"),
-    Experiment("residuals", "Errors of pixels that last"),
-    Experiment("whole_drives", "Real drives many times over, to their end"),
-    Experiment("perturbations", "Real drives many times over, and spoilt"),
-    Experiment("real_sequences", "Real sequences"),
+    Experiment("perturbations", "faults", "Real drives many times over, and spoilt"),
+    Experiment("cost", "cost", "What a frame costs, next to others", pictures={"growth": "Floors are dashed."}),
 )  # fmt: skip
 
+#: What the first page shows: of which experiment, which picture.
+SHOWN = (("real_sequences", "paths"), ("consistency", "consistency"), ("aisle", "top_view"))
 
-#: Those whose pictures are among the documentation's.
-WORLDS = ("aisle", "box", "boxes", "desk", "field", "people", "startup", "street")
 
-
-def run(experiment: Experiment, out: Path, quick: bool) -> tuple[str, str]:
+def run(experiment: Experiment, folder: Path, quick: bool) -> tuple[str, str]:
     """Run a script: what it printed, and why it failed (empty where it did not)."""
-    script = ROOT / "experiments" / f"{experiment.name}.py"
-    if not script.exists():
+    if not (ROOT / "experiments" / f"{experiment.name}.py").exists():
         return "", "there is no such script"
+    out = (folder / experiment.name).absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    for left in out.glob("*.png"):
+        left.unlink()
+    print(f"{experiment.name} …", file=sys.stderr, flush=True)
+    began = time.monotonic()
     command = [sys.executable, *experiment.command(quick), "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if line.strip()]
-        return done.stdout, f"exit status {done.returncode}: {lines[-1] if lines else 'nothing was said'}"
-    return done.stdout, ""
-
-
-def printed_by(experiment: Experiment, folder: Path, quick: bool, resume: bool) -> tuple[str, str]:
-    """What a script prints, now or in an earlier call of the same code, and why it failed; kept beside its files."""
-    out = (folder / experiment.name).absolute()
-    out.mkdir(parents=True, exist_ok=True)
-    kept = out / "printed.json"
-    made = {"command": experiment.command(quick), "versions": made_with([ROOT / "experiments"])}
-    if resume and kept.exists():
-        before = json.loads(kept.read_text(encoding="utf-8"))
-        if before["made"] == made:
-            return before["printed"], ""
-        print(f"{experiment.name}: made by other code, run again", file=sys.stderr, flush=True)
-    for left in [kept, *out.glob("*.png")]:
-        left.unlink(missing_ok=True)
-    print(f"{experiment.name} …", file=sys.stderr, flush=True)
-    began = time.monotonic()
-    printed, failure = run(experiment, out, quick)
-    ended = failure or f"done in {time.monotonic() - began:.0f} s"
-    print(f"{experiment.name}: {ended}", file=sys.stderr, flush=True)
-    if not failure:
-        kept.write_text(json.dumps({"made": made, "printed": printed}, indent=2) + "\n", encoding="utf-8")
-    return printed, failure
+    lines = [line for line in done.stderr.splitlines() if line.strip()] or ["nothing was said"]
+    failure = f"exit status {done.returncode}: {lines[-1]}" if done.returncode else ""
+    took = failure or f"done in {time.monotonic() - began:.0f} s"
+    print(f"{experiment.name}: {took}", file=sys.stderr, flush=True)
+    return done.stdout, failure
 
 
 def described(experiment: Experiment) -> str:
@@ -163,93 +159,52 @@ def described(experiment: Experiment) -> str:
 
 
 def copied_pictures(experiment: Experiment, out: Path, page: Path) -> list[str]:
-    """Markdown for the pictures that a script has left; they go to ``images/results`` beside the page."""
+    """Markdown for the pictures that a script has left; they go to ``images/results`` beside the first page."""
     shown = []
-    for picture in sorted({p for pattern in experiment.pictures for p in out.glob(pattern)}):
-        target = page.parent / "images" / "results" / f"{experiment.name}_{picture.name}"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(picture, target)
-        said = caption(experiment.name, picture.stem)
-        image = f"![{said or f'{experiment.title}: {picture.stem}'}](images/results/{target.name})"
-        shown.append(f"{image}\n\n*{said}*" if said else image)
+    for name, said in (experiment.pictures or {}).items():
+        target = page.parent / "images" / "results" / f"{experiment.name}_{name}.png"
+        if (out / f"{name}.png").exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(out / f"{name}.png", target)
+            shown.append(f"![{said}](../images/results/{target.name})\n\n*{said}*")
     return shown
 
 
 def section(experiment: Experiment, printed: str, failure: str, pictures: Sequence[str], quick: bool) -> str:
-    """A script's section of the page."""
-    lines = [f"## {experiment.title}", "", described(experiment), ""]
-    if experiment.paper:
-        lines += [f"**The paper:** {experiment.paper}", ""]
-    if failure:
-        lines += [f"**Failed:** {failure}", ""]
-    lines += [explained(experiment.name, printed), "", demoted(printed), ""]
-    for picture in pictures:
-        lines += [picture, ""]
-    lines += [f"`python {' '.join(experiment.command(quick))}`", ""]
-    return "\n".join(lines)
+    """A script's section of its page; headings that it printed stand below the section's."""
+    text = "\n".join(f"##{line}" if line.startswith("#") else line for line in printed.strip().splitlines())
+    parts = [f"## {experiment.title}", described(experiment)]
+    parts += [f"**The paper:** {experiment.paper}"] if experiment.paper else []
+    parts += [f"**Failed:** {failure}"] if failure else []
+    return "\n\n".join([*parts, text, *pictures, f"`python {' '.join(experiment.command(quick))}`\n"])
 
 
-def with_sections(page: str, chosen: Sequence[Experiment], sections: Sequence[str]) -> str:
-    """A page with the sections of some experiments replaced, or added at its end; the others stay as they are."""
-    parts = page.split("\n## ")
-    for experiment, text in zip(chosen, sections):
-        new = text.removeprefix("## ").rstrip("\n") + "\n"
-        at = next((i for i, part in enumerate(parts) if part.split("\n")[0] == experiment.title), None)
-        if at is None:
-            parts.append(new)
-        else:
-            parts[at] = new
-    return "\n## ".join(parts)
+def with_section(page: str, title: str, text: str) -> str:
+    """A page with the section of this title replaced, or added at its end; the others stay as they are."""
+    parts = page.rstrip("\n").split("\n## ")
+    at = next((i for i, part in enumerate(parts) if part.split("\n")[0] == title), len(parts))
+    parts[at : at + 1] = [text.removeprefix("## ").rstrip("\n") + "\n"]
+    return "\n## ".join(part.rstrip("\n") + "\n" for part in parts)
 
 
-def gallery(pictures: Sequence[tuple[Experiment, Sequence[str]]]) -> str:
-    """The page of pictures; of the worlds and the demo they are there already."""
-    lines = [
-        "# Gallery", "",
-        "Pictures of the experiments, the demo and the worlds. [Results](results.md) says what each picture of an "
-        "experiment shows. Written by `python experiments/results.py`.", "",
-    ]  # fmt: skip
-    for experiment, shown in pictures:
-        if shown:
-            lines += [f"## {experiment.title}", "", *(line for picture in shown for line in (picture, ""))]
-    lines += [
-        "## The demo", "",
-        "`slam demo`: the map of the bookshelf aisle that each back end makes. Red triangles: measured in the last "
-        "frame; grey: landmarks of before; the squared line is the box.",
-        "", "![Top view of both maps](images/demo_top_view.png)", "",
-        "## The worlds", "", "Drawn by `python docs/make_world_pictures.py`; see [worlds](worlds.md).", "",
-    ]  # fmt: skip
-    return "\n".join([*lines, *(f"![{name}](images/worlds/{name}.jpg)" for name in WORLDS), ""])
-
-
-def demoted(text: str) -> str:
-    """Markdown whose headings stand below the section's."""
-    return "\n".join(f"##{line}" if line.startswith("#") else line for line in text.strip().splitlines())
-
-
-def head(quick: bool) -> str:
-    """Title, and with what the page was made."""
-    used = ", ".join(f"{name} {version}" for name, version in versions().items())
+def page_head(name: str, quick: bool) -> str:
+    """Title, question, and with what the page was made."""
+    used = ", ".join(f"{package} {version}" for package, version in versions().items())
     short = " in its short form, which shows that everything runs, and no more" if quick else ""
+    title, question = PAGES[name]
     return (
-        "# Results\n\nBoth papers' experiments and our own. Papers A and B: see [the papers](papers.md); errors, "
-        "covariances and NEES: see [concepts](concepts.md). A click on *What the columns say* explains the tables of a "
-        "section, and its last line is the command that makes it.\n\nThis page is written by "
-        f"`python experiments/results.py`{short}; nothing in it is typed in. With {used}.\n"
+        f"# {title}\n\n{question} Errors, covariances and NEES: see [concepts](../concepts.md). Written by "
+        f"`python experiments/results.py`{short}, with {used}.\n"
     )
 
 
-def summary() -> str:
-    """The section that the page begins with: the README's results, whose figures tests compare with the others."""
+def first_page() -> str:
+    """The README's results, whose figures tests compare with the others; three pictures; the other pages."""
     text = (ROOT / "README.md").read_text(encoding="utf-8").partition("\n## Results\n")[2].partition("\n## ")[0]
-    return "## In short\n" + text.replace("](docs/results.md#", "](#").replace("](docs/", "](").rstrip("\n") + "\n"
-
-
-def with_summary(page: str) -> str:
-    """A page that begins with the present summary."""
-    first, *parts = page.split("\n## ")
-    parts = [part for part in parts if not part.startswith("In short\n")]
-    return "\n## ".join([first, summary().removeprefix("## "), *parts])
+    captions = {(e.name, name): said for e in EXPERIMENTS for name, said in (e.pictures or {}).items()}
+    pictures = [f"![{captions.get(shown, shown[0])}](images/results/{'_'.join(shown)}.png)" for shown in SHOWN]
+    pages = [f"- [{title}](results/{name}.md): {question}" for name, (title, question) in PAGES.items()]
+    return "\n\n".join(["# Results", "\n".join(pages), text.replace("](docs/", "](").strip(), *pictures]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -257,25 +212,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="every script in its short form")
     parser.add_argument("--only", nargs="*", choices=[e.name for e in EXPERIMENTS], help="these scripts alone")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for what the scripts leave")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md", help="the page")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results.md", help="the first page")
     parser.add_argument("--processes", type=int, default=1, help="how many scripts run at once")
-    parser.add_argument("--resume", action="store_true", help="take what the same code has left in --out")
     given = parser.parse_args(arguments)
     chosen = [e for e in EXPERIMENTS if not given.only or e.name in given.only]
     with ThreadPoolExecutor(given.processes) as pool:
-        outcomes = list(pool.map(lambda e: printed_by(e, given.out, given.quick, given.resume), chosen))
-    pictures = [(e, copied_pictures(e, given.out / e.name, given.page)) for e in chosen]
-    sections = [section(e, *outcome, shown, given.quick) for (e, shown), outcome in zip(pictures, outcomes)]
-    failed = [e.name for e, (_, failure) in zip(chosen, outcomes) if failure]
-    given.page.parent.mkdir(parents=True, exist_ok=True)
-    if given.only and given.page.exists():
-        page = with_sections(given.page.read_text(encoding="utf-8"), chosen, sections)
-    else:
-        page = "\n".join([head(given.quick), *sections])
-    given.page.write_text(with_summary(page), encoding="utf-8")
-    if not given.only:  # a part of the pictures would be no gallery
-        given.page.with_name("gallery.md").write_text(gallery(pictures), encoding="utf-8")
-    print(f"{len(sections)} experiments, {len(failed)} failed. Page: {given.page}", file=sys.stderr)
+        outcomes = list(pool.map(lambda e: run(e, given.out, given.quick), chosen))
+    folder = given.page.with_name("results")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in dict.fromkeys(e.page for e in chosen):
+        file = folder / f"{name}.md"
+        text = file.read_text(encoding="utf-8") if given.only and file.exists() else page_head(name, given.quick)
+        for experiment, outcome in zip(chosen, outcomes):
+            if experiment.page == name:
+                pictures = copied_pictures(experiment, given.out / experiment.name, given.page)
+                text = with_section(text, experiment.title, section(experiment, *outcome, pictures, given.quick))
+        file.write_text(text, encoding="utf-8")
+    given.page.write_text(first_page(), encoding="utf-8")
+    failed = sum(bool(failure) for _, failure in outcomes)
+    print(f"{len(chosen)} experiments, {failed} failed. Pages: {folder}", file=sys.stderr)
     return 1 if failed else 0
 
 

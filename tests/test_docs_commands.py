@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -145,26 +144,3 @@ def in_a_process(words, folder):
     paths = os.pathsep.join([str(ROOT), str(DOCS / "examples")])
     environment = {**os.environ, "PYTHONPATH": paths, "HOME": str(folder), "MPLBACKEND": "agg"}
     return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-
-
-def test_the_console_of_the_page_on_bad_input(reader, slam_command, tmp_path, monkeypatch):
-    shutil.copytree(reader / "euroc", tmp_path / "recording")
-    monkeypatch.chdir(tmp_path)
-    sensor = tmp_path / "recording" / "mav0" / "cam0" / "sensor.yaml"
-    sensor.write_text("\n".join([*sensor.read_text().splitlines()[:2], "{["]) + "\n")
-    (console,) = blocks(DOCS / "robustness.md", "console")
-    command, line, question, status = console.splitlines()
-    done = slam_command(*command.removeprefix("$ slam ").split())
-    assert question == "$ echo $?"
-    assert done.stderr.replace(f"{tmp_path}/", "").splitlines() == [line]
-    assert done.returncode == int(status)
-
-
-def test_the_console_of_the_page_on_self_calibration(reader, slam_command, tmp_path, monkeypatch):
-    shutil.copytree(reader / "euroc", tmp_path / "KITTI_FOLDER")
-    monkeypatch.chdir(tmp_path)
-    (console,) = blocks(DOCS / "selfcalibration.md", "console")
-    command, question, shown = console.splitlines()
-    assert slam_command(*command.removeprefix("$ slam ").split()).returncode == 0
-    done = in_a_process(shlex.split(question.removeprefix("$ ")), tmp_path)
-    assert done.stdout.startswith(shown.split("…")[0]), done.stderr

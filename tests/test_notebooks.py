@@ -36,9 +36,3 @@ def test_notebooks_run_and_show_what_is_saved(path, monkeypatch):
     assert len(shown) == len(saved) > 3
     assert shown[0] == saved[0]  # the sequence, the same everywhere
     assert sum("Figure" in text for text in shown) >= 2
-
-
-def test_notebooks_are_small_and_lie_where_the_pages_say():
-    assert [path.stem for path in NOTEBOOKS] == ["comparing_back_ends", "first_steps"]
-    for path in NOTEBOOKS:
-        assert path.stat().st_size < 400_000
