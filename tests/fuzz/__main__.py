@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz``: many cases of every class, with counts; the failures by kind, and a page for the docs."""
+"""``python -m tests.fuzz``: many cases of every class, with counts, and the failures by kind."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import logging
 import sys
 import time
 from collections import Counter
-from pathlib import Path
 
 from tests.fuzz.catalogue import SUBJECTS
 from tests.fuzz.harness import Failure, Subject, run_case, warm_up
-from tests.fuzz.page import Tally, write_page
 
 
 def main() -> int:
@@ -22,7 +20,6 @@ def main() -> int:
     parser.add_argument("--only", default="", help="classes by name, with commas")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="one case by its number, with its traceback")
-    parser.add_argument("--page", type=Path, help="write the table of classes to this Markdown file")
     arguments = parser.parse_args()
     logging.getLogger("slam").addHandler(logging.NullHandler())
     logging.getLogger("slam").propagate = False
@@ -37,15 +34,13 @@ def main() -> int:
         print("\n".join(f.detail for f in failures if f) or "holds")
         return int(any(failures))
     share = None if arguments.minutes is None else 60 * arguments.minutes / len(chosen)
-    tallies = [_run(s, arguments.seed, arguments.cases, share) for s in chosen]
-    print(f"{sum(t.cases for t in tallies)} cases, {sum(t.failed for t in tallies)} failed")
-    if arguments.page is not None:
-        write_page(arguments.page, tallies, arguments.seed)
-    return int(any(t.failed for t in tallies))
+    failed = [_run(s, arguments.seed, arguments.cases, share) for s in chosen]
+    print(f"{len(chosen)} classes, {sum(failed)} cases failed")
+    return int(any(failed))
 
 
-def _run(subject: Subject, seed: int, cases: int, seconds: float | None) -> Tally:
-    """Cases of one class, by number or for a time."""
+def _run(subject: Subject, seed: int, cases: int, seconds: float | None) -> int:
+    """Cases of one class, by number or for a time; how many failed."""
     started = time.monotonic()
     failures: list[Failure] = []
     number = 0
@@ -59,7 +54,7 @@ def _run(subject: Subject, seed: int, cases: int, seconds: float | None) -> Tall
     for signature, count in kinds.most_common():
         first = next(f.number for f in failures if f.signature == signature)
         print(f"  {count} × {signature} (first: --only {subject.name} --case {first})", flush=True)
-    return Tally(subject, number, len(failures))
+    return len(failures)
 
 
 if __name__ == "__main__":

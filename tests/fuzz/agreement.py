@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -201,25 +202,9 @@ def _play(rng: np.random.Generator, play: Play, tolerance: tuple[float, float]) 
     play.compare(*tolerance)
 
 
-def ekf(rng: np.random.Generator, folder: Path) -> None:
-    """The filter's."""
-    agree(rng, backends.create("ekf", RIG, models=MODELS), TOLERANCES["ekf"])
+def answers(name: str, rng: np.random.Generator, folder: Path) -> None:
+    """Those of a back end: ids, counts and stamps exact; pose, landmarks and covariances of dense least squares."""
+    agree(rng, backends.create(name, RIG, models=MODELS), TOLERANCES[name])
 
 
-def smoother(rng: np.random.Generator, folder: Path) -> None:
-    """The smoother's."""
-    agree(rng, backends.create("smoother", RIG, models=MODELS), TOLERANCES["smoother"])
-
-
-def batch(rng: np.random.Generator, folder: Path) -> None:
-    """The batch estimator's."""
-    agree(rng, backends.create("batch", RIG, models=MODELS), TOLERANCES["batch"])
-
-
-_PROMISE = "ids, counts, shapes and stamps exact; pose, landmarks and covariances those of dense least squares"
-
-SUBJECTS = (
-    Subject("answers of ekf", "sequences of calls with good data", _PROMISE, ekf, short=2),
-    Subject("answers of smoother", "the same", _PROMISE, smoother, short=2),
-    Subject("answers of batch", "the same", _PROMISE, batch, short=2),
-)
+SUBJECTS = tuple(Subject(f"answers of {name}", partial(answers, name), short=2) for name in TOLERANCES)

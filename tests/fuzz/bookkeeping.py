@@ -179,10 +179,4 @@ def _rows(features: StereoFeatures, rows: np.ndarray) -> StereoFeatures:
     return replace(features, **{name: getattr(features, name)[rows] for name in names})
 
 
-SUBJECTS = (
-    Subject(
-        "bookkeeping", "frames in any order, whole, dark or strange, with small maps",
-        "statuses true, ids never used twice, the map what was added and not erased, and never too large",
-        keep_books, short=12,
-    ),
-)  # fmt: skip
+SUBJECTS = (Subject("bookkeeping", keep_books, short=12),)

@@ -2,38 +2,10 @@
 
 from __future__ import annotations
 
-from tests.fuzz import (
-    agreement,
-    aligning,
-    bookkeeping,
-    commands,
-    finished,
-    foreign,
-    library,
-    live,
-    lives,
-    lying_atlases,
-    readers,
-    runs,
-    saved,
-    settings,
-    values,
-)
+from tests.fuzz import agreement, bookkeeping, commands, foreign, library, readers, runs, saved, settings, values
 
-SUBJECTS = (
-    *readers.SUBJECTS,
-    *settings.SUBJECTS,
-    *saved.SUBJECTS,
-    *lying_atlases.SUBJECTS,
-    *commands.SUBJECTS,
-    *finished.SUBJECTS,
-    *runs.SUBJECTS,
-    *values.SUBJECTS,
-    *library.SUBJECTS,
-    *lives.SUBJECTS,
-    *foreign.SUBJECTS,
-    *aligning.SUBJECTS,
-    *live.SUBJECTS,
-    *agreement.SUBJECTS,
-    *bookkeeping.SUBJECTS,
+SUBJECTS = tuple(
+    subject
+    for module in (readers, settings, saved, commands, runs, values, library, foreign, agreement, bookkeeping)
+    for subject in module.SUBJECTS
 )

@@ -154,7 +154,4 @@ def _run(mine: Any, folder: Path) -> None:
         raise Broken("a pose is lost")
 
 
-SUBJECTS = (
-    Subject("back ends from elsewhere", "back ends that raise, exit or answer nonsense, in systems, runs and replays",
-            "a result or one line chained from its cause; whole files", failing, quiet=False, short=30),
-)  # fmt: skip
+SUBJECTS = (Subject("back ends from elsewhere", failing, quiet=False, short=30),)

@@ -41,17 +41,13 @@ class Subject:
     """A class of inputs.
 
     Attributes:
-        name: for the command line and the table.
-        inputs: what is made, in a line.
-        promise: what is promised of it, in a line.
+        name: for the command line.
         case: makes one of a random generator, in an empty folder, and gives it to the program.
         quiet: whether Python's warnings count as broken promises.
         short: number of cases in the tests.
     """
 
     name: str
-    inputs: str
-    promise: str
     case: Case
     quiet: bool = True
     short: int = 60
@@ -83,7 +79,7 @@ def run_case(subject: Subject, seed: int, number: int) -> Failure | None:
     except (Exception, TimedOut) as error:  # noqa: BLE001 every kind is counted
         return Failure(number, _signature(error), "".join(traceback.format_exception(error)))
     finally:
-        _remove(folder)
+        shutil.rmtree(folder, ignore_errors=True)
     return None
 
 
@@ -178,8 +174,3 @@ def _signature(error: BaseException) -> str:
             where = f" at {Path(place.filename).parent.name}/{Path(place.filename).name}:{place.name}"
     text = str(error).split(":")[0][:70]
     return f"{type(error).__name__}: {text}{where}"
-
-
-def _remove(folder: Path) -> None:
-    """Remove a case's folder, whatever is in it."""
-    shutil.rmtree(folder, ignore_errors=True)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import backends
-from slam.data import Observations, StereoFeatures, StereoFrame, UpdateStatus
+from slam.data import StereoFeatures, StereoFrame
 from slam.errors import SlamError
 from slam.geometry.rig import StereoRig
-from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from tests.fuzz.harness import Broken, Subject, require_line
 from tests.fuzz.hostile import VALUES, choose
@@ -22,23 +19,8 @@ from tests.fuzz.settings import scene
 RIG = StereoRig.rectified_pair(300, 159.5, 119.5, 0.12, 320, 240)
 
 _STAMPS = (
-    None,
-    "x",
-    np.nan,
-    np.inf,
-    -np.inf,
-    -1.0,
-    0.0,
-    1e9,
-    1e12,
-    1e18,
-    1e300,
-    10**400,
-    1j,
-    True,
-    np.float32(1),
-    [1.0],
-)
+    None, "x", np.nan, np.inf, -np.inf, -1.0, 0.0, 1e9, 1e18, 1e300, 10**400, 1j, True, np.float32(1), [1.0],
+)  # fmt: skip
 _ARRAYS = ("uv_left", "uv_right", "scale", "angle", "response", "laplacian", "descriptors")
 _NUMBERS = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-300, 1e300, 1e30, 1e9, -1e9, 1e-12)
 
@@ -114,111 +96,6 @@ def _images(good: np.ndarray) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def calls(rng: np.random.Generator, folder: Path, backend: str) -> None:
-    """A sequence of calls against a plain model of what the map holds."""
-    filter_ = backends.create(backend, RIG, models=EstimatorModels(pixel_sigma=0.5))
-    known: set[int] = set()
-    stamp, started = 0.0, False
-    for _ in range(int(rng.integers(4, 14))):
-        kind = int(rng.integers(8)) if started else 0
-        if kind <= 2:
-            stamp = _predict(rng, filter_, stamp, started)
-            started = started or bool(filter_.trajectory().stamps.size)
-            if not started:
-                continue
-            _guarded(lambda: _update(rng, filter_, known))
-            _guarded(lambda: _add(rng, filter_, known))
-        elif kind == 3:
-            _guarded(lambda: _update(rng, filter_, known))
-        elif kind == 4:
-            _guarded(lambda: _add(rng, filter_, known))
-        elif kind == 5:
-            _guarded(lambda: _remove(rng, filter_, known))
-        elif kind == 6:
-            _guarded(lambda: _insert(rng, filter_, known))
-        else:
-            _guarded(lambda: filter_.positions(np.array([choose(rng, (-1, 0, 5, 10**6, 2**63 - 1))])))
-        estimate = filter_.estimate()
-        _require_estimate(estimate)
-        if set(estimate.ids.tolist()) != known:
-            raise Broken(f"the map holds {len(estimate.ids)} landmarks, {len(known)} were given")
-
-
-def _guarded(call: Any) -> None:
-    try:
-        call()
-    except SlamError as error:
-        require_line(error)
-
-
-def _predict(rng: np.random.Generator, backend: Any, stamp: float, started: bool) -> float:
-    """Advance by a usual or an unusual time."""
-    step = choose(rng, (0.03, 0.03, 0.03, 0.1, 1.0, 1e-9, 1e5, 1e9, 1e15, 0.0, -1.0, np.nan, np.inf))
-    try:
-        prediction = backend.predict(stamp + step)
-    except SlamError as error:
-        require_line(error)
-        return stamp
-    _require_sound(prediction.T_world_left, prediction.covariance, "a prediction")
-    return stamp + step
-
-
-def _pixels(rng: np.random.Generator, ids: np.ndarray) -> Observations:
-    """Pixels near where still points lie, with some hostile ones."""
-    points = _points()[ids % len(_points())]
-    left, right = RIG.project(points)
-    left, right = left + 0.3 * rng.standard_normal(left.shape), right + 0.3 * rng.standard_normal(right.shape)
-    if len(ids) and rng.random() < 0.4:
-        row = int(rng.integers(len(ids)))
-        which = (left, right)[int(rng.random() < 0.7)]
-        which[row, int(rng.integers(2))] = choose(rng, (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e9, 0.0))
-    if len(ids) and rng.random() < 0.2:
-        right = left - np.array([10.0 ** rng.integers(-300, 3), 0.0])  # tiny or huge disparities
-    return Observations(ids, left, right)
-
-
-@lru_cache(maxsize=1)
-def _points() -> np.ndarray:
-    rng = np.random.default_rng(5)
-    return np.column_stack([rng.uniform(-1, 1, 60), rng.uniform(-0.8, 0.8, 60), rng.uniform(2, 8, 60)])
-
-
-def _some(rng: np.random.Generator, ids: set[int], fresh: float) -> np.ndarray:
-    """Some ids, ascending, a share of them from elsewhere."""
-    pool = sorted(ids) if rng.random() > fresh else list(range(60))
-    count = int(rng.integers(len(pool) + 1))
-    return np.sort(rng.permutation(np.array(pool, np.int64))[:count])
-
-
-def _update(rng: np.random.Generator, backend: Any, known: set[int]) -> None:
-    guess = choose(
-        rng, (None, None, np.eye(4), np.full((4, 4), np.nan), np.eye(3), 1e300 * np.eye(4), np.zeros((4, 4)))
-    )
-    report = backend.update(_pixels(rng, _some(rng, known, 0.1)), guess)
-    if not isinstance(report.status, UpdateStatus):
-        raise Broken("an update has no status")
-
-
-def _add(rng: np.random.Generator, backend: Any, known: set[int]) -> None:
-    seen = _pixels(rng, _some(rng, set(range(60)) - known, 0.1))
-    backend.add(seen)
-    known.update(seen.ids.tolist())
-
-
-def _remove(rng: np.random.Generator, backend: Any, known: set[int]) -> None:
-    ids = _some(rng, known, 0.1)
-    backend.remove(ids)
-    known.difference_update(ids.tolist())
-
-
-def _insert(rng: np.random.Generator, backend: Any, known: set[int]) -> None:
-    ids = _some(rng, set(range(60)) - known, 0.1)
-    positions = _points()[ids] * choose(rng, (1.0, 1.0, 1e6, 1e300, np.nan, 0.0))
-    covariances = np.tile(np.eye(3), (len(ids), 1, 1)) * choose(rng, (0.01, 1e10, 1e-20, 1e300, np.nan, 0.0, -1.0))
-    backend.insert(ids, positions, covariances)
-    known.update(ids.tolist())
-
-
 def _require_estimate(estimate: Any) -> None:
     _require_sound(estimate.T_world_left, estimate.covariance, "the pose")
     if not np.isfinite(estimate.positions).all():
@@ -247,24 +124,7 @@ def _require_covariances(P: np.ndarray, what: str) -> None:
         raise Broken(f"the covariance of {what} is not positive definite")
 
 
-def ekf_calls(rng: np.random.Generator, folder: Path) -> None:
-    """The filter's."""
-    calls(rng, folder, "ekf")
-
-
-def smoother_calls(rng: np.random.Generator, folder: Path) -> None:
-    """The smoother's."""
-    calls(rng, folder, "smoother")
-
-
-_SOUND = "a status or one line; poses finite, covariances symmetric and positive definite after every call"
-
 SUBJECTS = (
-    Subject("features", "hostile features between good ones, both back ends", "a sound result or one line",
-            hostile_features, quiet=False, short=40),
-    Subject("images", "hostile images, stamps and indices", "a result or one line", hostile_images, quiet=False,
-            short=8),
-    Subject("calls of ekf", "sequences of calls with hostile stamps, pixels, guesses and covariances", _SOUND,
-            ekf_calls, quiet=False, short=30),
-    Subject("calls of smoother", "the same", _SOUND, smoother_calls, quiet=False, short=20),
-)  # fmt: skip
+    Subject("features", hostile_features, quiet=False, short=40),
+    Subject("images", hostile_images, quiet=False, short=8),
+)

@@ -285,12 +285,4 @@ def write(files: Files, root: Path) -> None:
             continue
 
 
-SUBJECTS = (
-    Subject(
-        "folders", "mutated folders of every format: names, tables, calibrations, images, pipes, devices",
-        "a sequence of sound frames or one line", read_folder, short=60,
-    ),
-    Subject(
-        "paths", "hostile paths and options of sequences", "a sequence or one line", read_path, short=60,
-    ),
-)  # fmt: skip
+SUBJECTS = (Subject("folders", read_folder), Subject("paths", read_path))

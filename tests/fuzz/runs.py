@@ -178,9 +178,4 @@ def _json(path: Path) -> object:
     return json.loads(path.read_text())
 
 
-SUBJECTS = (
-    Subject(
-        "files of a run", "full disks, devices and folders in the way, folders in use, runs that stop",
-        "whole files, every one that can be written; one line", write_run, quiet=False, short=40,
-    ),
-)  # fmt: skip
+SUBJECTS = (Subject("files of a run", write_run, quiet=False, short=40),)

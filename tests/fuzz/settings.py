@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
@@ -24,10 +23,7 @@ from slam.object_models import ObjectModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
 from slam.tracking.association import AssociationConfig
-from slam.worlds import names as world_names
-from slam.worlds import options as world_options
-from slam.worlds.options import Option
-from tests.fuzz.harness import Broken, Subject
+from tests.fuzz.harness import Subject
 from tests.fuzz.hostile import NUMBERS, VALUES, choose
 
 FRAMES = 4
@@ -106,23 +102,6 @@ def _setting(rng: np.random.Generator, tree: dict[str, Any], backend: str) -> st
     return f"{section}.{key}={value}"
 
 
-def trees(rng: np.random.Generator, folder: Path) -> None:
-    """Trees of JSON with one leaf, or one branch, replaced."""
-    tree = SystemConfig.for_kind("handheld", "surf", "ekf").to_json()
-    node: Any = tree
-    while True:
-        key = choose(rng, list(node))
-        if not isinstance(node[key], dict) or not node[key] or rng.random() < 0.2:
-            break
-        node = node[key]
-    if rng.random() < 0.1:
-        node[choose(rng, ("x", "", "a.b"))] = choose(rng, VALUES)
-    node[key] = choose(rng, VALUES)
-    config = SystemConfig.from_json(json.loads(json.dumps(tree, default=str)) if rng.random() < 0.5 else tree)
-    if not config.objects.database:
-        _run(config, "ekf")
-
-
 def _run(config: SystemConfig, backend: str) -> None:
     """A few frames with what was accepted."""
     rig, frames = scene()
@@ -131,48 +110,7 @@ def _run(config: SystemConfig, backend: str) -> None:
         system.process_features(features)
 
 
-def worlds(rng: np.random.Generator, folder: Path) -> None:
-    """A world with one to three hostile options: its images, its features and its truth."""
-    name = choose(rng, world_names())
-    options = world_options(name)
-    chosen = {choose(rng, list(options)) for _ in range(int(rng.integers(1, 4)))} - {"width", "height"}
-    values = {key: choose(rng, _world_values(rng, options[key])) for key in sorted(chosen)}
-    text = "&".join(f"{key}={value}" for key, value in {"frames": 2, "width": 96, "height": 72, **values}.items())
-    world = slam.open_sequence(f"synthetic:{name}?{text}")
-    if len(world) > 10**6:
-        raise Broken(f"{len(world)} frames")
-    for k in sorted({0, len(world) - 1}):
-        frame, features = world.frame(k), world.observations(k)
-        if not (np.isfinite(features.uv_left).all() and frame.left.shape[:2] == (world.rig.height, world.rig.width)):
-            raise Broken("a frame is none")
-    if not np.isfinite(world.ground_truth.poses).all():
-        raise Broken("the truth is not finite")
-
-
-def _world_values(rng: np.random.Generator, option: Option) -> tuple[Any, ...]:
-    """Values of an option within its range, at its ends, and hostile ones."""
-    if isinstance(option.default, str):
-        faults = ("0", "0:1", ":", "1:0", "0.5", "0,1,0", "1:1e9", "-1", "1e-300", "0:" + "9" * 30, "nan", "x:y", ",,")
-        return (*(option.choices or ()), *faults, *NUMBERS)
-    low, high = option.low, option.high
-    inside = low + float(rng.random()) ** 4 * (min(high, 1e4) - low)
-    kind = type(option.default)
-    return (*[kind(inside)] * 6, low, min(high, 200), *NUMBERS)
-
-
 SUBJECTS = (
-    Subject(
-        "options of worlds", "built-in sequences with hostile options", "one line, or sound frames, features and truth",
-        worlds, quiet=False, short=12,
-    ),
-    Subject(
-        "configuration classes", "hostile values in every field of every configuration class",
-        "refused in one line, or four frames with it end well", construct, quiet=False, short=60,
-    ),
-    Subject(
-        "settings", "--set texts with hostile keys and values", "the same", texts, quiet=False, short=60,
-    ),
-    Subject(
-        "trees of settings", "trees of plain types with hostile leaves", "the same", trees, quiet=False, short=40,
-    ),
-)  # fmt: skip
+    Subject("configuration classes", construct, quiet=False, short=60),
+    Subject("settings", texts, quiet=False, short=60),
+)
