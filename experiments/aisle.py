@@ -29,7 +29,7 @@ from slam.evaluation.association_truth import SurfacePoints
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d, draw_top_view
+from slam.run.figures import draw_map_3d
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, run
@@ -175,7 +175,7 @@ def main() -> int:
     rows = [row(sequence, backend, frontend, config, arguments.out) for backend in ONLINE]
     runs = [RunData.read(arguments.out / backend, backend) for backend in ONLINE]
     draw_map_3d(runs, arguments.out / "map_3d.png")
-    draw_top_view(runs, sequence.ground_truth, arguments.out / "top_view.png")
+    plot(runs, arguments.out / "top_view.png", "map")
     plot(runs, arguments.out / "errors.png", "errors")
     draw_map_over_time([arguments.out / backend for backend in ONLINE], arguments.out / "map.png")
     print(markdown(HEADER, rows, 2))

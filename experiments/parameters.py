@@ -30,7 +30,8 @@ ROOMS = (
 INTRODUCTION = """# Parameters
 
 The numbers in the algorithms that are not settings (`slam settings` lists those): how many there are of each kind, and
-every one that was chosen. The others stand with their reasons in the code. Made by `python experiments/parameters.py`.
+those chosen ones that change a result. The others stand with their reasons in the code. Made by
+`python experiments/parameters.py`.
 """
 
 #: What kinds of numbers there are; a constant's comment begins with its kind, and is a choice where it does not.
@@ -142,7 +143,7 @@ def _comment(comments: dict[int, tuple[str, bool]], first: int, last: int | None
 
 
 def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
-    """The page as Markdown: how many numbers of each kind there are, and the choices, one by one."""
+    """The page as Markdown: how many numbers of each kind there are, and the choices that change a result."""
     ratios, scatter = sensitivity.get("ratios", {}), sensitivity.get("scatter", {})
     measured = {p: ratios.get(f"{p.module}:{p.name}") for p in parameters}
     lines = [INTRODUCTION, _row(["kind", "what it is", "numbers", *OUTCOMES])]
@@ -156,7 +157,8 @@ def page(parameters: list[Parameter], sensitivity: dict[str, Any]) -> str:
         lines += ["", SENSITIVITY.format(cases=cases, **scatter)]
     lines += ["## Choices", "", _row(["name", "value", "what it is", "½", "2"]), "| --- | ---: | --- | ---: | ---: |"]
     file = ""
-    for p in (p for p in parameters if p.kind == "choice"):
+    shown = ("within the scatter", "beyond it", "fails")
+    for p in (p for p in parameters if p.kind == "choice" and _outcome(measured[p], scatter) in shown):
         if p.file != file:
             file = p.file
             lines.append(_row([f"**{file}**", "", "", "", ""]))

@@ -17,15 +17,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from experiments.common import script_options
 from experiments.tables import markdown
-from slam.compare.plan import CLOSED_LOOP, Plan
+from slam.compare.plan import Plan
 from slam.compare.scheduler import LocalScheduler
 from slam.compare.sweep import Run, sweep
 from slam.registry import ONLINE
-from slam.run.figures import draw_map_3d, draw_top_view
+from slam.run.figures import draw_map_3d
 from slam.run.plots import plot
 from slam.run.run_data import RunData
 from slam.runtime.cores import available_cores
-from slam.sequences import open_sequence
 
 HEADER = ("back end", "frames tracked", "ATE online [mm]", "ATE final [mm]", "path [m]", "landmark error, median [mm]",
           "landmarks in the map, mean", "NEES / 6")  # fmt: skip
@@ -59,9 +58,8 @@ def main() -> int:
     print(text)
     (arguments.out / "tables.md").write_text(text + "\n", encoding="utf-8")
     data = [RunData.read(run.folder, run.trial.backend) for run in runs if run.completed]
-    truth = open_sequence(next(plan.trials_of(CLOSED_LOOP)).source).ground_truth
     draw_map_3d(data, arguments.out / "map_3d.png")
-    draw_top_view(data, truth, arguments.out / "top_view.png")
+    plot(data, arguments.out / "top_view.png", "map")
     plot(data, arguments.out / "errors.png", "errors")
     return 0
 

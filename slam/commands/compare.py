@@ -9,11 +9,11 @@ from pathlib import Path
 
 from slam.compare.paper import write_paper
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
-from slam.compare.report import conclusions, most_trials, write_report
+from slam.compare.report import cautions, conclusions, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
 from slam.compare.sweep import Run, check, sweep
-from slam.compare.tables import count_tests, groups, write_tables
-from slam.compare.wording import beforehand, caution
+from slam.compare.tables import groups, write_tables
+from slam.compare.wording import beforehand
 from slam.errors import ConfigurationError
 from slam.runtime.cores import available_cores
 from slam.sequences.faults import said_before
@@ -67,7 +67,7 @@ def compare(
     Raises:
         SlamError: bad input; nothing has been run then.
     """
-    from slam.commands.display import SweepProgress, print_conclusions
+    from slam.commands.display import counting, print_conclusions
 
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         wanted = "at least one worker" if workers < 1 else f"at most {_MOST_WORKERS} workers"
@@ -83,18 +83,22 @@ def compare(
         )
         print(f"{len(planned)} runs, {sum(planned)} frames in all, {where}: about {about}")
         print(beforehand(plan.trials if any(map(is_world, plan.sequences)) else 1), flush=True)
-    with said_before(), SweepProgress(planned, quiet) as bar:  # `check` has said what opening says
-        scheduler: Scheduler = LocalScheduler(count, bar.frames) if address is None else DaskScheduler(address)
-        runs = sweep(
-            plan, out, scheduler,
-            lambda trial: bar.ended(frames[trial.sequence]), lambda trial: bar.kept(frames[trial.sequence]), overwrite,
-        )  # fmt: skip
+    scheduler: Scheduler = LocalScheduler(count) if address is None else DaskScheduler(address)
+    done = 0
+    with said_before(), counting(sum(planned), "frames", quiet) as tell:  # `check` has said what opening says
+
+        def ended(trial: Trial) -> None:
+            nonlocal done
+            done += frames[trial.sequence]
+            tell(done)
+
+        runs = sweep(plan, out, scheduler, ended, overwrite)
     write_tables(plan, runs, out)
     write_paper(plan, runs, out)
     report = write_report(plan, runs, out, where)
     if not quiet:
         every = groups(plan, runs)
-        print_conclusions(conclusions(every), caution(most_trials(every), count_tests(every)), plan.backends[0])
+        print_conclusions(conclusions(every), cautions(every), plan.backends[0])
         failed = sum(not run.completed for run in runs)
         print(f"{len(runs)} runs, {failed} failed. Report: {report}")
     return runs

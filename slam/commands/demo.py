@@ -13,7 +13,7 @@ from slam.files import write_png
 from slam.outputs import Output, require_outputs
 from slam.registry import ONLINE
 from slam.run.drawing import draw_objects, with_legend
-from slam.run.figures import draw_map_3d, draw_top_view
+from slam.run.figures import draw_map_3d
 from slam.run.outputs import NAMES, write_json
 from slam.run.plots import plot
 from slam.run.run_data import RunData
@@ -45,12 +45,9 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
     Raises:
         SlamError: a file cannot be written, or is there already.
     """
-    import matplotlib
-
     own = Output(out, "--out", ["comparison.json", _FIRST, _FRAME, _TOP, _MAP])
     require_outputs([own, *(Output(out / backend, "--out", NAMES) for backend in ONLINE)], (), overwrite)
 
-    matplotlib.use("Agg")
     world = _WORLD.format(frames)
     summaries: list[dict[str, Any]] = []
     shown: dict[bool, FrameResult] = {}  # the last frame with a body, and without one
@@ -68,7 +65,7 @@ def demo(out: Path, frames: int, quiet: bool = False, overwrite: bool = False) -
                 summaries.append(run(sequence, RunOptions(backend, "surf", config, out / backend), seen))
     write_json(out / "comparison.json", {"runs": summaries})
     runs = [RunData.read(out / backend, backend) for backend in ONLINE]
-    draw_top_view(runs, sequence.ground_truth, out / _TOP)
+    plot(runs, out / _TOP, "map")
     draw_map_3d(runs, out / _MAP)
     plot(runs, out / _FIRST)
     last = shown.get(True, shown.get(False))

@@ -1,4 +1,4 @@
-"""The figures of merit of a comparison: their names, the units in which people see them, and which way is better."""
+"""The figures of merit of a comparison: names, places in a run's summary, units, and which way is better."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ class Metric:
         main: one of those that a summary speaks of.
         unit: in which people see it.
         scale: of that unit, by the unit of the key.
+        place: keys of a run's summary one below the other; empty where the summary does not have it.
+        share_of: what its number there is divided by: a number, or the name of another one beside it.
     """
 
     key: str
@@ -29,6 +31,8 @@ class Metric:
     main: bool = False
     unit: str = ""
     scale: float = 1.0
+    place: tuple[str, ...] = ()
+    share_of: float | str = 1.0
 
     @property
     def title(self) -> str:
@@ -50,36 +54,47 @@ def number(value: float) -> str:
 #: Share of the runs that came to their end: known of every run, also of those that have no other figure.
 COMPLETED = Metric("completed", "runs completed", "higher", True, "%", 100)
 
+_ONLINE, _FINAL, _HONEST = ("accuracy", "online"), ("accuracy", "final"), ("consistency",)
+_MM, _PERCENT, _FRAMES = ("mm", 1e3), ("%", 100.0), ("frames", 1.0)
+
 #: In the order of the tables. Times are apart: they differ from run to run.
 METRICS = (
-    Metric("ate_online_m", "ATE RMSE, online", "lower", True, "mm", 1e3),
-    Metric("ate_final_m", "ATE RMSE, final", "lower", True, "mm", 1e3),
-    Metric("ate_without_loops_m", "ATE RMSE, online, loops left out", "lower", False, "mm", 1e3),
-    Metric("loops_closed", "loops closed"),
-    Metric("loops_refused", "loops refused"),
-    Metric("rpe_1s_m", "RPE RMSE over 1 s", "lower", False, "mm", 1e3),
-    Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg"),
-    Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%"),
-    Metric("gps_m", "GPS distance RMSE", "lower", True, "mm", 1e3),
-    Metric("scale_error_percent", "scale error, absolute", "lower", False, "%"),
-    Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%"),
-    Metric("nees_per_dof", "NEES / 6 from the start (expected 1)", "one", True),
-    Metric("nees_1m_per_dof", "NEES / 6 over 1 m (expected 1)", "one"),
-    Metric("nees_10m_per_dof", "NEES / 6 over 10 m (expected 1)", "one", True),
-    Metric("nees_100m_per_dof", "NEES / 6 over 100 m (expected 1)", "one"),
-    Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one"),
-    Metric("landmark_error_m", "landmark error, median", "lower", True, "mm", 1e3),
-    Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, "mm", 1e3),
-    Metric("association_precision", "association precision", "higher", False, "%", 100),
-    Metric("tracked", "frames tracked", "higher", True, "%", 100),
-    Metric("frames_lost", "frames lost", "", False, "%", 100),
-    Metric("frames_predicted", "frames predicted", "", False, "%", 100),
-    Metric("frames_failed", "frames failed", "", False, "%", 100),
+    Metric("ate_online_m", "ATE RMSE, online", "lower", True, *_MM, (*_ONLINE, "ATE RMSE [m]")),
+    Metric("ate_final_m", "ATE RMSE, final", "lower", True, *_MM, (*_FINAL, "ATE RMSE [m]")),
+    Metric("ate_without_loops_m", "ATE RMSE, online, loops left out", "lower", False, *_MM,
+           ("accuracy", "online without loops", "ATE RMSE [m]")),
+    Metric("loops_closed", "loops closed", place=("loops", "closed")),
+    Metric("loops_refused", "loops refused", place=("loops", "refused")),
+    Metric("rpe_1s_m", "RPE RMSE over 1 s", "lower", False, *_MM, (*_ONLINE, "RPE RMSE over 1 s [m]")),
+    Metric("rpe_1s_deg", "RPE RMSE over 1 s, rotation", "lower", False, "deg", 1.0,
+           (*_ONLINE, "RPE rotation RMSE over 1 s [deg]")),
+    Metric("segment_percent", "RPE by distance (segment error)", "lower", False, "%", 1.0,
+           (*_ONLINE, "segment error [%]")),
+    Metric("gps_m", "GPS distance RMSE", "lower", True, *_MM, (*_ONLINE, "GPS distance RMSE [m]")),
+    Metric("scale_error_percent", "scale error, absolute", "lower", False, "%", 1.0, (*_HONEST, "scale error [%]")),
+    Metric("scale_sigma_percent", "scale sigma (claimed)", "", False, "%", 1.0, (*_HONEST, "scale sigma [%]")),
+    Metric("nees_per_dof", "NEES / 6 from the start (expected 1)", "one", True, place=(*_HONEST, "mean NEES"),
+           share_of="dof"),
+    Metric("nees_1m_per_dof", "NEES / 6 over 1 m (expected 1)", "one", place=(*_HONEST, "NEES over 1 m"),
+           share_of="dof"),
+    Metric("nees_10m_per_dof", "NEES / 6 over 10 m (expected 1)", "one", True, place=(*_HONEST, "NEES over 10 m"),
+           share_of="dof"),
+    Metric("nees_100m_per_dof", "NEES / 6 over 100 m (expected 1)", "one", place=(*_HONEST, "NEES over 100 m"),
+           share_of="dof"),
+    Metric("nis_per_dof", "NIS per degree of freedom (expected 1)", "one",
+           place=(*_HONEST, "NIS per degree of freedom")),
+    Metric("landmark_error_m", "landmark error, median", "lower", True, *_MM),
+    Metric("landmark_error_90_m", "landmark error, 90 % below", "lower", False, *_MM),
+    Metric("association_precision", "association precision", "higher", False, *_PERCENT),
+    Metric("tracked", "frames tracked", "higher", True, *_PERCENT),
+    Metric("frames_lost", "frames lost", "", False, *_PERCENT),
+    Metric("frames_predicted", "frames predicted", "", False, *_PERCENT),
+    Metric("frames_failed", "frames failed", "", False, *_PERCENT),
     Metric("map_size", "landmarks in the map, mean"),
-    Metric("lifetime_frames", "lifetime of a landmark, median", "", False, "frames"),
-    Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, "frames"),
+    Metric("lifetime_frames", "lifetime of a landmark, median", "", False, *_FRAMES),
+    Metric("lifetime_mean_frames", "lifetime of a landmark, mean", "", False, *_FRAMES),
     Metric("used_per_frame", "observations used per frame"),
-)
+)  # fmt: skip
 
 #: Frames whose pose was not measured: they are in no figure of accuracy, and counted here. The share tracked is tested.
 UNTRACKED = ("frames_lost", "frames_predicted", "frames_failed")
@@ -89,7 +104,30 @@ BY_KEY = {metric.key: metric for metric in METRICS}
 _OBJECT = "object"
 _NEES = "NEES / degree of freedom"
 _SHARES = ("precision", "recall", "F1", "coverage", "counted right")
-_UNITS = {"m": ("mm", 1e3), "deg": ("deg", 1.0), "frames": ("frames", 1.0)}
+_UNITS = {"m": _MM, "deg": ("deg", 1.0), "frames": _FRAMES}
+
+
+def figures(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What a run's summary says, by key of `METRICS`, and ``object …`` figures; what it does not say is left out."""
+    found = {}
+    for metric in METRICS:
+        tree: Any = summary
+        for key in metric.place[:-1]:
+            tree = tree.get(key, {}) if isinstance(tree, Mapping) else {}
+        if metric.place and isinstance(tree, Mapping) and tree.get(metric.place[-1]) is not None:
+            divisor = tree[metric.share_of] if isinstance(metric.share_of, str) else metric.share_of
+            found[metric.key] = float(tree[metric.place[-1]]) / divisor
+    if "scale_error_percent" in found:
+        found["scale_error_percent"] = abs(found["scale_error_percent"])
+    if not found.get("loops_closed", 0) + found.get("loops_refused", 0):
+        found = {key: value for key, value in found.items() if not key.startswith("loops")}
+    frames, status = summary.get("frames", 0), summary.get("status", {})
+    if frames:
+        started = status.get("started", 0)  # its pose is that of the world
+        found["tracked"] = (status.get("tracked", 0) + started) / frames
+        found |= {key: status.get(key.removeprefix("frames_"), 0) / frames for key in UNTRACKED}
+        found["used_per_frame"] = summary.get("observations", {}).get("used", 0) / frames
+    return {**found, **object_figures(summary)}
 
 
 def object_metric(key: str) -> Metric:
@@ -97,7 +135,7 @@ def object_metric(key: str) -> Metric:
     text = re.sub(r"^bodies (\d+) ", r"body \1: ", key.removeprefix(f"{_OBJECT} "))
     label = text if text.startswith("body") else f"objects: {text}"
     if key.endswith(_SHARES):
-        return Metric(key, label, "higher", False, "%", 100)
+        return Metric(key, label, "higher", False, *_PERCENT)
     if key.endswith(_NEES):
         return Metric(key, label, "one")
     found = re.fullmatch(r"(.*) \[(\w+)\]", label)
@@ -115,14 +153,14 @@ def object_figures(summary: Mapping[str, Any]) -> dict[str, float]:
     objects = summary.get("objects")
     if not isinstance(objects, Mapping):
         return {}
-    figures = dict(_leaves(_OBJECT, objects))
-    for key in [key for key in figures if key.endswith(" mean NEES")]:
+    found = dict(_leaves(_OBJECT, objects))
+    for key in [key for key in found if key.endswith(" mean NEES")]:
         name = key.removesuffix("mean NEES")
-        figures[name + _NEES] = figures.pop(key) / figures.pop(name + "dof", 6.0)
-    bodies = [figures[key] for key in figures if key.endswith(" frames in view")]
+        found[name + _NEES] = found.pop(key) / found.pop(name + "dof", 6.0)
+    bodies = [found[key] for key in found if key.endswith(" frames in view")]
     if not any(bodies):
-        figures = {key: value for key, value in figures.items() if not key.endswith(("precision", "recall", "F1"))}
-    return figures
+        found = {key: value for key, value in found.items() if not key.endswith(("precision", "recall", "F1"))}
+    return found
 
 
 def _leaves(name: str, tree: Any) -> list[tuple[str, float]]:

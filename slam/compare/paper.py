@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from slam.compare.figures import as_pdf, pictures
 from slam.compare.measure import Metric
 from slam.compare.plan import Plan, folder_name, is_world, short_name
+from slam.compare.report import TEMPLATES
 from slam.compare.statistics import FEWEST, LEVEL, Difference
 from slam.compare.sweep import Run
 from slam.compare.tables import Group, count_tests, groups, mean_figures
-from slam.compare.wording import decimals, measurements, shown_interval, shown_mean, shown_p
+from slam.compare.wording import measurements, shown_interval, shown_mean, shown_p, shown_spread
 from slam.files import whole_file, write_text
 from slam.naming import printable
 
-TABLES, FIGURES, FOLDER = "tables.tex", "figures.tex", "figures"
+FOLDER = "figures"
 
-_HEAD = "% Written by slam compare. Needs: \\usepackage{{{}}}\n"
-
-_COLUMN = 237.0  # [pt] of a page that has two, in usual classes
-_TEXT = {"\\small": 4.3, "\\footnotesize": 3.95}  # [pt] mean width of a letter, measured
-_GAP = 8.0  # [pt] between columns
+_WIDE = 5  # columns from which on a table goes over both columns of a page
 _INTERVALS = 2  # back ends whose intervals a page has room for
 
 #: What LaTeX reads otherwise, and what older engines lack.
@@ -39,67 +35,70 @@ _LATEX = str.maketrans(
 
 
 def write_paper(plan: Plan, runs: Sequence[Run], out: Path) -> None:
-    """Write ``tables.tex`` (booktabs, graphicx), ``figures.tex`` (graphicx) and the pictures as ``figures/*.pdf``.
+    """Write ``tables.tex``, ``figures.tex`` and the pictures as ``figures/*.pdf``.
 
     Every caption says which measurements the back ends were given. Only ``figures/*_time.pdf`` depends on the machine.
     """
+    from jinja2 import Environment, FileSystemLoader
+
     every = groups(plan, runs)
     tests = count_tests(every)
-    tables = [table for group in every for table in (means_table(group), differences_table(group, tests)) if table]
-    write_text(out / TABLES, _HEAD.format("booktabs,graphicx") + "\n" + "\n".join(tables))
+    made = [table for group in every for table in (means_table(group), differences_table(group, tests)) if table]
     (out / FOLDER).mkdir(exist_ok=True)
-    shown = [text for group in every for text in _figures(group, out / FOLDER)]
-    write_text(out / FIGURES, _HEAD.format("graphicx") + "\n" + "\n".join(shown))
+    shown = [figure for group in every for figure in _figures(group, out / FOLDER)]
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), trim_blocks=True, keep_trailing_newline=True, block_start_string="<%",
+        block_end_string="%>", variable_start_string="<<", variable_end_string=">>",
+    )  # fmt: skip
+    for name, rows in (("tables", made), ("figures", shown)):
+        write_text(out / f"{name}.tex", environment.get_template(f"{name}.tex.j2").render(**{name: rows}))
 
 
-def means_table(group: Group) -> str:
+def means_table(group: Group) -> dict[str, Any]:
     """Mean, standard deviation and confidence interval of every figure of each back end; of one trial its figures.
 
     There are no intervals of fewer than `FEWEST` trials, nor of more than two back ends, for which a page has no room.
     """
-    names, label = list(group.runs), f"tab:{_label(group)}_means"
-    if group.trials == 1:
-        rows = [[latex(m.title), *(_value_cell(group, name, m) for name in names)] for m in group.shown]
-        caption = f"{_what(group)}: one trial. {_given(group)}."
-        return _table("l" + "r" * len(names), ["figure", *map(latex, names)], rows, caption, label)
-    rows = [[latex(m.title), *(_mean_cells(group, name, m) for name in names)] for m in group.shown]
-    spread = f"{_what(group)}: mean $\\pm$ standard deviation over {_trials(group)}"
-    if not _has_intervals(group):
-        head, caption = ["figure", *map(latex, names)], f"{spread}. {_given(group)}."
-        return _table("l" + "r" * len(names), head, rows, caption, label)
-    level = f"{round(100 * LEVEL)} \\%"
-    head = ["figure", *(f"{latex(name)} & {level} CI" for name in names)]
-    caption = f"{spread}, and the {level} bootstrap confidence interval (BCa) of the mean. {_given(group)}."
-    return _table("l" + "rl" * len(names), head, rows, caption, label)
+    names = list(group.runs)
+    intervals = group.trials >= FEWEST and len(names) <= _INTERVALS
+    level = f"{round(100 * LEVEL)} % CI"
+    head = [cell for name in names for cell in ([name, level] if intervals else [name])]
+    rows = [[m.title, *(cell for b in names for cell in _mean_cells(group, b, m, intervals))] for m in group.shown]
+    trials = f"{group.trials} trials"
+    if any(map(group.failures, names)):
+        trials = f"the completed of {trials}"
+    says = "one trial" if group.trials == 1 else f"mean ± standard deviation over {trials}"
+    if intervals:
+        says += f", and the {level} of the mean (bootstrap, BCa)"
+    return _table(group, "means", "r" * len(head), ["figure", *head], rows, says)
 
 
-def differences_table(group: Group, tests: int) -> str:
+def differences_table(group: Group, tests: int) -> dict[str, Any] | None:
     """Effect, interval and p of every figure that has a better side, each other back end against the first.
 
-    Figures that are the same in all pairs are left out. Empty where none is left, as with one pair.
+    Figures that are the same in all pairs are left out. None where none is left, as with one pair.
 
     Args:
         group: the runs.
         tests: that p is adjusted for.
     """
     first, *others = group.runs
-    rows = []
-    for metric in group.shown:
-        for other, d in group.differences(metric).items():
-            if metric.better and d.varies:
-                rows.append([latex(metric.title), *([latex(other)] if len(others) > 1 else []), *_difference_cells(d)])
+    rows = [
+        [metric.title, other, *_difference_cells(d)]
+        for metric in group.shown
+        for other, d in group.differences(metric).items()
+        if metric.better and d.varies
+    ]
     if not rows:
-        return ""
-    head = ["figure", *(["back end"] if len(others) > 1 else []), "difference", f"{round(100 * LEVEL)} \\% CI"]
-    head += ["$p$", "$p_\\mathrm{Holm}$", "pairs"]
-    caption = (
-        f"{_what(group)}: mean paired difference, {' and '.join(map(latex, others)) or 'other'} less {latex(first)} "
-        "(for figures that should be 1, the ratio of the factors by which the two are off), with its "
-        f"{round(100 * LEVEL)} \\% bootstrap confidence interval (BCa). $p$: two-sided sign-flip permutation test, and "
-        f"adjusted by Holm's method over {tests} tests. {_given(group)}."
+        return None
+    level = f"{round(100 * LEVEL)} %"
+    head = ["figure", "back end", "difference", f"{level} CI", "p", "p, Holm", "pairs"]
+    says = (
+        f"mean paired difference, {' and '.join(others)} less {first} (for figures that should be 1, the ratio of the "
+        f"factors by which the two are off), with its {level} bootstrap confidence interval (BCa); p of the two-sided "
+        f"sign-flip permutation test, and adjusted by Holm's method over {tests} tests"
     )
-    columns = "ll" if len(others) > 1 else "l"
-    return _table(columns + "rlrrr", head, rows, caption, f"tab:{_label(group)}_differences")
+    return _table(group, "differences", "lrlrrr", head, rows, says)
 
 
 def latex(text: str) -> str:
@@ -107,87 +106,44 @@ def latex(text: str) -> str:
     return printable(text).translate(_LATEX)
 
 
-def _figures(group: Group, folder: Path) -> Iterable[str]:
-    """Write a group's pictures; a figure environment for each."""
-    for picture in pictures(group):
-        name = f"{_label(group)}_{picture.name}"
-        caption = f"{_what(group)}: {_lower(latex(picture.caption))} {_given(group)}."
-        with whole_file(folder / f"{name}.pdf") as file:
-            file.write(as_pdf(picture.draw(), f"{picture.title}: {group.sequence}, {group.mode}"))
-        yield (
-            "\\begin{figure}\n  \\centering\n"
-            f"  \\includegraphics[width=\\linewidth]{{{FOLDER}/{name}}}\n"
-            f"  \\caption{{{caption}}}\n  \\label{{fig:{name}}}\n\\end{{figure}}\n"
-        )
+def _table(
+    group: Group, kind: str, columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], says: str
+) -> dict[str, Any]:
+    """What the template needs; a wide table goes over both columns of a page that has two."""
+    return {
+        "kind": "table*" if len(head) >= _WIDE else "table",
+        "caption": f"{_what(group)}: {latex(says)}. {_given(group)}.",
+        "label": f"tab:{_label(group)}_{kind}",
+        "columns": f"l{columns}",
+        "head": list(map(latex, head)),
+        "rows": [list(map(latex, row)) for row in rows],
+    }
 
 
-def _table(columns: str, head: Sequence[str], rows: Sequence[Sequence[str]], caption: str, label: str) -> str:
-    """A table as large as its column has room for; a wide one goes over both columns of a page that has two.
-
-    Where even a page is narrower, the table is made smaller.
-    """
-    cells = [" & ".join(row).split(" & ") for row in (head, *rows)]
-    letters = sum(max(map(_letters, column)) for column in zip(*cells))
-    fits = [size for size, letter in _TEXT.items() if letter * letters + _GAP * len(columns) < _COLUMN]
-    kind, size = ("table", fits[0]) if fits else ("table*", "\\footnotesize")
-    lines = [" & ".join(row) + " \\\\" for row in rows]
-    return "\n    ".join(
-        [
-            f"\\begin{{{kind}}}\n  \\centering\n  {size}\n  \\setlength{{\\tabcolsep}}{{4pt}}\n"
-            f"  \\caption{{{caption}}}\n  \\label{{{label}}}\n  \\smallskip\n"
-            f"  \\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n"
-            f"  \\begin{{tabular}}{{{columns}}}",
-            "\\toprule",
-            " & ".join(head) + " \\\\",
-            "\\midrule",
-            *lines,
-            f"\\bottomrule\n  \\end{{tabular}}}}\n\\end{{{kind}}}\n",
-        ]
-    )
-
-
-def _letters(cell: str) -> int:
-    """How many letters wide a cell is, about."""
-    return len(re.sub(r"\\[a-z]+(\{\})?|[\\${}]", lambda found: "" if found[0] in "\\${}" else "+", cell))
-
-
-def _value_cell(group: Group, backend: str, metric: Metric) -> str:
-    """The figure of the one trial."""
-    value = metric.scale * mean_figures(group.finite(backend, metric.key))[0]
-    return f"${value:.{decimals(value)}f}$" if np.isfinite(value) else "--"
-
-
-def _has_intervals(group: Group) -> bool:
-    return group.trials >= FEWEST and len(group.runs) <= _INTERVALS
-
-
-def _trials(group: Group) -> str:
-    """How many trials, and whether each back end completed all."""
-    most = max(group.failures(backend) for backend in group.runs)
-    return f"{group.trials} trials" if not most else f"the completed of {group.trials} trials"
-
-
-def _mean_cells(group: Group, backend: str, metric: Metric) -> str:
-    mean, sd, low, high = (metric.scale * x for x in mean_figures(group.finite(backend, metric.key)))
-    if not np.isfinite(mean):
-        return "-- & --" if _has_intervals(group) else "--"
-    digits = decimals(mean)
-    shown = [f"${x:.{digits}f}$" if np.isfinite(x) else "--" for x in (mean, sd, low, high)]
-    spread = f"{shown[0]} $\\pm$ {shown[1]}" if np.isfinite(sd) else shown[0]
-    if not _has_intervals(group):
-        return spread
-    return f"{spread} & [{shown[2]}, {shown[3]}]" if np.isfinite(low) else f"{spread} & --"
+def _mean_cells(group: Group, backend: str, metric: Metric, intervals: bool) -> list[str]:
+    mean, sd, low, high = mean_figures(group.finite(backend, metric.key))
+    shown = " ".join(part for part in shown_spread(metric, mean, sd) if part)
+    bounds = [shown_spread(metric, bound, float("nan"))[0] for bound in (low, high)]
+    return [shown, f"[{', '.join(bounds)}]" if "–" not in bounds else "–"] if intervals else [shown]
 
 
 def _difference_cells(d: Difference) -> list[str]:
     interval = shown_interval(d, ", ")
-    bounds = latex(interval if interval == "–" else f"[{interval}]")
     return [
-        latex(shown_mean(d)),
-        bounds,
-        *(latex(shown_p(p)) if d.varies else "--" for p in (d.p, d.p_holm)),
-        str(d.pairs),
-    ]
+        shown_mean(d), interval if interval == "–" else f"[{interval}]", shown_p(d.p), shown_p(d.p_holm), str(d.pairs),
+    ]  # fmt: skip
+
+
+def _figures(group: Group, folder: Path) -> list[dict[str, str]]:
+    """Write a group's pictures; what the template needs of each."""
+    found = []
+    for picture in pictures(group):
+        name = f"{_label(group)}_{picture.name}"
+        with whole_file(folder / f"{name}.pdf") as file:
+            file.write(as_pdf(picture.draw(), f"{picture.title}: {group.sequence}, {group.mode}"))
+        caption = f"{_what(group)}: {latex(picture.caption)} {_given(group)}."
+        found.append({"name": name, "file": f"{FOLDER}/{name}", "caption": caption})
+    return found
 
 
 def _what(group: Group) -> str:
@@ -204,8 +160,3 @@ def _given(group: Group) -> str:
 
 def _label(group: Group) -> str:
     return "_".join([short_name(group.sequence), short_name(group.variant.name), group.mode.replace(" ", "_")])
-
-
-def _lower(text: str) -> str:
-    """A sentence that goes on after a colon; abbreviations stay."""
-    return text if text[1:2].isupper() else text[0].lower() + text[1:]

@@ -13,10 +13,10 @@ import numpy as np
 
 from slam.compare import figures
 from slam.compare.measure import COMPLETED, Metric, number
-from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan
+from slam.compare.plan import Plan
 from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
-from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures
+from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures, run_head
 from slam.compare.wording import (
     STRENGTH,
     WORDS,
@@ -28,22 +28,66 @@ from slam.compare.wording import (
     headline,
     honesty,
     in_short,
-    innovations,
     measurements,
-    replayed,
-    sentence,
     shown_interval,
     shown_mean,
     shown_p,
     shown_spread,
-    worth_saying,
 )
 from slam.files import read_object, write_text
 from slam.run.style import stage_name, stages
 
-_TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 
 _TESTED = (Verdict.CERTAIN, Verdict.LIKELY, Verdict.HINT)
+
+
+@dataclass(frozen=True)
+class Conclusions:
+    """What can be said of a group in its main figures, in the report and on the terminal.
+
+    Attributes:
+        name: of the group.
+        verdict: which back end is better in what, a sentence for each but the reference.
+        failed: which runs failed; empty where none did.
+        headlines: what is certain, likely and a hint, in both directions, and which main figures are open.
+        honesty: one per back end, on its covariances.
+    """
+
+    name: str
+    verdict: list[str]
+    failed: str
+    headlines: list[Line]
+    honesty: list[str]
+
+
+def conclusions(every: Sequence[Group]) -> list[Conclusions]:
+    """What can be said, group by group."""
+    found = []
+    for group in every:
+        first, *others = group.runs
+        own = {other: [group.differences(metric)[other] for metric in group.metrics] for other in others}
+        nees = {
+            metric.key: {b: mean_figures(group.finite(b, metric.key))[0] for b in group.runs}
+            for metric in group.metrics
+            if metric.key.startswith("nees")
+        }
+        variant = "" if group.variant.name == "surf" else f", {group.variant.name}"
+        found.append(
+            Conclusions(
+                f"{group.sequence}{variant}, {group.mode}",
+                [in_short(differences, first, other) for other, differences in own.items()],
+                failures({b: group.failures(b) for b in group.runs}, group.trials),
+                [line for other, differences in own.items() for line in headline(differences, other)],
+                honesty(nees, group.trials),
+            )
+        )
+    return found
+
+
+def cautions(every: Sequence[Group]) -> str:
+    """What the trials of the group that has most can show at best; empty where they are enough."""
+    return caution(max(group.trials for group in every), count_tests(every))
 
 
 def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Path:
@@ -59,16 +103,18 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         the file.
     """
     from jinja2 import Environment, FileSystemLoader
+    from markupsafe import Markup
 
     every = groups(plan, runs)
-    environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True)
+    keys = list(dict.fromkeys(key for run in runs for key in run.metrics))
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
     text = environment.get_template("report.html.j2").render(
         title=f"{' against '.join(plan.backends)}: a paired comparison",
         plan=plan,
         runs=runs,
         failed=sum(not run.completed for run in runs),
         short=conclusions(every),
-        caution=caution(most_trials(every), count_tests(every)),
+        caution=cautions(every),
         tests=count_tests(every),
         strengths=[(verdict.value, WORDS[verdict], STRENGTH[verdict]) for verdict in _TESTED],
         fewest=FEWEST,
@@ -76,135 +122,60 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         sections=_sections(plan, every),
         workers=workers,
         **_times(every),
-        run_columns=(*RUN_COLUMNS, *_run_keys(runs)),
-        run_rows=[_run_row(run, _run_keys(runs)) for run in runs],
-        command=_command(plan),
+        run_columns=(*RUN_COLUMNS, *keys),
+        run_rows=[(*run_head(r), *(number(r.metrics.get(key, float("nan"))) for key in keys)) for r in runs],
+        command=f"{plan.command()} --out DIR",
         versions=read_object(out / SWEEP)["versions"],
         settings=_settings(every),
-        script=_script(),
+        script=Markup((TEMPLATES / "map3d.js").read_text(encoding="utf-8")),
     )
-    path = out / "report.html"
-    write_text(path, text)
-    return path
-
-
-@dataclass(frozen=True)
-class Conclusions:
-    """What can be said of a group in its main figures.
-
-    Attributes:
-        name: of the group.
-        verdict: which back end is better in what, a sentence for each but the reference.
-        failed: which runs failed; empty where none did.
-        headlines: what is certain, likely and a hint, in both directions, and which main figures are open.
-        sentences: one per main figure.
-        honesty: one per back end, on its covariances.
-    """
-
-    name: str
-    verdict: list[str]
-    failed: str
-    headlines: list[Line]
-    sentences: list[str]
-    honesty: list[str]
-
-
-def conclusions(every: Sequence[Group]) -> list[Conclusions]:
-    """What can be said, group by group."""
-    return [_conclusions(group, every) for group in every]
-
-
-def most_trials(every: Sequence[Group]) -> int:
-    """Trials of the group that has most: recorded sequences have one."""
-    return max(group.trials for group in every)
-
-
-def _conclusions(group: Group, every: Sequence[Group]) -> Conclusions:
-    first, *others = group.runs
-    compared = [group.differences(metric) for metric in group.metrics]
-    headlines: list[Line] = []
-    sentences: list[str] = []
-    verdict: list[str] = []
-    for other in others:
-        own = [differences[other] for differences in compared]
-        verdict.append(in_short(own, first, other))
-        headlines += headline(own, other)
-        sentences += [sentence(d, first, other) for d in own if worth_saying(d)]
-    failed = failures({b: group.failures(b) for b in group.runs}, group.trials)
-    return Conclusions(_name(group), verdict, failed, headlines, sentences, _honesty(group, every))
-
-
-def _honesty(group: Group, every: Sequence[Group]) -> list[str]:
-    """Whether each back end's covariances hold, and what the figures that say so mean."""
-    means = {
-        metric.key: {b: mean_figures(group.finite(b, metric.key))[0] for b in group.runs} for metric in group.metrics
-    }
-    lines = honesty({key: values for key, values in means.items() if key.startswith("nees")}, group.trials)
-    return lines + _why_replays_differ(group, every) + innovations(means.get("nis_per_dof", {}))
-
-
-def _why_replays_differ(group: Group, every: Sequence[Group]) -> list[str]:
-    """A sentence where a replay's covariances are smaller than those of the closed loop that it replays."""
-    own = (group.sequence, group.variant, CLOSED_LOOP)
-    before = next((other for other in every if (other.sequence, other.variant, other.mode) == own), None)
-    if group.mode != REPLAY or before is None:
-        return []
-    first = next(iter(group.runs))
-    nees = [{m.key: mean_figures(g.finite(first, m.key))[0] for m in g.metrics} for g in (before, group)]
-    return [text for text in [replayed(first, *nees)] if text]
-
-
-def _name(group: Group) -> str:
-    variant = "" if group.variant.name == "surf" else f", {group.variant.name}"
-    return f"{group.sequence}{variant}, {group.mode}"
+    write_text(out / "report.html", text)
+    return out / "report.html"
 
 
 def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
     """A section per sequence and variant: a table per mode, the pictures of the closed loop."""
     sections = []
     for at in range(0, len(every), len(plan.modes)):
-        own = every[at : at + len(plan.modes)]
-        first = own[0]
-        variant = "" if len(plan.variants) == 1 else f" · {first.variant.name}"
+        first = every[at]
+        given = measurements(first.mode, plan.backends[0])
         sections.append(
             {
-                "title": f"{first.sequence}{variant}",
-                "tables": [_table(group, own) for group in own],
-                "pictures": _pictures(first),
-                "given": measurements(first.mode, plan.backends[0]),
+                "title": first.sequence + ("" if len(plan.variants) == 1 else f" · {first.variant.name}"),
+                "tables": [_table(group) for group in every[at : at + len(plan.modes)]],
+                "pictures": [
+                    {"source": _embedded(figures.as_svg(p.draw())), "alt": p.title, "caption": f"{p.caption} {given}."}
+                    for p in figures.pictures(first)
+                ],
+                "given": given,
                 "map": figures.map_data(first) if figures.example(first) else None,
             }
         )
     return sections
 
 
-def _table(group: Group, every: Sequence[Group]) -> dict[str, Any]:
-    first = next(iter(group.runs))
+def _table(group: Group) -> dict[str, Any]:
     reasons = {
-        f"{b}, seed {r.trial.seed}: {r.outcome.removeprefix('failed: ')}"
-        for b, rs in group.runs.items()
-        for r in rs
-        if not r.completed
+        f"{backend}, seed {run.trial.seed}: {run.outcome.removeprefix('failed: ')}"
+        for backend, runs in group.runs.items()
+        for run in runs
+        if not run.completed
     }
     return {
-        "title": f"{measurements(group.mode, first)}",
-        "rows": [_row(group, metric, group.differences(metric)) for metric in group.shown],
-        "honesty": _honesty(group, every),
-        "sentences": [sentence(d, first, b) for m in group.shown if m.better for b, d in group.differences(m).items()],
+        "title": measurements(group.mode, next(iter(group.runs))),
+        "rows": [_row(group, metric) for metric in group.shown],
         "reasons": sorted(reasons),
     }
 
 
-def _row(group: Group, metric: Metric, differences: dict[str, Difference]) -> dict[str, Any]:
-    cells = [_cells(d) for d in differences.values()]
+def _row(group: Group, metric: Metric) -> dict[str, Any]:
+    failed, label = [0] * len(group.runs), metric.title
+    means = [shown_spread(metric, *mean_figures(group.finite(b, metric.key))[:2]) for b in group.runs]
     if metric is COMPLETED:
-        means = [(f"{group.trials - group.failures(b)} of {group.trials}", "") for b in group.runs]
-        return {"label": metric.label, "means": means, "failed": list(map(group.failures, group.runs)), "cells": cells}
-    means = []
-    for backend in group.runs:
-        mean, sd, _, _ = mean_figures(group.finite(backend, metric.key))
-        means.append(shown_spread(metric, mean, sd))
-    return {"label": metric.title, "means": means, "failed": [0] * len(means), "cells": cells}
+        failed, label = list(map(group.failures, group.runs)), metric.label
+        means = [(f"{group.trials - count} of {group.trials}", "") for count in failed]
+    cells = [_cells(d) for d in group.differences(metric).values()]
+    return {"label": label, "means": means, "failed": failed, "cells": cells}
 
 
 def _cells(d: Difference) -> dict[str, str]:
@@ -220,15 +191,6 @@ def _cells(d: Difference) -> dict[str, str]:
     }
 
 
-def _pictures(group: Group) -> list[dict[str, str]]:
-    """Pictures of a group, embedded; each caption says which measurements."""
-    given = measurements(group.mode, next(iter(group.runs)))
-    return [
-        {"source": _embedded(figures.as_svg(p.draw())), "alt": p.title, "caption": f"{p.caption} {given}."}
-        for p in figures.pictures(group)
-    ]
-
-
 def _times(every: Sequence[Group]) -> dict[str, Any]:
     """What the stages do, and a row of medians per group and back end."""
     runs = [run for group in every for rs in group.runs.values() for run in rs]
@@ -236,22 +198,10 @@ def _times(every: Sequence[Group]) -> dict[str, Any]:
     rows = []
     for group in every:
         for backend, own in group.runs.items():
-            cells = []
-            for stage in known:
-                values = [run.milliseconds[stage] for run in own if stage in run.milliseconds]
-                cells.append(f"{np.median(values):.2f}" if values else "–")
+            values = ([run.milliseconds[stage] for run in own if stage in run.milliseconds] for stage in known)
+            cells = (f"{np.median(each):.2f}" if each else "–" for each in values)
             rows.append((group.sequence, group.variant.name, group.mode, backend, *cells))
     return {"stages": ["whole frame", *map(stage_name, known[1:])], "times": rows}
-
-
-def _run_keys(runs: Sequence[Run]) -> list[str]:
-    return list(dict.fromkeys(key for run in runs for key in run.metrics))
-
-
-def _run_row(run: Run, keys: Sequence[str]) -> tuple[str, ...]:
-    t = run.trial
-    head = (t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome)
-    return (*head, *(number(run.metrics.get(key, float("nan"))) for key in keys))
 
 
 def _settings(every: Sequence[Group]) -> str:
@@ -266,15 +216,5 @@ def _settings(every: Sequence[Group]) -> str:
     return json.dumps(shown, indent=1)
 
 
-def _command(plan: Plan) -> str:
-    return f"{plan.command()} --out DIR"
-
-
 def _embedded(svg: str) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-
-
-def _script() -> Any:
-    from markupsafe import Markup
-
-    return Markup((_TEMPLATES / "map3d.js").read_text(encoding="utf-8"))

@@ -14,15 +14,11 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessP
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.sharedctypes import Synchronized
 from typing import Any, Protocol
 
-from slam.compare.frames import count_in
 from slam.errors import SlamError
 
 _SHARED_DEATHS = 2  # a job whose worker has died so often is next run alone, so that no other is to blame
-
-_LOOK = 0.5  # how often the frames done are looked at [s]
 
 #: Read by the libraries when they are loaded, which is before a worker's first job.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -67,57 +63,41 @@ class LocalScheduler:
 
     Attributes:
         workers: number of processes.
-        on_frames: told now and then how many frames the jobs of this call have done, those of jobs that died included.
     """
 
     workers: int
-    on_frames: Callable[[int], None] | None = None
 
     def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
         """See `Scheduler`."""
         waiting = deque(jobs)
         deaths: dict[str, int] = {}
         alone: deque[Job] = deque()
-        frames = _Frames(self.on_frames)
         while waiting:
-            for job in _in_pool(waiting, self.workers, deliver, frames):
+            for job in _in_pool(waiting, self.workers, deliver):
                 deaths[job.name] = deaths.get(job.name, 0) + 1
                 (alone if deaths[job.name] >= _SHARED_DEATHS else waiting).append(job)
         while alone:
-            for job in _in_pool(deque([alone.popleft()]), 1, deliver, frames):
+            for job in _in_pool(deque([alone.popleft()]), 1, deliver):
                 deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
 
 
-class _Frames:
-    """The number that workers count their frames in, and who is told of it."""
-
-    def __init__(self, told: Callable[[int], None] | None) -> None:
-        self._told = told
-        self.counter = None if told is None else multiprocessing.get_context("spawn").Value("q", 0)
-
-    def tell(self) -> None:
-        if self._told is not None and self.counter is not None:
-            self._told(self.counter.value)
-
-
-def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver, frames: _Frames) -> list[Job]:
+def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:
     """Run jobs until none is waiting or a worker dies; the jobs that were running then come back.
 
     No more jobs are submitted than there are workers: so those submitted are those that were running.
     """
     running: dict[Future[Any], Job] = {}
-    with _pool(workers, frames) as pool:
+    with _pool(workers) as pool:
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
                     running[pool.submit(waiting[0].function, *waiting[0].arguments())] = waiting[0]
                     waiting.popleft()
-                for future in wait(running, _LOOK, return_when=FIRST_COMPLETED).done:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
                     error = future.exception()
                     if isinstance(error, BrokenProcessPool):
                         raise error
                     deliver(running.pop(future), None if error else future.result(), error)
-                frames.tell()
         except BrokenProcessPool:
             return _undelivered(running, deliver)
     return []
@@ -136,13 +116,13 @@ def _undelivered(running: dict[Future[Any], Job], deliver: Deliver) -> list[Job]
 
 
 @contextmanager
-def _pool(workers: int, frames: _Frames) -> Iterator[ProcessPoolExecutor]:
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool whose processes begin with one thread each, and end with this block however it ends."""
     before = {process.pid for process in multiprocessing.active_children()}
     kept = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _begin_worker, (frames.counter,))
+    pool = ProcessPoolExecutor(workers, context, _begin_worker)
     try:
         yield pool
     except BaseException:
@@ -162,9 +142,8 @@ def _pool(workers: int, frames: _Frames) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
-def _begin_worker(counter: Synchronized[int] | None) -> None:
-    """Leave interrupts to the parent, end when it is gone, however it went, and count frames where it asks for it."""
-    count_in(counter)
+def _begin_worker() -> None:
+    """Leave interrupts to the parent, and end when it is gone, however it went."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     parent = multiprocessing.parent_process()

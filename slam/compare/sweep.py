@@ -17,7 +17,6 @@ from typing import Any
 
 from slam import registry
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Trial
-from slam.compare.revision import running_code
 from slam.compare.scheduler import Job, Scheduler
 from slam.compare.trial import (
     COMPLETED,
@@ -35,6 +34,7 @@ from slam.errors import SlamError
 from slam.files import noting_inputs, read_object, remove_file
 from slam.outputs import Output, require_outputs
 from slam.run.outputs import naming_folder, write_json
+from slam.run.repeat import running_code
 from slam.sequences import open_sequence
 from slam.sequences.faults import said_before
 
@@ -76,7 +76,6 @@ def sweep(
     out: Path,
     scheduler: Scheduler,
     on_done: Callable[[Trial], None] | None = None,
-    on_kept: Callable[[Trial], None] | None = None,
     overwrite: bool = False,
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
@@ -85,8 +84,7 @@ def sweep(
         plan: what to run.
         out: folder; one of an earlier sweep with the same versions is gone on with.
         scheduler: where trials run.
-        on_done: called for each trial that ends.
-        on_kept: called for each that was done before.
+        on_done: called for each trial that ends, or was done before.
         overwrite: whether to run all again, and to replace files that are there.
 
     Raises:
@@ -100,8 +98,8 @@ def sweep(
         jobs = {}
         for trial in plan.trials_of(mode):
             if not overwrite and _is_done(trial, out):
-                if on_kept is not None:
-                    on_kept(trial)
+                if on_done is not None:
+                    on_done(trial)
             else:
                 jobs[trial.folder] = trial
         scheduler.run(

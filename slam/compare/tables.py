@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +14,7 @@ from slam.compare.statistics import Difference, adjusted, difference, interval
 from slam.compare.sweep import Run
 from slam.files import write_text
 from slam.geometry.se3 import Array
+from slam.run.outputs import csv_rows
 
 
 @dataclass(frozen=True)
@@ -112,16 +111,17 @@ def write_tables(plan: Plan, runs: Sequence[Run], out: Path) -> None:
     """Write runs.csv, means.csv, differences.csv, and apart from these, because no two runs agree, timings.csv."""
     own = sorted({key for run in runs for key in run.metrics} - set(BY_KEY))
     keys = [*BY_KEY, *own]
-    _write(out / "runs.csv", (*RUN_COLUMNS, *keys), ((*_head(r), *_cells(r, keys)) for r in runs))
+    _write(out / "runs.csv", (*RUN_COLUMNS, *keys), ((*run_head(r), *_cells(r, keys)) for r in runs))
     every = groups(plan, runs)
     _write(out / "means.csv", MEAN_COLUMNS, (row for group in every for row in _mean_rows(group)))
     _write(out / "differences.csv", DIFFERENCE_COLUMNS, (row for group in every for row in _difference_rows(group)))
     stages = list(dict.fromkeys(stage for run in runs for stage in run.milliseconds))
-    rows = ((*_head(r), *(_number(r.milliseconds.get(s)) for s in stages)) for r in runs)
+    rows = ((*run_head(r), *(_number(r.milliseconds.get(s)) for s in stages)) for r in runs)
     _write(out / "timings.csv", (*RUN_COLUMNS, *(f"ms_{stage}" for stage in stages)), rows)
 
 
-def _head(run: Run) -> tuple[str, ...]:
+def run_head(run: Run) -> tuple[str, ...]:
+    """Cells of `RUN_COLUMNS`."""
     t = run.trial
     return t.sequence, t.variant.name, t.variant.frontend, t.mode, str(t.seed), t.backend, run.outcome
 
@@ -162,6 +162,4 @@ def _number(value: float | None) -> str:
 
 def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table at once or not at all."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    write_text(path, text.getvalue())
+    write_text(path, csv_rows([columns, *rows]))

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def _closed_loop(trial: Trial, out: Path) -> Measured:
     record = out / RECORDING
     options = RunOptions(trial.backend, trial.variant.frontend, config, out, trial.start, trial.stop, record)
     collector = Collector(sequence, trial.start)
-    shown = WithoutImages(sequence) if isinstance(sequence, WorldSequence) and frontend is not None else sequence
+    shown: Any = sequence if frontend is None else WithoutImages(cast(WorldSequence, sequence))
     summary = run(shown, options, collector.add, frontend=frontend)
     return _measured(collector, out, summary)
 

@@ -14,15 +14,9 @@ from slam.evaluation.metrics import chi_square_band
 
 #: A verdict as a badge has it, in the report and on the terminal.
 WORDS = {
-    Verdict.CERTAIN: "certain",
-    Verdict.LIKELY: "likely",
-    Verdict.HINT: "a hint",
-    Verdict.OPEN: "open",
-    Verdict.EQUAL: "equal",
-    Verdict.SINGLE: "one trial",
-    Verdict.NONE: "no pair",
-    Verdict.UNTESTED: "",
-}
+    Verdict.CERTAIN: "certain", Verdict.LIKELY: "likely", Verdict.HINT: "a hint", Verdict.OPEN: "open",
+    Verdict.EQUAL: "equal", Verdict.SINGLE: "one trial", Verdict.NONE: "no pair", Verdict.UNTESTED: "",
+}  # fmt: skip
 
 #: What a badge means.
 STRENGTH = {
@@ -31,23 +25,15 @@ STRENGTH = {
     Verdict.HINT: f"a hint (p ≤ {HINT_ALPHA:g})",
     Verdict.SINGLE: "in one trial, which cannot say whether that is chance",
 }
-_VERB = {Verdict.CERTAIN: "is", Verdict.LIKELY: "seems", Verdict.HINT: "seems", Verdict.SINGLE: "was"}
 
 _TRIFLE = 0.01  # of the larger value: a smaller difference is no headline
 _MISSING = 0.5  # of what the smaller of two shares lacks: with a larger difference, nearly all is not as good as all
-
 _FACTOR = 3.0  # between two means, from which on it is said as a factor
 
-_SMOOTHER, _ROUGHER = 0.5, 2.0  # NIS per degree of freedom beyond which a sentence says what it means
-
 #: Figures that say whether covariances hold, the best first: drift does not add up over stretches.
-_HONESTY = ("nees_10m_per_dof", "nees_1m_per_dof", "nees_per_dof")
-
-
-_REPLAYED = (
-    "covariances of a replay are the back end's alone; those of a closed loop are larger, as they count what is not "
-    "known of the rig's calibration."
-)
+_HONESTY = {
+    "nees_10m_per_dof": "over 10 m of path", "nees_1m_per_dof": "over 1 m of path", "nees_per_dof": "from the start",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,28 +74,25 @@ def headline(differences: Sequence[Difference], other: str) -> list[Line]:
     All that is certain, likely, or a hint is named, in both directions; of the rest the main figures.
     """
     lines = []
-    tested = [d for d in differences if direction(d) and _is_named(d)]
-    named = [d for d in tested if not is_trifle(d)]
+    tested = [d for d in differences if direction(d) and (d.metric.main or d.verdict is not Verdict.SINGLE)]
     for verdict in STRENGTH:
         for way in ("better", "worse"):
-            own = [d for d in named if d.verdict is verdict and direction(d) == way]
+            own = [d for d in tested if d.verdict is verdict and direction(d) == way and not is_trifle(d)]
             if own:
-                lines.append(Line(f"{other}: {_listed(own)}", way, verdict))
+                lines.append(Line(f"{other}: {'; '.join(map(_brief, own))}", way, verdict))
     if trifles := [_name(d.metric) for d in tested if is_trifle(d)]:
         lines.append(Line(f"{other}: less than {100 * _TRIFLE:g} % apart: {', '.join(trifles)}", "", Verdict.EQUAL))
     rest = [d for d in differences if worth_saying(d)]
-    for verdict in (Verdict.OPEN, Verdict.NONE):
-        names = [_name(d.metric) for d in rest if (Verdict.OPEN if _is_open(d) else d.verdict) is verdict]
-        if names:
+    for verdict, of in ((Verdict.OPEN, (Verdict.OPEN, Verdict.EQUAL)), (Verdict.NONE, (Verdict.NONE,))):
+        if names := [_name(d.metric) for d in rest if d.verdict in of]:
             lines.append(Line(f"{other}: {', '.join(names)}", "", verdict))
     return lines or [Line(f"{other}: errors (the true path is not known)", "", Verdict.NONE)]
 
 
 def in_short(differences: Sequence[Difference], reference: str, other: str) -> str:
     """Which of two back ends is better in what, in one sentence: in the main figures that can be told apart."""
-    told = [
-        d for d in differences if d.metric.main and d.verdict in (Verdict.CERTAIN, Verdict.LIKELY) and not is_trifle(d)
-    ]
+    sure = (Verdict.CERTAIN, Verdict.LIKELY)
+    told = [d for d in differences if d.metric.main and d.verdict in sure and not is_trifle(d)]
     parts = []
     for better, first, second in ((True, other, reference), (False, reference, other)):
         if names := [f"{_name(d.metric)} ({WORDS[d.verdict]})" for d in told if d.better is better]:
@@ -117,12 +100,17 @@ def in_short(differences: Sequence[Difference], reference: str, other: str) -> s
     return f"{'; '.join(parts) or f'No difference between {reference} and {other} can be concluded'}."
 
 
-def beforehand(trials: int) -> str:
-    """What so many trials can show, before they are run."""
-    tests = int(ALPHA * 2 ** min(trials - 1, 30))
-    if tests < 1:
-        return caution(trials)
-    return f"With {trials} trials a difference that has the same sign in all is certain where up to {tests} are tested."
+def sentence(d: Difference, reference: str, other: str) -> str:
+    """What may be said of one difference."""
+    trials = "one trial" if d.pairs == 1 else f"{d.pairs} trials"
+    if d.verdict is Verdict.NONE:
+        return f"{d.metric.label}: no trial in which both {reference} and {other} have it."
+    said = f"{_brief(d)}, from {reference} to {other}, mean of {trials}"
+    if not direction(d):
+        return f"{said}: no difference can be concluded." if d.metric.better else f"{said}."
+    interval = f"; {round(100 * LEVEL)} % interval {shown_interval(d, ' to ')}" if np.isfinite(d.low) else ""
+    p = f", p {shown_p(d.p)}, adjusted {shown_p(d.p_holm)}" if d.varies else ""
+    return f"{said}{interval}{p}: {direction(d)}, {STRENGTH[d.verdict]}."
 
 
 def is_trifle(d: Difference) -> bool:
@@ -131,30 +119,16 @@ def is_trifle(d: Difference) -> bool:
     Shares such as that of tracked frames are judged by what they lack, too: 99.2 % is not equal to 100 %.
     """
     apart, larger = abs(d.other - d.reference), max(abs(d.reference), abs(d.other))
-    if d.metric.better == "higher" and d.metric.unit == "%" and _shown(d, d.reference) != _shown(d, d.other):
+    same = _shown(d, d.reference) == _shown(d, d.other)
+    if d.metric.better == "higher" and d.metric.unit == "%" and not same:
         return bool(apart < _TRIFLE * larger and apart < _MISSING * (1 - min(d.reference, d.other)))
-    return bool(apart < _TRIFLE * larger or _shown(d, d.reference) == _shown(d, d.other))
+    return bool(apart < _TRIFLE * larger or same)
 
 
-def sentence(d: Difference, reference: str, other: str) -> str:
-    """What may be said of a difference, in plain words, in the unit in which the figure is shown."""
-    label, unit = d.metric.label, d.metric.unit and f" {d.metric.unit}"
-    if d.verdict is Verdict.NONE:
-        return f"{label}: nothing to compare, no trial in which both {reference} and {other} have it."
-    trials = "one trial" if d.pairs == 1 else f"{d.pairs} trials"
-    first, second = (other, reference) if d.better else (reference, other)
-    values = {reference: d.metric.show(d.reference), other: d.metric.show(d.other)}
-    against = f"{values[first]} against {values[second]}{unit}"
-    if d.verdict is Verdict.EQUAL:
-        return f"{label}: equal in {trials}, {values[reference]}{unit}."
-    if d.better is None:
-        return f"{label}: {reference} {values[reference]}, {other} {values[other]}{unit}, mean of {trials}."
-    if d.verdict is Verdict.SINGLE:
-        return f"{label}: {first} was better, {against}, {STRENGTH[d.verdict]}."
-    if d.verdict is Verdict.OPEN:
-        return f"{label}: no difference can be concluded, {first} {against}, mean of {trials}; {_evidence(d)}."
-    how = f"{against}{_apart(d)}, in {d.wins} of {trials}; {_evidence(d)}"
-    return f"{label}: {first} {_VERB[d.verdict]} better than {second}, {how}: {STRENGTH[d.verdict]}."
+def worth_saying(d: Difference) -> bool:
+    """Whether a summary speaks of it whatever its verdict: not of what has the same ideal value in every run."""
+    perfect = d.metric.better == "higher" and d.reference == 1
+    return d.metric.main and not (perfect and d.verdict is Verdict.EQUAL)
 
 
 def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
@@ -171,49 +145,12 @@ def honesty(values: dict[str, dict[str, float]], runs: int) -> list[str]:
         if key is None:
             continue
         value = values[key][backend]
-        where = {"nees_10m_per_dof": "over 10 m of path", "nees_1m_per_dof": "over 1 m of path"}.get(
-            key, "from the start"
-        )
         claim = "consistent" if low <= value <= high else "overconfident" if value > high else "too cautious"
         lines.append(
-            f"{backend}: {claim}. NEES / 6 {where} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by chance "
-            f"({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances claim."
+            f"{backend}: {claim}. NEES / 6 {_HONESTY[key]} is {_digits(value)}, expected 1, {low:.2f} to {high:.2f} by "
+            f"chance ({round(100 * LEVEL)} %): errors are {_digits(np.sqrt(value))} times as large as the covariances "
+            "claim."
         )
-    return lines
-
-
-def replayed(backend: str, closed: dict[str, float], replay: dict[str, float]) -> str:
-    """Why the covariances of a replay are smaller than those of the closed loop; empty where they are not.
-
-    Args:
-        backend: the one whose closed loop is replayed, so that the measurements of both are the same.
-        closed: its mean NEES there, by key of the figure; NaN where there is none.
-        replay: that of the replay.
-    """
-    for key in _HONESTY:
-        before, now = closed.get(key, np.nan), replay.get(key, np.nan)
-        if np.isfinite(before + now):
-            if now - before < _TRIFLE * now:
-                return ""
-            return f"NEES / 6 of {backend} is {_digits(now)}, and {_digits(before)} in its closed loop: {_REPLAYED}"
-    return ""
-
-
-def innovations(nis: dict[str, float]) -> list[str]:
-    """What a NIS far from one means, a sentence for the back ends that are on the same side.
-
-    Args:
-        nis: mean NIS per degree of freedom by back end; NaN where there is none.
-    """
-    lines = []
-    for below, meaning in (
-        (True, "better than assumed. Pixels are more exact than models.pixel_sigma, or motion is smoother"),
-        (False, "worse than assumed. Pixels are less exact than models.pixel_sigma, or matches are wrong"),
-    ):
-        own = [f"{b} {_digits(x)}" for b, x in nis.items() if (x < _SMOOTHER if below else x > _ROUGHER)]
-        if own:
-            text = f"NIS per degree of freedom: {', '.join(own)}, expected 1"
-            lines.append(f"{text}: predictions and measurements agree {meaning}.")
     return lines
 
 
@@ -226,6 +163,14 @@ def failures(runs: dict[str, int], trials: int) -> str:
         f"Runs failed, {', '.join(counts)}: a trial in which either failed is no pair, and the other figures speak of "
         "the pairs alone."
     )
+
+
+def beforehand(trials: int) -> str:
+    """What so many trials can show, before they are run."""
+    tests = int(ALPHA * 2 ** min(trials - 1, 30))
+    if tests < 1:
+        return caution(trials)
+    return f"With {trials} trials a difference that has the same sign in all is certain where up to {tests} are tested."
 
 
 def caution(trials: int, tests: int = 1) -> str:
@@ -243,8 +188,7 @@ def caution(trials: int, tests: int = 1) -> str:
             "One trial cannot tell a difference from chance: synthetic worlds have as many as are asked for (--trials, "
             f"{enough} or more), a recorded sequence has one."
         )
-    least = 2 / 2**trials
-    what = "nothing can be certain"
+    least, what = 2 / 2**trials, "nothing can be certain"
     if trials < fewest(1):
         why = f"even where all agree, chance alone does as much in {100 * least:.2g} % of such comparisons"
     else:
@@ -261,6 +205,9 @@ def measurements(mode: str, reference: str) -> str:
     return "Closed loop: each back end steers its own data association"
 
 
+# ------------------------------------------------------------------------------------------- numbers for people
+
+
 def shown_mean(d: Difference) -> str:
     """The mean difference for people, with the digits of its interval.
 
@@ -270,8 +217,7 @@ def shown_mean(d: Difference) -> str:
         return f"× {10**d.mean:.3f}"
     if not np.isfinite(d.low):
         return d.metric.show(d.mean)
-    digits = decimals(d.metric.scale * max(abs(d.low), abs(d.high)))
-    return f"{d.metric.scale * d.mean:.{digits}f}".replace("-", "−")
+    return _fixed(d.metric.scale * d.mean, decimals(d.metric.scale * max(abs(d.low), abs(d.high))))
 
 
 def shown_interval(d: Difference, between: str = " … ") -> str:
@@ -280,31 +226,17 @@ def shown_interval(d: Difference, between: str = " … ") -> str:
         return "–"
     if d.metric.better == "one":
         return f"{10**d.low:.3f}{between}{10**d.high:.3f}"
-    return shown_bounds(d.metric, d.low, d.high, between)
-
-
-def shown_bounds(metric: Metric, low: float, high: float, between: str = " … ") -> str:
-    """Two values of a figure for people; a dash where there are none."""
-    if not np.isfinite(low):
-        return "–"
-    low, high = metric.scale * low, metric.scale * high
-    digits = decimals(max(abs(low), abs(high)))
-    return f"{low:.{digits}f}{between}{high:.{digits}f}".replace("-", "−")
+    digits = decimals(d.metric.scale * max(abs(d.low), abs(d.high)))
+    return between.join(_fixed(d.metric.scale * bound, digits) for bound in (d.low, d.high))
 
 
 def shown_spread(metric: Metric, mean: float, sd: float) -> tuple[str, str]:
     """Mean and standard deviation for people, with as many digits as the mean needs; empty where there is none."""
-    mean, sd = metric.scale * mean, metric.scale * sd
     if not np.isfinite(mean):
         return "–", ""
-    digits = decimals(mean)
-    shown = f"{mean:.{digits}f}".replace("-", "−")
-    return shown, f"± {sd:.{digits}f}" if np.isfinite(sd) else ""
-
-
-def decimals(value: float) -> int:
-    """Digits after the point that show three of a value; at most six."""
-    return min(6, max(0, 2 - int(np.floor(np.log10(abs(value)))))) if value else 0
+    digits = decimals(metric.scale * mean)
+    spread = f"± {_fixed(metric.scale * sd, digits)}" if np.isfinite(sd) else ""
+    return _fixed(metric.scale * mean, digits), spread
 
 
 def shown_p(p: float) -> str:
@@ -314,43 +246,18 @@ def shown_p(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
-def worth_saying(d: Difference) -> bool:
-    """Whether a summary speaks of it whatever its verdict: not of what has the same ideal value in every run."""
-    perfect = d.metric.better == "higher" and d.reference == 1
-    return d.metric.main and not (perfect and d.verdict is Verdict.EQUAL)
+def decimals(value: float) -> int:
+    """Digits after the point that show three of a value; at most six."""
+    return min(6, max(0, 2 - int(np.floor(np.log10(abs(value)))))) if value else 0
 
 
-def _is_named(d: Difference) -> bool:
-    return d.metric.main or d.verdict is not Verdict.SINGLE
-
-
-def _is_open(d: Difference) -> bool:
-    return d.verdict in (Verdict.OPEN, Verdict.EQUAL)
-
-
-def _evidence(d: Difference) -> str:
-    """Interval, where there is one, and p."""
-    if not np.isfinite(d.low):
-        return f"p {_equals(d.p)}" + ("" if d.p_holm == d.p else f", Holm-adjusted {shown_p(d.p_holm)}")
-    what = f"{round(100 * LEVEL)} % interval"
-    if d.metric.better == "one":
-        what += " of the ratio of the factors by which they are off"
-    unit = d.metric.unit and f" {d.metric.unit}"
-    text = f"{what} {shown_interval(d, ' to ')}{unit}, p {_equals(d.p)}"
-    return text if d.p_holm == d.p else f"{text}, Holm-adjusted {shown_p(d.p_holm)}"
-
-
-def _equals(p: float) -> str:
-    return shown_p(p) if shown_p(p).startswith("<") else f"= {shown_p(p)}"
+def _fixed(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "−")
 
 
 def _name(metric: Metric) -> str:
     """A label that can stand in a list."""
     return metric.label.replace(", ", " ").removesuffix(" (expected 1)")
-
-
-def _listed(differences: Sequence[Difference]) -> str:
-    return "; ".join(map(_brief, differences))
 
 
 def _brief(d: Difference) -> str:
@@ -360,7 +267,6 @@ def _brief(d: Difference) -> str:
 
 
 def _shown(d: Difference, value: float) -> str:
-    """One of its two means as headlines print it."""
     return shown_spread(d.metric, value, np.nan)[0]
 
 
@@ -371,10 +277,8 @@ def _apart(d: Difference) -> str:
         return ""
     if small <= 0 or large / small < _FACTOR:
         return f" ({100 * (d.other / d.reference - 1):+.2g} %)".replace("-", "−")
-    return (
-        f" ({_digits(large / small) if large / small < 1e4 else f'{large / small:.1g}'} times as "
-        f"{'much' if d.other > d.reference else 'little'})"
-    )
+    times = _digits(large / small) if large / small < 1e4 else f"{large / small:.1g}"
+    return f" ({times} times as {'much' if d.other > d.reference else 'little'})"
 
 
 def _digits(value: float) -> str:

@@ -42,10 +42,10 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     Figures that cannot be computed for this path, such as those of one that runs off to infinity, are left out.
     """
     figures: dict[str, float] = {}
-    pairs = _common(estimate, sequence.ground_truth)
+    pairs = with_truth(estimate, sequence)
     if pairs is not None:
         mounting = getattr(sequence, "truth_noise", TruthNoise()).mounting
-        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _segments):
+        for part in (_absolute, partial(_from_start, mounting=mounting), _relative, _over_a_second, _segments):
             figures.update(_where_possible(part, *pairs))
         figures["poses with truth"] = float(len(pairs[0]))
     gps = getattr(sequence, "gps", None)
@@ -54,14 +54,9 @@ def evaluate(estimate: Trajectory, sequence: WithTruth) -> dict[str, float]:
     return figures
 
 
-def true_path(estimate: Trajectory, sequence: WithTruth) -> Trajectory | None:
-    """The true path at the stamps of an estimated one, in its own world; None where fewer than 3 poses have any."""
-    pairs = _common(estimate, sequence.ground_truth)
-    return None if pairs is None else pairs[1]
-
-
-def _common(estimate: Trajectory, truth: Trajectory | None) -> tuple[Trajectory, Trajectory] | None:
-    """Both paths at common stamps; None where fewer than 3 poses have truth."""
+def with_truth(estimate: Trajectory, sequence: WithTruth) -> tuple[Trajectory, Trajectory] | None:
+    """Estimated and true path at common stamps; None where fewer than 3 poses have truth."""
+    truth = sequence.ground_truth
     if truth is None or not len(estimate):
         return None
     try:
@@ -129,6 +124,18 @@ def _relative(own: Trajectory, true: Trajectory) -> dict[str, float]:
     }
 
 
+def _over_a_second(own: Trajectory, true: Trajectory) -> dict[str, float]:
+    """RPE over as many frames as come nearest to a second; nothing for a shorter path."""
+    delta = max(1, round(1.0 / float(np.median(np.diff(own.stamps)))))
+    if len(own) <= delta:
+        return {}
+    rpe = relative_errors(own, true, delta)
+    return {
+        "RPE RMSE over 1 s [m]": rpe.translation_statistics.rmse,
+        "RPE rotation RMSE over 1 s [deg]": rpe.rotation_statistics.rmse,
+    }
+
+
 def _segments(own: Trajectory, true: Trajectory) -> dict[str, float]:
     return {"segment error [%]": segment_errors(own, true).mean_translation}
 
@@ -146,7 +153,7 @@ def consistency(
         sequence: with ground truth or without; its `truth_noise`, where it has one, is that of the truth.
         common: the part of the covariances that the poses share (N); None where that is not known, or nothing.
     """
-    pairs = _common(estimate, sequence.ground_truth)
+    pairs = with_truth(estimate, sequence)
     if pairs is None or pairs[0].stamps[0] != estimate.stamps[0]:
         return {}
     rows = np.searchsorted(estimate.stamps, pairs[0].stamps)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,20 +24,6 @@ _CORRECTED, _CLOSED, _REFUSED = "#4527a0", "0.1", "#d81b60"  # what loops do
 _BODIES = ("#00838f", "#6a1b9a", "#5d4037", "#ad1457")
 _STRAIGHT = 12  # a path that is so many times as long as wide looks like a line on one scale
 _SIGMAS = 2.0  # size of ellipses and ellipsoids
-
-
-def draw_top_view(runs: list[RunData], truth: Trajectory | None, path: Path) -> None:
-    """Top view (right, forward) of each run: landmarks red triangles if seen in the last frame, else green dots.
-
-    As in paper A, Fig. 6; grey are landmarks of before.
-    """
-    figure, axes = _figure(len(runs), (6.4, 6.0))
-    for axis, run, colour in zip(axes, runs, backend_colours([run.backend for run in runs])):
-        draw_map(axis, run, truth, colour)
-        axis.set(title=run.name)
-        _draw_end(axis, run, truth, colour)
-    axes[-1].legend(*_named_once(axes), loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
-    _save(figure, path)
 
 
 def draw_map(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) -> None:
@@ -100,54 +85,33 @@ def is_revised(run: RunData) -> bool:
 
 def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
     """The map in 3D with covariance ellipsoids and the path (paper A, Fig. 5)."""
-    import matplotlib.pyplot as plt
-    from matplotlib.transforms import Bbox
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    figure = plt.figure(figsize=(6.4 * len(runs), 5.4))
+    figure = Figure(figsize=(6.4 * len(runs), 5.4))
+    FigureCanvasAgg(figure)
     u, v = np.mgrid[0 : 2 * np.pi : 9j, 0 : np.pi : 6j]
     sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     for i, run in enumerate(runs):
         axis: Any = figure.add_subplot(1, len(runs), i + 1, projection="3d")
-        near = well_known(run)[-most:]
-        for row in near:
+        for row in well_known(run)[-most:]:
             values, vectors = np.linalg.eigh(run.covariances[row])
             shape = (sphere * _SIGMAS * np.sqrt(np.maximum(values, 0))) @ vectors.T + run.positions[row]
             colour = _SEEN if run.seen_last[row] else _UNSEEN
             axis.plot_wireframe(shape[..., 0], shape[..., 2], -shape[..., 1], color=colour, lw=0.35)
-        p = run.online.positions
-        axis.plot(
-            p[:, 0], p[:, 2], -p[:, 1], color=backend_colours([run.backend])[0], lw=1.5, label=f"path of {run.name}"
-        )
+        p, colour = run.online.positions, backend_colours([run.backend])[0]
+        axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=colour, lw=1.5, label="path")
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
-        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]", title=run.name)
         for side in (axis.xaxis, axis.yaxis, axis.zaxis):
             side.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.yaxis.labelpad = axis.zaxis.labelpad = 9  # clear of the numbers
         axis.set_box_aspect(np.ptp([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()], axis=1))  # one scale for all
         axis.view_init(elev=25, azim=-65)
-    _, low, _, high = _ink(figure)
-    for axis, run in zip(figure.axes, runs):
-        figure.text(axis.get_position().x0 + axis.get_position().width / 2, high, run.name, ha="center", va="bottom")
-    shown = _named_once(figure.axes)
-    figure.legend(*shown, loc="upper center", bbox_to_anchor=(0.5, low), ncols=4, fontsize=8, frameon=False)
-    corners = np.reshape(_ink(figure), (2, 2)) * figure.get_size_inches()
-    _save(figure, path, bbox_inches=Bbox(corners).padded(0.1))
-
-
-def _named_once(axes: Sequence[Any]) -> tuple[list[Any], list[str]]:
-    """What a legend for several panels has: handles and labels, each label once."""
-    found = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels())}
-    return list(found.values()), list(found)
-
-
-def _ink(figure: Any) -> tuple[float, float, float, float]:
-    """Left, lower, right and upper end of what is drawn, in parts of the figure: a 3D scene leaves much of it white."""
-    figure.canvas.draw()
-    drawn = np.asarray(figure.canvas.buffer_rgba())[..., :3].min(axis=2) < 255
-    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
-    height, width = drawn.shape
-    return columns[0] / width, 1 - (rows[-1] + 1) / height, (columns[-1] + 1) / width, 1 - rows[0] / height
+    figure.axes[0].legend(loc="lower left", fontsize=8, frameon=False)
+    with whole_file(path) as file:
+        figure.savefig(file, dpi=110, metadata={"Software": None}, bbox_inches="tight")
 
 
 def stretch(axis: Axes, points: np.ndarray) -> bool:
@@ -205,24 +169,6 @@ def _draw_truth(axis: Axes, run: RunData, truth: Trajectory | None) -> None:
     axis.plot(*(true.positions @ T[:3, :3].T + T[:3, 3])[:, [0, 2]].T, "--", color=_TRUTH, lw=1.2, label="true path")
 
 
-def _draw_end(axis: Axes, run: RunData, truth: Trajectory | None, colour: str) -> None:
-    """The end of the path in an inset, large enough to tell it from the true path."""
-    online = run.online
-    if truth is None or len(online) < 3:
-        return
-    extent = max(float(np.ptp(online.positions, axis=0).max()), 1e-3)
-    _, errors, _ = position_errors(run, truth)
-    error = float(np.linalg.norm(errors[-1]))
-    end, half = online.positions[-1, [0, 2]], max(0.03 * extent, 3 * error)
-    inset = axis.inset_axes((0.68, 0.03, 0.3, 0.3))
-    inset.plot(*online.positions[:, [0, 2]].T, color=colour, lw=3, alpha=0.6)
-    _draw_truth(inset, run, truth)
-    inset.set(xlim=(end[0] - half, end[0] + half), ylim=(end[1] - half, end[1] + half), aspect="equal")
-    inset.set(xticks=[], yticks=[])
-    inset.set_title(f"end, {200 * half:.2g} cm wide", fontsize=7)
-    axis.indicate_inset_zoom(inset, edgecolor="0.5")
-
-
 def well_known(run: RunData) -> np.ndarray:
     """Rows of landmarks that are well known and near the path, most recent last: others spoil a picture's scale."""
     size = np.sqrt(np.trace(run.covariances, axis1=1, axis2=2)) if len(run.positions) else np.zeros(0)
@@ -254,18 +200,3 @@ def _limit_to_most(axis: Axes, run: RunData) -> None:
     margin = 0.05 * float((high - low).max()) + 0.1
     axis.set_xlim(low[0] - margin, high[0] + margin)
     axis.set_ylim(low[1] - margin, high[1] + margin)
-
-
-def _figure(count: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, count, figsize=(size[0] * count, size[1]), squeeze=False, layout="constrained")
-    return figure, list(axes.ravel())
-
-
-def _save(figure: Any, path: Path, **options: Any) -> None:
-    import matplotlib.pyplot as plt
-
-    with whole_file(path) as file:
-        figure.savefig(file, dpi=110, metadata={"Software": None}, **options)
-    plt.close(figure)

@@ -66,8 +66,8 @@ class RunFiles:
             self._trajectory, self._frames, self._objects = (
                 stack.enter_context(closing(RowFile(folder / name))) for name in _ROWS
             )
-            self._frames.write(_rows([FRAME_COLUMNS]))
-            self._objects.write(_rows([OBJECT_COLUMNS]))
+            self._frames.write(csv_rows([FRAME_COLUMNS]))
+            self._objects.write(csv_rows([OBJECT_COLUMNS]))
             self._spare = stack.enter_context(ExitStack())
             for _ in range(_SPARE):
                 self._spare.callback(os.close, os.open(os.devnull, os.O_RDONLY))
@@ -108,20 +108,21 @@ class RunFiles:
         row += [_number(features.threshold), _number(r.nis), r.dof, *map(_number, deviations)]
         row += [f"{result.milliseconds.get(stage, 0.0):.3f}" for stage in STAGES]
         line = tum_line(e.stamp, e.T_world_left) if result.located else ""
-        things = _rows(_object_row(number, thing) for thing in result.objects)
+        things = csv_rows(_object_row(number, thing) for thing in result.objects)
         with naming_folder(self.folder):
-            self._frames.write(_rows([row]))
+            self._frames.write(csv_rows([row]))
             self._objects.write(things)
             self._trajectory.write(line)
 
-    def write_trajectory(self, trajectory: Trajectory) -> None:
-        """Write trajectory_final.txt; raises SlamError where it cannot be written, and nothing is left of it."""
-        write_text(self.folder / "trajectory_final.txt", _tum(trajectory))
+    def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """Write a path to a file; raises SlamError where it cannot be written, and nothing is left of it."""
+        lines = (tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
+        write_text(self.folder / name, "".join(lines))
 
     def write_landmarks(self, estimate: Estimate, landmarks: LandmarkTable | None, numbers: list[int]) -> None:
         """Write landmarks.csv; `numbers` are the frames' numbers by step. Raises as `write_trajectory`."""
         rows = [] if landmarks is None else _landmark_rows(estimate, landmarks, numbers)
-        write_text(self.folder / "landmarks.csv", _rows([LANDMARK_COLUMNS, *rows]))
+        write_text(self.folder / "landmarks.csv", csv_rows([LANDMARK_COLUMNS, *rows]))
 
     def write_old_landmarks(self, atlas: Atlas, present: IdArray) -> None:
         """Write landmarks_old.csv: of this run's keyframes, without those `present`; raises as `write_trajectory`."""
@@ -131,11 +132,7 @@ class RunFiles:
             at = transform(T, np.asarray(keyframe.points, float)[rows])
             found.update(zip(np.asarray(keyframe.landmarks)[rows].tolist(), at))
         lines = ([i, *(f"{x:.9g}" for x in found[i])] for i in sorted(found))
-        write_text(self.folder / OLD_LANDMARKS, _rows([header(OLD_TABLE), *lines]))
-
-    def write_truth(self, trajectory: Trajectory) -> None:
-        """Write truth.txt, the true path at the frames' stamps; raises as `write_trajectory`."""
-        write_text(self.folder / "truth.txt", _tum(trajectory))
+        write_text(self.folder / OLD_LANDMARKS, csv_rows([header(OLD_TABLE), *lines]))
 
     def write_json(self, name: str, tree: dict[str, Any]) -> None:
         """Write a JSON file at once or not at all; raises as `write_trajectory`."""
@@ -171,16 +168,11 @@ def naming_folder(folder: Path) -> Iterator[None]:
         raise SlamError(f"cannot write to {folder}: no possible file name") from error
 
 
-def _rows(rows: Iterable[Sequence[Any]]) -> str:
+def csv_rows(rows: Iterable[Sequence[Any]]) -> str:
     """Rows of a CSV file."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
-
-
-def _tum(trajectory: Trajectory) -> str:
-    """All lines of a TUM file."""
-    return "".join(tum_line(s, T) for s, T in zip(trajectory.stamps, trajectory.poses))
 
 
 def _landmark_rows(estimate: Estimate, landmarks: LandmarkTable, numbers: list[int]) -> Iterator[list[Any]]:

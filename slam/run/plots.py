@@ -108,10 +108,9 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    inches = None if width is None else width / 25.4
-    with rc_context(_STYLE | (_SMALL_STYLE if inches is not None and inches < _PAGE else {})):
-        figure = KINDS[kind](runs, inches)
-        caption = _caption(figure, runs, kind)
+    with rc_context(_style(width)):
+        figure = KINDS[kind](runs, _inches(width))
+        caption = _caption(figure, runs)
         if path.suffix.lower() != ".png" or width is not None:
             _without_titles(figure, runs, kind)
         FigureCanvasAgg(figure)
@@ -125,7 +124,26 @@ def plot(runs: Sequence[RunData], path: Path, kind: str = "summary", width: floa
     return caption
 
 
-def _caption(figure: Figure, runs: Sequence[RunData], kind: str) -> str:
+def drawn(runs: Sequence[RunData], kind: str, width: float) -> Figure:
+    """A picture without titles, as for a paper, so wide [mm]."""
+    from matplotlib import rc_context
+
+    with rc_context(_style(width)):
+        figure = KINDS[kind](runs, _inches(width))
+        _without_titles(figure, runs, kind)
+    return figure
+
+
+def _inches(width: float | None) -> float | None:
+    return None if width is None else width / 25.4
+
+
+def _style(width: float | None) -> dict[str, Any]:
+    """Sizes of the letters: small ones where a picture is, as in a paper."""
+    return _STYLE | (_SMALL_STYLE if width is not None and width / 25.4 < _PAGE else {})
+
+
+def _caption(figure: Figure, runs: Sequence[RunData]) -> str:
     """The titles in one text."""
     titles = [" ".join(axis.get_title().split()) for axis in figure.axes]
     return ". ".join([_title(runs), *(title for title in titles if title)]) + "."

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,13 @@ from slam.calibration import load_calibration
 from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFrame
 from slam.errors import SlamError, one_line, text_of
-from slam.evaluation.summary import true_path
+from slam.evaluation.summary import with_truth
 from slam.files import noting_inputs
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Frontend
 from slam.mapping.map_io import load_map, save_map
 from slam.objects.metrics import ObjectScore, labels_in_images, score_for
 from slam.outputs import Output, require_outputs
-from slam.run.last_files import LastFiles
 from slam.run.outcome import median_depth, motion_doubt, outcome
 from slam.run.outputs import NAMES, RunFiles
 from slam.run.recorded import RecordedFrame, Recording
@@ -147,7 +147,7 @@ def run(
         warm_up(options.backend if options.backend in registry.ONLINE else registry.ONLINE[0], until=until)
     record = RunRecord()
     results = _processed(system, _Reading(frames, live), tuple(watches), options.overlap, record)
-    return _drive(sequence, options, system, results, record, on_frame, live)
+    return _Run(sequence, options, system, record, live).drive(results, on_frame)
 
 
 @one_blas_thread
@@ -168,56 +168,191 @@ def run_recording(
     backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
     results = zip(recording.numbers.tolist(), replay(recording, backend, association=config.association))
     record = RunRecord()
-    return _drive(recording, options, Replayed(recording, backend, record), results, record, on_frame)
+    return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
 
 
-def _drive(
-    sequence: Sequence | Recording,
-    options: RunOptions,
-    system: StereoSlam | Replayed,
-    results: Iterable[tuple[int, FrameResult]],
-    record: RunRecord,
-    on_frame: Callable[[FrameResult], None] | None,
-    live: LiveFrames | None = None,
-) -> dict[str, Any]:
-    """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
+@dataclass
+class _Run:
+    """A run on its way: everything that its files are made of."""
 
-    Raises:
-        SlamError: a file cannot be written; all others are.
-    """
-    tape: list[RecordedFrame] = []
-    score = score_for(sequence)
-    last = LastFiles()
-    ended, stopped_by = "completed", None
-    with RunFiles(options.out) as files:
-        files.write_json("config.json", _config_tree(sequence, options, system))
-        with last.each():
-            files.write_json("schema.json", schema(options.config, getattr(system, "frontend", None), system.backend))
+    sequence: Sequence | Recording
+    options: RunOptions
+    system: StereoSlam | Replayed
+    record: RunRecord
+    live: LiveFrames | None = None
+    tape: list[RecordedFrame] = field(default_factory=list)
+    failures: list[Exception] = field(default_factory=list)  # of the last files
+
+    def drive(
+        self, results: Iterable[tuple[int, FrameResult]], on_frame: Callable[[FrameResult], None] | None
+    ) -> dict[str, Any]:
+        """Write what each frame gives, and in the end the rest, however it ends; returns the summary.
+
+        Raises:
+            SlamError: a file cannot be written; all others are.
+        """
+        record, score = self.record, score_for(self.sequence)
+        ended, stopped_by = "completed", None
+        with RunFiles(self.options.out) as files:
+            files.write_json("config.json", self._config())
+            with self._each():
+                frontend, backend = getattr(self.system, "frontend", None), self.system.backend
+                files.write_json("schema.json", schema(self.options.config, frontend, backend))
+            try:
+                for number, result in results:
+                    record.add(number, result)
+                    places = (_place(step, record) for step in (result.loop, result.refused_loop))
+                    files.write_frame(number, result, *places)
+                    if score is not None:
+                        score.add(number, result, labels_in_images(self.sequence, number, result.features))
+                    if self.options.record is not None:
+                        self.tape.append(RecordedFrame.of(result, number))
+                    if on_frame is not None:
+                        on_frame(result)
+            except BaseException as error:
+                ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
+                raise
+            finally:
+                files.free_spare()
+                if self.live is not None and self.live.ended_early and stopped_by is None:
+                    ended = "ended by the user"
+                summary = self._finish(files, ended, score)
+                self._write_copies()
+                if self.failures:
+                    summary["failures"] = self._said()
+                    with self._each():
+                        files.write_json("summary.json", summary)
+                self._report(stopped_by)
+        return summary
+
+    @contextmanager
+    def _each(self) -> Iterator[None]:
+        """One of the last files: it is written although another one failed."""
         try:
-            for number, result in results:
-                record.add(number, result)
-                files.write_frame(number, result, _place(result.loop, record), _place(result.refused_loop, record))
-                if score is not None:
-                    score.add(number, result, labels_in_images(sequence, number, result.features))
-                if options.record is not None:
-                    tape.append(RecordedFrame.of(result, number))
-                if on_frame is not None:
-                    on_frame(result)
-        except BaseException as error:
-            ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
-            raise
-        finally:
-            files.free_spare()
-            if live is not None and live.ended_early and stopped_by is None:
-                ended = "ended by the user"
-            summary = _finish(sequence, options, system, record, files, ended, score, last, live)
-            _write_copies(sequence, options, system, record, tape, last)
-            if last.failures:
-                summary["failures"] = last.lines
-                with last.each():
-                    files.write_json("summary.json", summary)
-            last.report(stopped_by)
-    return summary
+            yield
+        except Exception as error:  # noqa: BLE001 `_report` raises it
+            self.failures.append(error)
+
+    def _said(self) -> list[str]:
+        """What failed, a line each."""
+        return [one_line(text_of(error)) or type(error).__name__ for error in self.failures]
+
+    def _report(self, stopped_by: BaseException | None) -> None:
+        """Raise what failed, in one line with the error that stopped the run; a signal goes on, after warnings.
+
+        Raises:
+            SlamError: a file could not be written.
+            Exception: a defect of the program, as it is.
+        """
+        lines = list(dict.fromkeys(self._said()))
+        if not lines:
+            return
+        if stopped_by is not None and not isinstance(stopped_by, SlamError):
+            for line in lines:
+                logger.warning("%s", line)
+            return
+        defect = next((error for error in self.failures if not isinstance(error, SlamError)), None)
+        if stopped_by is None and defect is not None:
+            raise defect
+        first = [] if stopped_by is None else [str(stopped_by)]
+        kind = SlamError if stopped_by is None else type(stopped_by)
+        raise kind("; ".join(dict.fromkeys([*first, *lines]))) from stopped_by
+
+    def _write_copies(self) -> None:
+        """The recording and the map, where they were asked for."""
+        if self.options.record is not None:
+            with self._each():
+                save_recording(self._recording(), self.options.record)
+        if self.options.save_map is not None and self.record.stamps and isinstance(self.system, StereoSlam):
+            with self._each():
+                save_map(self.options.save_map, self.system)
+
+    def _recording(self) -> Recording:
+        """What was given to the back end of a run.
+
+        Raises:
+            SlamError: it was given to more than one, or it was given landmarks back, which are no observations.
+        """
+        options, sequence = self.options, self.sequence
+        if self.record.returned is not None:
+            raise SlamError(
+                f"{options.record}: not written: landmarks came back into the map in frame {self.record.returned}, and "
+                "a recording holds observations alone: use atlas.give_back=false"
+            )
+        if isinstance(self.system, StereoSlam) and self.system.restarted:
+            raise SlamError(
+                f"{options.record}: not written: the camera was lost, and a new back end took over in frame "
+                f"{self.system.restarted[0]}; what is recorded is for one"
+            )
+        whole = Recording.of(self.tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
+        return replace(whole, kind=sequence.kind)
+
+    def _finish(self, files: RunFiles, ended: str, score: ObjectScore | None) -> dict[str, Any]:
+        """Write the last files, each whether or not another fails, and return the summary."""
+        summary = self._head(ended)
+        system, record, sequence = self.system, self.record, self.sequence
+        if record.stamps:
+            final = Trajectory.empty()
+            with self._each():
+                final = system.trajectory()
+                files.write_trajectory("trajectory_final.txt", final)
+            with self._each():
+                pairs = with_truth(record.trajectory, sequence)
+                if pairs is not None:
+                    files.write_trajectory("truth.txt", pairs[1])
+            with self._each():
+                files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
+            if isinstance(system, StereoSlam) and system.landmarks is not None:
+                with self._each():
+                    files.write_old_landmarks(system.atlas, system.landmarks.ids)
+            with self._each():
+                summary.update(results_of(sequence, system, record, final, score))
+        summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
+        summary["configuration"] = self.options.config.to_json()
+        summary["versions"] = versions()
+        with self._each():
+            files.write_json("summary.json", summary)
+        return summary
+
+    def _head(self, ended: str) -> dict[str, Any]:
+        """The summary's first part: what was run, how it ended, and whether the camera was tracked."""
+        options, record, sequence = self.options, self.record, self.sequence
+        warnings = getattr(self.system, "warnings", ())
+        driving = options.origin.get("kind") == "driving"
+        doubt = motion_doubt(record, options.config.models.motion, driving)
+        in_map, dropped = options.prior_map is not None, self.live.dropped if self.live else 0
+        tracking = outcome(record, sequence.rig, warnings, in_map, dropped, doubt, driving)
+        if doubt and not tracking:
+            logger.warning("%s", doubt)
+        return {
+            **self._names(),
+            "ended": ended,
+            "frames": len(record.numbers),
+            "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
+            "tracking": tracking,
+            "warnings": [*sequence.warnings, *warnings, *([doubt] if doubt else [])],
+            **({} if self.live is None else {"live": live_frames(self.live, record)}),
+        }
+
+    def _names(self) -> dict[str, Any]:
+        options, sequence = self.options, self.sequence
+        return {
+            "sequence": sequence.name, "format": sequence.format, "frontend": options.frontend,
+            "backend": options.backend,
+        }  # fmt: skip
+
+    def _config(self) -> dict[str, Any]:
+        """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
+        options = self.options
+        parts = {"frontend": in_force(getattr(self.system, "frontend", None)), "backend": in_force(self.system.backend)}
+        return {
+            **options.origin,
+            **self._names(),
+            "frames": [options.start, options.stop],
+            "settings": portable(options.config.to_json()),
+            "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
+            "versions": versions(),
+        }
 
 
 def _place(step: int | None, record: RunRecord) -> int | str:
@@ -225,49 +360,6 @@ def _place(step: int | None, record: RunRecord) -> int | str:
     if step is None:
         return ""
     return record.numbers[step] if step >= 0 else "map"
-
-
-def _write_copies(
-    sequence: Sequence | Recording,
-    options: RunOptions,
-    system: StereoSlam | Replayed,
-    record: RunRecord,
-    tape: list[RecordedFrame],
-    last: LastFiles,
-) -> None:
-    """The recording and the map, where they were asked for."""
-    if options.record is not None:
-        with last.each():
-            save_recording(_recording(sequence, options, system, record, tape), options.record)
-    if options.save_map is not None and record.stamps and isinstance(system, StereoSlam):
-        with last.each():
-            save_map(options.save_map, system)
-
-
-def _recording(
-    sequence: Sequence | Recording,
-    options: RunOptions,
-    system: StereoSlam | Replayed,
-    record: RunRecord,
-    tape: list[RecordedFrame],
-) -> Recording:
-    """What was given to the back end of a run.
-
-    Raises:
-        SlamError: it was given to more than one, or it was given landmarks back, which are no observations.
-    """
-    if record.returned is not None:
-        raise SlamError(
-            f"{options.record}: not written: landmarks came back into the map in frame {record.returned}, and a "
-            "recording holds observations alone: use atlas.give_back=false"
-        )
-    if isinstance(system, StereoSlam) and system.restarted:
-        raise SlamError(
-            f"{options.record}: not written: the camera was lost, and a new back end took over in frame "
-            f"{system.restarted[0]}; what is recorded is for one"
-        )
-    whole = Recording.of(tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
-    return replace(whole, kind=sequence.kind)
 
 
 def _processed(
@@ -307,78 +399,6 @@ class _Reading:
                 return
             self.milliseconds[frame.index] = 1e3 * (time.perf_counter() - start) if self.live is None else 0.0
             yield frame
-
-
-def _finish(
-    sequence: Sequence | Recording,
-    options: RunOptions,
-    system: StereoSlam | Replayed,
-    record: RunRecord,
-    files: RunFiles,
-    ended: str,
-    score: ObjectScore | None,
-    last: LastFiles,
-    live: LiveFrames | None = None,
-) -> dict[str, Any]:
-    """Write the last files, each whether or not another fails, and return the summary."""
-    warnings = getattr(system, "warnings", ())
-    driving = options.origin.get("kind") == "driving"
-    doubt = motion_doubt(record, options.config.models.motion, driving)
-    in_map, dropped = options.prior_map is not None, live.dropped if live else 0
-    tracking = outcome(record, sequence.rig, warnings, in_map, dropped, doubt, driving)
-    if doubt and not tracking:
-        logger.warning("%s", doubt)
-    summary: dict[str, Any] = {
-        "sequence": sequence.name,
-        "format": sequence.format,
-        "frontend": options.frontend,
-        "backend": options.backend,
-        "ended": ended,
-        "frames": len(record.numbers),
-        "status": {name: record.statuses.count(name) for name in sorted(set(record.statuses))},
-        "tracking": tracking,
-        "warnings": [*sequence.warnings, *warnings, *([doubt] if doubt else [])],
-    }
-    if live is not None:
-        summary["live"] = live_frames(live, record)
-    if record.stamps:
-        final = Trajectory.empty()
-        with last.each():
-            final = system.trajectory()
-            files.write_trajectory(final)
-        with last.each():
-            truth = true_path(record.trajectory, sequence)
-            if truth is not None:
-                files.write_truth(truth)
-        with last.each():
-            files.write_landmarks(system.estimate(), system.landmarks, record.numbers)
-        if isinstance(system, StereoSlam) and system.landmarks is not None:
-            with last.each():
-                files.write_old_landmarks(system.atlas, system.landmarks.ids)
-        with last.each():
-            summary.update(results_of(sequence, system, record, final, score))
-    summary["seed"] = getattr(sequence, "values", {}).get("seed", 0)  # a world's; nothing else is random
-    summary["configuration"] = options.config.to_json()
-    summary["versions"] = versions()
-    with last.each():
-        files.write_json("summary.json", summary)
-    return summary
-
-
-def _config_tree(sequence: Sequence | Recording, options: RunOptions, system: StereoSlam | Replayed) -> dict[str, Any]:
-    """What is run; ``in_force`` are all options of front end and back end, also those left at their defaults."""
-    parts = {"frontend": in_force(getattr(system, "frontend", None)), "backend": in_force(system.backend)}
-    return {
-        **options.origin,
-        "sequence": sequence.name,
-        "format": sequence.format,
-        "frontend": options.frontend,
-        "backend": options.backend,
-        "frames": [options.start, options.stop],
-        "settings": portable(options.config.to_json()),
-        "in_force": {name: portable(part) for name, part in parts.items() if part is not None},
-        "versions": versions(),
-    }
 
 
 def parse_frames(text: str | None) -> tuple[int, int | None]:

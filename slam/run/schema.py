@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from slam.config import SystemConfig
 from slam.run.settings_reference import descriptions
@@ -32,91 +31,71 @@ FRAMES = {
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 
-@dataclass(frozen=True)
-class Columns:
-    """Columns of one kind.
-
-    Attributes:
-        names: in their order.
-        unit: of all of them; empty for counts, words and ratios.
-        text: what they hold, in which frame.
-    """
+class Columns(NamedTuple):
+    """Columns of one kind: names, the unit of all (empty for counts, words and ratios), what they hold, which frame."""
 
     names: tuple[str, ...]
     unit: str
     text: str
 
 
-def _upper(prefix: str, names: tuple[str, ...]) -> tuple[str, ...]:
+def _upper(prefix: str, names: str) -> str:
     """Names of a symmetric matrix's upper triangle, row by row."""
-    return tuple(f"{prefix}{a}{b}" for i, a in enumerate(names) for b in names[i:])
+    return " ".join(f"{prefix}{a}{b}" for i, a in enumerate(names) for b in names[i:])
 
 
-_SIX = tuple("012345")
+def _table(*rows: str) -> tuple[Columns, ...]:
+    """Rows of ``names | unit | meaning``."""
+    cells = ([cell.strip() for cell in row.split("|")] for row in rows)
+    return tuple(Columns(tuple(names.split()), unit, text) for names, unit, text in cells)
 
-_POSE = (
-    Columns(("stamp",), "s", "time of the frame"),
-    Columns(("x", "y", "z"), "m", "position of the left camera in the world"),
-    Columns(("qx", "qy", "qz", "qw"), "", "unit quaternion that turns camera coordinates to world coordinates"),
+
+_POSE = _table(
+    "stamp | s | time of the frame",
+    "x y z | m | position of the left camera in the world",
+    "qx qy qz qw | | unit quaternion that turns camera coordinates to world coordinates",
 )
 
-FRAME_TABLE = (
-    Columns(("frame",), "", "number of the frame in the sequence"),
-    Columns(("stamp",), "s", "time of the frame"),
-    Columns(("status", "reason"), "", "started, tracked, predicted, lost or failed; and why, where it is not tracked"),
-    Columns(("features", "stereo"), "", "number of features in the left image; of those matched in the right image"),
-    Columns(("predicted", "matched"), "", "number of landmarks predicted to be in view; of those matched to a feature"),
-    Columns(("used", "rejected"), "", "number of matches that the back end used; that it rejected"),
-    Columns(("added", "erased", "map_size"), "", "number of landmarks added; erased; in the map after the frame"),
-    Columns(
-        ("keyframe", "loop", "refused"),
-        "",
-        "1 for a keyframe, else 0; the earlier frame of the same place, where a loop is closed (`map`: it is in the "
-        "prior map); the same for a loop that is refused because it contradicts the path",
-    ),
-    Columns(("D_threshold",), "", "threshold of the SURF detector (paper A, III.A)"),
-    Columns(
-        ("nis", "nis_dof"), "", "normalised innovation squared of the measurements used, and its degrees of freedom"
-    ),
-    Columns(("sd_x", "sd_y", "sd_z"), "m", "standard deviations of the position, along the axes of the world"),
-    Columns(("sd_rotation",), "rad", "standard deviation of the orientation, all three axes together"),
-    Columns(
-        tuple(f"ms_{stage}" for stage in STAGES), "ms", f"wall time of each stage: {', '.join(STAGE_NAMES.values())}"
-    ),
+FRAME_TABLE = _table(
+    "frame | | number of the frame in the sequence",
+    "stamp | s | time of the frame",
+    "status reason | | started, tracked, predicted, lost or failed; and why, where it is not tracked",
+    "features stereo | | number of features in the left image; of those matched in the right image",
+    "predicted matched | | number of landmarks predicted to be in view; of those matched to a feature",
+    "used rejected | | number of matches that the back end used; that it rejected",
+    "added erased map_size | | number of landmarks added; erased; in the map after the frame",
+    "keyframe loop refused | | 1 for a keyframe, else 0; the earlier frame of the same place, where a loop is closed "
+    "(`map`: it is in the prior map); the same for a loop that is refused because it contradicts the path",
+    "D_threshold | | threshold of the SURF detector (paper A, III.A)",
+    "nis nis_dof | | normalised innovation squared of the measurements used, and its degrees of freedom",
+    "sd_x sd_y sd_z | m | standard deviations of the position, along the axes of the world",
+    "sd_rotation | rad | standard deviation of the orientation, all three axes together",
+    f"{' '.join(f'ms_{stage}' for stage in STAGES)} | ms | wall time of each stage: {', '.join(STAGE_NAMES.values())}",
 )
 
-LANDMARK_TABLE = (
-    Columns(("id",), "", "of the landmark"),
-    Columns(("x", "y", "z"), "m", "position in the world"),
-    Columns(_upper("c", ("x", "y", "z")), "m²", "covariance of the position, upper triangle row by row"),
-    Columns(("seen", "last_seen"), "", "number of frames it was measured in; the last of them, empty for none"),
+LANDMARK_TABLE = _table(
+    "id | | of the landmark",
+    "x y z | m | position in the world",
+    f"{_upper('c', 'xyz')} | m² | covariance of the position, upper triangle row by row",
+    "seen last_seen | | number of frames it was measured in; the last of them, empty for none",
 )
 
-OBJECT_TABLE = (
-    Columns(("frame",), "", "number of the frame in the sequence"),
-    Columns(("stamp",), "s", "time of the frame"),
-    Columns(("id",), "", "of the body; it keeps it through stops and occlusions"),
-    Columns(
-        ("moving", "measured"), "", "1 where the body moves now, else 0; 1 where it was measured in this frame, else 0"
-    ),
-    Columns(("last_measured",), "s", "time of the last frame in which it was measured; empty where that is not known"),
-    Columns(("existence",), "", "probability that it exists"),
-    Columns(("x", "y", "z"), "m", "position of the body's origin in the world"),
-    Columns(("roll", "pitch", "yaw"), "rad", "orientation, from body to world axes: R = Rz(yaw) Ry(pitch) Rx(roll)"),
-    Columns(("vx", "vy", "vz"), "m/s", "velocity of the body's origin, along the axes of the world"),
-    Columns(("wx", "wy", "wz"), "rad/s", "angular velocity, along the axes of the world"),
-    Columns(
-        ("motion_x", "motion_y", "motion_z"),
-        "m",
-        "motion since the frame before: a point of the body went from p to R p + t in the world; this is t",
-    ),
-    Columns(("motion_roll", "motion_pitch", "motion_yaw"), "rad", "R of that motion"),
-    Columns(
-        _upper("c", _SIX),
-        "rad², rad·m, m²",
-        "covariance of the pose, upper triangle row by row: 0 to 2 rotation about x, y, z, 3 to 5 translation along "
-        "x, y, z, both in body axes, perturbing the pose on the right",
-    ),
+OBJECT_TABLE = _table(
+    "frame | | number of the frame in the sequence",
+    "stamp | s | time of the frame",
+    "id | | of the body; it keeps it through stops and occlusions",
+    "moving measured | | 1 where the body moves now, else 0; 1 where it was measured in this frame, else 0",
+    "last_measured | s | time of the last frame in which it was measured; empty where that is not known",
+    "existence | | probability that it exists",
+    "x y z | m | position of the body's origin in the world",
+    "roll pitch yaw | rad | orientation, from body to world axes: R = Rz(yaw) Ry(pitch) Rx(roll)",
+    "vx vy vz | m/s | velocity of the body's origin, along the axes of the world",
+    "wx wy wz | rad/s | angular velocity, along the axes of the world",
+    "motion_x motion_y motion_z | m | motion since the frame before: a point of the body went from p to R p + t in "
+    "the world; this is t",
+    "motion_roll motion_pitch motion_yaw | rad | R of that motion",
+    f"{_upper('c', '012345')} | rad², rad·m, m² | covariance of the pose, upper triangle row by row: 0 to 2 rotation "
+    "about x, y, z, 3 to 5 translation along x, y, z, both in body axes, perturbing the pose on the right",
 )
 
 #: Landmarks that had left the map before the end.

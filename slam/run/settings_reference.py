@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial
 from inspect import cleandoc
+from math import inf
 from typing import Any, get_args, get_type_hints
 
 from slam import registry
+from slam.bounds import LEAST
 from slam.config import SystemConfig
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.models import KINDS
-from slam.run.ranges import range_of_integers, range_of_numbers
 
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 _UNIT = re.compile(r"\[((?:px|m|rad|s|degrees|grey levels)(?:[²³]|/s²?|/√s)*(?: / √s)?)\]")
+_TRIED = 130  # whole numbers from zero on that are tried one by one, to find sets such as 16 and 64
+_LARGE, _SMALL, _STEPS = 1e15, 1e-12, 110  # taken for infinity, and for zero; bisections between the two
 _PARTS = ("frontend", "backend")  # sections whose settings are those of a class chosen by name
 
 
@@ -125,11 +128,39 @@ def _range(config: Any, name: str, annotation: Any, text: str) -> str:
     if str in kinds:
         words = re.findall(r'"(\w+)"', text)
         return ", ".join(words) if default in words else "text"
-    if int in kinds:
-        return range_of_integers(accepts, default) + also
-    if float in kinds:
-        return range_of_numbers(accepts, default) + also
+    if int in kinds or float in kinds:
+        return _range_of_numbers(accepts, default, int in kinds) + also
     return "list" + also
+
+
+def _range_of_numbers(accepts: Callable[[float], bool], default: float | None, whole: bool) -> str:
+    """Which numbers are accepted: a list such as ``"16, 64"``, or an interval such as ``"(0, 1]"``."""
+    tried = [n for n in range(_TRIED) if accepts(n)] if whole else []
+    if tried and tried[-1] < _TRIED - 1 and tried != list(range(tried[0], tried[-1] + 1)):
+        return ", ".join(map(str, tried))
+    inside = default if default is not None else next(iter(tried), None)
+    if inside is None:
+        return "numbers"
+    low, high = (_last(accepts, max(-_LARGE, min(inside, _LARGE)), sign * _LARGE, whole) for sign in (-1, 1))
+    first = "(-∞" if low == -inf else f"{'[' if accepts(low) else '('}{low:.10g}"
+    return f"{first}, " + ("∞)" if high == inf else f"{high:.10g}{']' if accepts(high) else ')'}")
+
+
+def _last(accepts: Callable[[float], bool], inside: float, outside: float, whole: bool) -> float:
+    """The last accepted number on the way from one inside to one outside; infinite where all are accepted."""
+    if accepts(int(outside) if whole else outside):
+        return inf if outside > 0 else -inf
+    for _ in range(_STEPS):
+        middle = (inside + outside) / 2
+        if whole:
+            middle = int(inside + outside) // 2 if outside > inside else -(int(-inside - outside) // 2)
+        if middle in (inside, outside):
+            break
+        inside, outside = (middle, outside) if accepts(middle) else (inside, middle)
+    if abs(inside) < 2 * LEAST and accepts(0):  # nothing between zero and `LEAST` is accepted where zero is
+        return 0
+    end = float(f"{0 if abs(inside) < _SMALL else inside:.9g}")
+    return int(end) if end.is_integer() else end
 
 
 def _accepts(config: Any, name: str, value: Any) -> bool:

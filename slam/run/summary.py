@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.data import Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend
 from slam.landmarks import LandmarkTable
@@ -36,6 +36,7 @@ class RunRecord:
     statuses: list[str] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     common: list[CommonError] = field(default_factory=list)
+    T_map_odom: list[Array] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     milliseconds: list[dict[str, float]] = field(default_factory=list)
     times: list[float] = field(default_factory=list)  # at the end of each frame, compiling left out [s]
@@ -69,6 +70,7 @@ class RunRecord:
         self.poses.append(result.estimate.T_world_left)
         self.covariances.append(result.estimate.covariance)
         self.common.append(result.common)
+        self.T_map_odom.append(result.T_map_odom)
         self.measured.append(result.status.measured)
         self.rejected += len(result.report.rejected)
         self.used += len(result.report.used)
@@ -140,6 +142,10 @@ def results_of(
         found["self_calibration"] = system.calibration.summary()
         found["loops"] = system.atlas.summary()
         found["bodies"] = len(record.bodies)
+        if system.atlas.loops or system.atlas.refused:
+            path = record.trajectory
+            odometry = Trajectory(path.stamps, inverse(np.array(record.T_map_odom)) @ path.poses)
+            found["accuracy"]["online without loops"] = evaluate(odometry.select(measured), sequence)
     if score is not None:
         found["objects"] = score.summary()
     compiled = compile_clock.seconds() - record.compiled_before

@@ -36,24 +36,6 @@ def test_runs_where_it_is_of_use_and_ends_with_the_block(started, monkeypatch, c
     assert all(process.poll() is not None for process in started)
 
 
-def test_modules_are_those_of_this_process_and_not_of_the_working_folder(started, monkeypatch, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "slam.py").write_text("open('executed', 'w').close()")
-    (tmp_path / "besides").mkdir()
-    (tmp_path / "besides" / "found_here.py").write_text("open('found', 'w').close()")
-    monkeypatch.chdir(tmp_path / "run")
-    monkeypatch.setattr(background_compilation, "_cold", lambda: True)
-    monkeypatch.setattr(background_compilation, "available_cores", lambda: 2)
-    monkeypatch.syspath_prepend(tmp_path / "besides")
-    monkeypatch.setattr(background_compilation, "__name__", "found_here")
-    with background_compilation.compiled_in_background("ekf"):
-        assert started[0].wait(60) == 0
-    monkeypatch.setattr(background_compilation, "__name__", "slam.commands")  # a package without a main module
-    with background_compilation.compiled_in_background("ekf"):
-        started[1].wait(60)
-    assert [file.name for file in (tmp_path / "run").iterdir() if file.name != "slam.py"] == ["found"]
-
-
 def test_ends_when_its_parent_is_killed():
     """Its standard input ends then."""
     command = [sys.executable, "-P", "-m", background_compilation.__name__, "ekf"]

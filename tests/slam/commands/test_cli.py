@@ -63,34 +63,10 @@ def test_empty_folder(slam_command, tmp_path):
     fails_with_one_line(slam_command("run", tmp_path / "empty", "--out", tmp_path / "out"), "empty")
 
 
-def test_a_file_where_a_folder_should_be(slam_command, tmp_path):
-    (tmp_path / "file").write_text("x")
-    fails_with_one_line(slam_command("run", tmp_path / "file", "--out", tmp_path / "out"), "file")
-
-
-def test_one_camera(slam_command, euroc, tmp_path):
-    (euroc / "mav0" / "cam1").rename(tmp_path / "elsewhere")
-    fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "cam1")
-
-
 def test_cameras_swapped(slam_command, euroc, tmp_path):
     sensor = euroc / "mav0" / "cam1" / "sensor.yaml"
     sensor.write_text(sensor.read_text().replace("0.11", "-0.11"))
     fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "left")
-
-
-def test_nan_in_the_calibration(slam_command, euroc, tmp_path):
-    sensor = euroc / "mav0" / "cam0" / "sensor.yaml"
-    sensor.write_text(sensor.read_text().replace("intrinsics: [150,", "intrinsics: [.nan,"))
-    fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "sensor.yaml")
-
-
-def test_images_of_unequal_size(slam_command, euroc, tmp_path):
-    import cv2
-
-    for image in (euroc / "mav0" / "cam1" / "data").iterdir():
-        cv2.imwrite(str(image), np.zeros((100, 160), np.uint8))
-    fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "160x100")
 
 
 def test_a_truncated_image_is_said_and_the_rest_goes_on(slam_command, euroc, tmp_path):
@@ -122,47 +98,9 @@ def test_unknown_names_and_keys(slam_command, euroc, tmp_path, arguments, words)
     fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out", *arguments), *words)
 
 
-def test_unknown_world(slam_command, tmp_path):
-    fails_with_one_line(slam_command("run", "synthetic:moon", "--out", tmp_path / "out"), "moon", "aisle")
-
-
-@pytest.mark.parametrize("text", ["aisle", "Aisel"])
-def test_a_world_without_its_mark(slam_command, tmp_path, text):
-    fails_with_one_line(slam_command("run", text, "--out", tmp_path / "out"), "did you mean 'synthetic:aisle'?")
-
-
-def test_a_format_of_folders_does_not_go_with_a_world(slam_command, tmp_path):
-    done = slam_command("run", "synthetic:desk?frames=2", "--format", "kitti", "--out", tmp_path / "out")
-    fails_with_one_line(done, "synthetic:desk?frames=2", "'kitti'")
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("command", ["run", "render"])
 def test_an_empty_sequence(slam_command, command, tmp_path):
     fails_with_one_line(slam_command(command, "", "--out", tmp_path / "out"), "path is empty")
-
-
-def test_only_worlds_are_rendered(slam_command, euroc, tmp_path):
-    done = slam_command("render", euroc, "--out", tmp_path / "out")
-    fails_with_one_line(done, "only synthetic worlds can be rendered")
-    assert not (tmp_path / "out").exists()
-
-
-def test_out_is_a_file(slam_command, euroc, tmp_path):
-    (tmp_path / "out").write_text("")
-    fails_with_one_line(slam_command("run", euroc, "--out", tmp_path / "out"), "out")
-
-
-def test_usage_errors_are_status_2(slam_command):
-    assert slam_command("run").returncode == 2
-    assert slam_command("fly").returncode == 2
-
-
-def test_list_names_everything():
-    done = in_a_new_process("list", env={**os.environ, "COLUMNS": "200"})
-    assert done.returncode == 0, done.stderr
-    for word in ("ekf", "smoother", "surf", "synthetic:aisle", "euroc", "kitti"):
-        assert word in done.stdout
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.errors import SlamError
-from slam.run.repeat import changed_versions, load, portable
+from slam.run.repeat import load, portable
 
 WORLD = "synthetic:aisle?frames=6&width=160&height=120"
 SAME = ("trajectory.txt", "trajectory_final.txt", "landmarks.csv", "objects.csv", "truth.txt", "schema.json")
@@ -120,24 +120,10 @@ def test_no_config_and_no_sequence(tmp_path):
         slam("run", WORLD, "--config", tmp_path, "--kind", "driving")
 
 
-def test_other_versions_are_said():
-    assert changed_versions({"numpy": "1", "numba": "2"}, {"numpy": "1", "numba": "2"}) == ""
-    assert changed_versions({"numpy": "1", "numba": "2"}, {"numpy": "3", "numba": "2"}) == "numpy 1, now 3"
-
-
 def test_infinity_goes_through_json():
     assert json.loads(json.dumps(portable({"a": (float("inf"), -float("inf"), 1.5)}))) == {
         "a": ["Infinity", "-Infinity", 1.5]
     }
-
-
-def test_runs_have_folders_of_their_own(here):
-    for _ in range(2):
-        slam("run", WORLD, "--frames", "0:2", "-q", "--no-picture")
-    assert {path.name for path in (here / "results").iterdir()} == {"aisle-ekf-1", "aisle-ekf-2"}
-    with pytest.raises(SlamError, match="70:80"):
-        slam("run", WORLD, "--frames", "70:80", "-q")
-    assert len(list((here / "results").iterdir())) == 2  # what was not begun leaves no folder
 
 
 def test_another_run_is_not_overwritten_without_being_told(here):
@@ -149,12 +135,6 @@ def test_another_run_is_not_overwritten_without_being_told(here):
     assert (here / "mine/config.json").read_bytes() == before
     slam("run", WORLD, "--frames", "0:3", "-o", "mine", "--overwrite", "-q", "--no-picture")
     assert json.loads((here / "mine/config.json").read_text())["frames"] == [0, 3]
-
-
-def test_a_file_where_results_go(here):
-    (here / "results").write_text("")
-    with pytest.raises(SlamError, match="give --out"):
-        slam("run", WORLD, "-q")
 
 
 def test_a_replay_has_a_folder_of_its_own_and_says_how_to_repeat_it(here):

@@ -7,8 +7,6 @@ import signal
 import time
 from pathlib import Path
 
-from slam.compare.frames import count_one
-
 
 def double(x):
     return 2 * x
@@ -37,8 +35,3 @@ def die(x):
 
 def threads():
     return os.environ["OPENBLAS_NUM_THREADS"], os.environ["OMP_NUM_THREADS"]
-
-
-def frames(count):
-    for _ in range(count):
-        count_one()

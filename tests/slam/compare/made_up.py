@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from slam.compare.collect import SERIES_COLUMNS
 from slam.compare.plan import Plan, Trial, Variant
+from slam.compare.simulated import SimulatedFrontend, WithoutImages
 from slam.compare.sweep import RUNS, SWEEP, Run
 from slam.compare.trial import COMPLETED, SERIES
-from slam.geometry.trajectory import Trajectory
+from slam.config import SystemConfig
+from slam.run.runner import RunOptions, run
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
@@ -49,19 +54,23 @@ def make(out: Path, of: Plan, worst: str | None = None, failed: tuple[tuple[str,
 
 def _run(out, trial, truth, worst, failed):
     folder = out / RUNS / trial.folder
-    folder.mkdir(parents=True)
     if (trial.backend, trial.seed) in failed:
         return Run(trial, "failed: EstimatorError: no way", {}, {}, folder)
+    shutil.copytree(_files(), folder)
     rng = np.random.default_rng([trial.seed, len(trial.backend)])
-    poses = truth.poses.copy()
-    poses[1:, :3, 3] += 0.002 * rng.standard_normal((len(poses) - 1, 3))
-    Trajectory(truth.stamps, poses).write_tum(folder / "trajectory.txt")
-    series = np.ones((len(poses), len(SERIES_COLUMNS)))
-    series[:, 0], series[:, 1] = np.arange(len(poses)), truth.stamps
-    series[:, 2:5] = poses[:, :3, 3] - truth.poses[:, :3, 3]
-    series[:, 5:8] = 0.002
-    series[:, 9] = rng.chisquare(6, len(poses))
+    series = np.ones((len(truth), len(SERIES_COLUMNS)))
+    series[:, 0], series[:, 1] = np.arange(len(truth)), truth.stamps
+    series[:, 2:5], series[:, 5:8] = 0.002 * rng.standard_normal((len(truth), 3)), 0.002
+    series[:, 9] = rng.chisquare(6, len(truth))
     series[0, 9] = np.nan
     np.savetxt(folder / SERIES, series, "%.9g", ",", header=",".join(SERIES_COLUMNS), comments="")
-    milliseconds = {"extract": 2.0, "update": 5.0, "total": 7.0}
-    return Run(trial, COMPLETED, metrics(trial, worst), milliseconds, folder)
+    return Run(trial, COMPLETED, metrics(trial, worst), {"extract": 2.0, "update": 5.0, "total": 7.0}, folder)
+
+
+@cache
+def _files() -> Path:
+    """The folder of a short run, the same for all."""
+    world, folder = open_sequence(f"{WORLD}&seed=0"), Path(tempfile.mkdtemp(prefix="made_up_"))
+    options = RunOptions("ekf", "simulated", SystemConfig(), folder)
+    run(WithoutImages(world), options, frontend=SimulatedFrontend(world))
+    return folder

@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import shlex
-
 import pytest
 
-from slam.commands.compare import quick, variants_of
+from slam.commands.compare import variants_of
 from slam.compare.plan import CLOSED_LOOP, Plan, Variant, parse_variant
 from slam.errors import ConfigurationError
 
@@ -56,22 +54,6 @@ def test_variants():
             parse_variant(bad)
     assert variants_of([], [], ["a.b=1"]) == (Variant("surf", "surf", ("a.b=1",)),)
     assert [v.name for v in variants_of(["surf", "simulated"], ["x:a.b=1"], [])] == ["surf", "simulated", "x"]
-
-
-def test_the_command_says_it_all():
-    plan = Plan(WORLDS, ("ekf", "batch"), (Variant("d", "surf", ("frontend.descriptor=16",)),), 4, 5, None, False)
-    words = shlex.split(plan.command())
-    assert words[:4] == ["slam", "compare", *WORLDS]
-    for pair in (["--backends", "ekf,batch"], ["--variant", "d:surf:frontend.descriptor=16"], ["--trials", "4"]):
-        at = words.index(pair[0])
-        assert words[at : at + 2] == pair
-    assert words[-3:] == ["--frames", "5:", "--no-replay"]
-
-
-def test_quick_cuts_down():
-    plan = quick(Plan(WORLDS, ("ekf",), trials=9, start=10, stop=None))
-    assert (plan.trials, plan.start, plan.stop) == (2, 10, 40)
-    assert quick(Plan(WORLDS, ("ekf",), stop=7)).stop == 7
 
 
 def test_no_more_trials_and_workers_than_anybody_has(tmp_path):

@@ -8,7 +8,6 @@ import pytest
 
 from slam.compare.scheduler import DaskScheduler, Job, LocalScheduler, WorkerDiedError
 from slam.errors import SlamError
-from slam.runtime.cores import available_cores
 from tests.slam.compare import jobs
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
@@ -42,13 +41,6 @@ def test_every_job_ends_once_and_errors_are_delivered():
     assert not multiprocessing.active_children()
 
 
-def test_frames_of_all_workers_are_counted():
-    told = []
-    run(LocalScheduler(2, told.append), [job(f"{i}", jobs.frames, 10) for i in range(4)])
-    assert told == sorted(told)
-    assert told[-1] == 40
-
-
 def test_a_killed_worker_loses_nothing(tmp_path):
     work = [job(f"{i}", jobs.double, i) for i in range(4)]
     ended = run(LocalScheduler(2), [job("dies", jobs.die_once, str(tmp_path / "marker"), 7), *work])
@@ -78,22 +70,3 @@ def test_nobody_answers():
     pytest.importorskip("distributed")
     with pytest.raises(SlamError, match=r"127\.0\.0\.1:1"):
         DaskScheduler("tcp://127.0.0.1:1", 0.5).run([job("a", jobs.double, 1)], lambda *_: None)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default")  # Dask's own
-def test_a_cluster_of_separate_processes(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    work = [job(f"{i}", jobs.double, i) for i in range(6)]
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        ended = run(
-            DaskScheduler(cluster.scheduler_address),
-            [*work, job("bad", jobs.fail, 3), job("dies", jobs.die_once, str(tmp_path / "marker"), 7)],
-        )
-    assert [ended[f"{i}"] for i in range(6)] == [0, 2, 4, 6, 8, 10]
-    assert isinstance(ended["bad"], ValueError)
-    assert ended["dies"] == 7
-
-
-def test_there_is_at_least_one_core():
-    assert available_cores() >= 1

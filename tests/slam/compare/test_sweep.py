@@ -13,12 +13,12 @@ import pytest
 from slam.compare.measure import BY_KEY
 from slam.compare.plan import CLOSED_LOOP, REPLAY, Plan, Variant
 from slam.compare.report import write_report
-from slam.compare.revision import running_code
 from slam.compare.scheduler import DaskScheduler, LocalScheduler
 from slam.compare.sweep import RUNS, SWEEP, check, sweep
 from slam.compare.tables import groups, write_tables
 from slam.compare.trial import failure, result_files, run_trial
-from slam.errors import ConfigurationError, SlamError
+from slam.errors import SlamError
+from slam.run.repeat import running_code
 
 pytestmark = pytest.mark.slow  # all share one sweep
 
@@ -190,10 +190,3 @@ def test_the_report_holds_everything_and_asks_nothing_of_the_network(done):
     data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', text, re.S).group(1))
     assert [layer["name"] for layer in data["layers"]] == ["ekf", "smoother"]
     assert len(data["layers"][0]["points"]) == len(data["layers"][0]["axes"]) > 10
-
-
-def test_no_workers():
-    from slam.commands.compare import compare
-
-    with pytest.raises(ConfigurationError, match="worker"):
-        compare(PLAN, None, workers=0)

@@ -44,15 +44,6 @@ def test_relative_nees_of_honest_odometry_is_six():
     assert "NEES over 100 m" not in figures
 
 
-def test_noise_of_the_truth_is_counted_once_and_at_both_ends():
-    noise = TruthNoise(rotation=2e-3, translation=0.03)
-    figures = mean_over_seeds(noise)
-    for key in ("mean NEES", "NEES over 10 m"):
-        assert 5.0 < figures[key] < 7.0, key
-    ignored = [consistency_figures(*odometry(seed, noise=noise), NONE)["NEES over 10 m"] for seed in range(20)]
-    assert np.mean(ignored) > 10
-
-
 def test_covariances_that_are_too_small_are_said_to_be():
     figures = mean_over_seeds(claimed=0.2)
     assert figures["NEES over 10 m"] > 60
@@ -60,15 +51,6 @@ def test_covariances_that_are_too_small_are_said_to_be():
     assert "hold" in verdict(mean_over_seeds())
     assert "too large" in verdict(mean_over_seeds(claimed=5.0))
     assert verdict({}) == ""
-
-
-def test_the_verdict_says_what_it_was_judged_by():
-    drifts = {"NEES over 10 m": 6.0, "mean NEES": 600.0}
-    expected = "covariances hold: errors over 10 m are 1.00 times what they claim; from the start, where errors"
-    assert verdict(drifts).startswith(expected)
-    assert verdict(drifts).endswith(" 10.00 times")
-    few = {"NEES over 1 m": 0.5, "no covariance over 1 m": 0.98, "mean NEES": 6.0}
-    assert verdict(few) == "covariances hold: errors from the start are 1.00 times what they claim"
 
 
 def test_a_constant_turn_of_the_truths_sensor_is_no_rotation_error():
@@ -147,15 +129,3 @@ def test_how_the_other_sensor_is_mounted_is_found():
     assert 4.5 < np.mean([f["NEES over 10 m"] for f in figures]) < 7.0
     fixed = consistency_figures(own, Trajectory(true.stamps, true.poses @ mounted), P, TruthNoise(1e-4, 0.01))
     assert fixed["NEES over 10 m"] > 12
-
-
-def test_truth_of_another_moment_is_off_along_the_motion():
-    late, rng = TruthNoise(time=0.005), np.random.default_rng(3)
-    figures: dict[bool, list[float]] = {True: [], False: []}
-    for seed in range(20):
-        own, true, P = odometry(seed)
-        by = exp(np.outer(10 * 0.005 * rng.normal(size=len(true)), STEP))  # ten steps a second
-        moved = Trajectory(true.stamps, true.poses @ by)
-        for known in figures:
-            figures[known].append(consistency_figures(own, moved, P, late if known else NONE)["NEES over 1 m"])
-    assert 5.0 < np.mean(figures[True]) < 7.0 < 12 < np.mean(figures[False])

@@ -45,9 +45,3 @@ def test_evo_ape_takes_the_path_and_agrees_on_its_error(done, tmp_path):
     ours = evaluate(Trajectory.read_tum(folder / "trajectory.txt"), world)["ATE RMSE [m]"]
     rmse = float(re.search(r"rmse\s+(\S+)", printed).group(1))
     assert rmse == pytest.approx(ours, abs=2e-6)  # six decimals are printed
-
-
-def test_evo_traj_takes_both_paths(done, tmp_path):
-    folder, _ = done
-    printed = evo("evo_traj", "tum", folder / "trajectory.txt", folder / "trajectory_final.txt", home=tmp_path)
-    assert printed.count("12 poses") == 2

@@ -17,13 +17,13 @@ import pytest
 
 from slam.config import SystemConfig
 from slam.errors import SlamError
-from slam.files import RowFile, lock_folder, read_bytes, require_target, whole_file
+from slam.files import RowFile, read_bytes, whole_file
 from slam.mapping.map_io import load_map
 from slam.run import runner
-from slam.run.outputs import RunFiles, write_json
+from slam.run.outputs import RunFiles
 from slam.run.recording import load_recording
 from slam.run.runner import RunOptions
-from tests.fuzz.runs import Scripted, _Frontend, disk_of, require_whole
+from tests.fuzz.runs import Scripted, _Frontend, disk_of
 
 LAST = ("trajectory_final.txt", "landmarks.csv", "summary.json")
 
@@ -34,15 +34,6 @@ def run(tmp_path, backend="ekf", error=None, at=0, **more):
 
 
 # --- single files ---
-
-
-def test_a_matrix_has_a_line_for_each_row(tmp_path):
-    tree = {"matrix": [[1.5, -2e-7], [None, 4]], "words": ["[\n1,\n2\n]", "b"], "empty": [], "one": [3]}
-    write_json(tmp_path / "a.json", tree)
-    text = (tmp_path / "a.json").read_text()
-    assert json.loads(text) == tree
-    assert "    [1.5, -2e-07],\n    [null, 4]\n" in text
-    assert '"one": [3]' in text
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path):
@@ -58,27 +49,6 @@ def test_a_file_is_whole_or_as_it_was(tmp_path):
     with whole_file(path) as file:
         file.write(b"after")
     assert path.read_text() == "after" and stat.S_IMODE(path.stat().st_mode) == 0o640
-
-
-def test_a_link_stays_a_link(tmp_path):
-    (tmp_path / "real").write_text("x")
-    (tmp_path / "link").symlink_to("real")
-    with whole_file(tmp_path / "link") as file:
-        file.write(b"y")
-    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_text() == "y"
-
-
-@pytest.mark.parametrize("place", ["pipe", "folder", "full", "x" * 300, "no/folder", "a\0b"])
-def test_what_cannot_be_a_file_is_not_written(tmp_path, place):
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "full").symlink_to("/dev/full")
-    with pytest.raises(SlamError) as caught:
-        require_target(tmp_path / place)
-        with whole_file(tmp_path / place):
-            pass
-    assert "\n" not in str(caught.value)
-    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "full").is_symlink()
 
 
 def test_rows_are_whole_on_a_full_disk(tmp_path):
@@ -102,15 +72,6 @@ def test_no_more_is_read_than_allowed(tmp_path):
     assert read_bytes("/proc/self/stat", 100_000) == b""  # whatever it holds, it says no size
 
 
-def test_nothing_stays_open(tmp_path):
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    for path in (tmp_path, "/dev/zero", "/dev/full", tmp_path / "nothing"):
-        for _ in range(5):
-            with pytest.raises(SlamError):
-                read_bytes(path, 10)
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-
-
 # --- a folder ---
 
 
@@ -120,33 +81,6 @@ def test_two_runs_do_not_share_a_folder(tmp_path):
     with RunFiles(tmp_path / "out"):
         pass
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.txt", "frames.csv", "objects.csv"}
-
-
-@pytest.mark.slow
-def test_two_commands_do_not_share_a_folder(tmp_path):
-    lock = lock_folder(tmp_path)
-    command = [sys.executable, "-m", "slam", "run", "synthetic:desk?frames=2", "--out", str(tmp_path), "--quiet"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    os.close(lock)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "another run" in done.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["trajectory.txt", "frames.csv", "objects.csv"])
-def test_a_pipe_in_place_of_rows_is_not_waited_for(tmp_path, name):
-    (tmp_path / "out").mkdir()
-    os.mkfifo(tmp_path / "out" / name)
-    with pytest.raises(SlamError, match="not a regular file"):
-        run(tmp_path)
-
-
-@pytest.mark.parametrize("bytes_", [0, 50, 700, 3500, 4300])
-@pytest.mark.parametrize("backend", ["ekf", "smoother"])
-def test_a_full_disk_is_one_line_and_what_is_there_is_whole(tmp_path, bytes_, backend):
-    with pytest.raises(SlamError, match=r"cannot .*writ.*File too large") as caught, disk_of(bytes_):
-        run(tmp_path, backend, record=tmp_path / "a.npz", save_map=tmp_path / "a.map")
-    assert "\n" not in str(caught.value)
-    require_whole(tmp_path, tmp_path / "out")
 
 
 def test_a_disk_that_fills_up_half_way(tmp_path):
@@ -210,24 +144,6 @@ def test_an_error_on_its_way_is_not_replaced(tmp_path, caplog):
     with pytest.raises(Stop), disk_of(5000):
         run(tmp_path, error=Stop("stop"), at=2, record=tmp_path / "a.npz")
     assert any("cannot be written" in line for line in caplog.messages)
-
-
-@pytest.mark.parametrize("option", ["--record", "--save-map"])
-def test_devices_are_not_replaced(tmp_path, option):
-    (tmp_path / "device").symlink_to("/dev/full")
-    command = [
-        sys.executable,
-        "-m",
-        "slam",
-        "run",
-        "synthetic:desk?frames=2",
-        "--out",
-        str(tmp_path / "out"),
-        "--quiet",
-    ]
-    done = subprocess.run([*command, option, str(tmp_path / "device")], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "not a regular file" in done.stderr
-    assert (tmp_path / "device").is_symlink() and not (tmp_path / "out").exists()
 
 
 # --- signals ---

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,7 +25,6 @@ from slam.run.recorded import RecordedFrame
 from slam.run.recording import load_recording
 from slam.run.run_data import RunData
 from slam.run.runner import RunOptions, parse_frames, run
-from slam.run.warm_up import warm_up
 from slam.sequences import open_sequence
 
 WORLD = "synthetic:aisle?frames=12"
@@ -122,14 +120,6 @@ def test_kernels_are_loaded_before_a_live_run_takes_its_first_frame(tmp_path, mo
     assert happened[3:] == ["ekf", 0, 1, 2]
 
 
-def test_loading_kernels_ends_when_it_is_told_to(monkeypatch):
-    until, done = threading.Event(), []
-    until.set()
-    monkeypatch.setattr("slam.run.warm_up._frames", lambda backend: (done.append(backend) for _ in range(5)))
-    assert warm_up("ekf", "smoother", until=until) == 0.0
-    assert done == ["ekf"]
-
-
 def test_frames_are_chosen(tmp_path):
     summary = run(open_sequence(WORLD), options(tmp_path, start=3, stop=7))
     assert summary["frames"] == 4
@@ -143,19 +133,6 @@ def test_a_fault_half_way_keeps_what_was_done(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == FILES
     assert len(Trajectory.read_tum(tmp_path / "trajectory.txt")) == 5
     assert "disk gone" in json.loads((tmp_path / "summary.json").read_text())["ended"]
-
-
-def test_a_fault_before_the_first_frame(tmp_path):
-    with pytest.raises(SequenceError):
-        run(Broken(0), options(tmp_path))
-    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 0
-
-
-def test_a_target_that_is_a_folder_is_refused_before_the_run(tmp_path):
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(SlamError, match="taken"):
-        run(open_sequence(WORLD), options(tmp_path / "out", record=tmp_path / "taken"))
-    assert {p.name for p in tmp_path.iterdir()} == {"taken"}
 
 
 def test_what_can_still_be_written_is_written_where_images_end_in_an_error(tmp_path):
@@ -203,14 +180,6 @@ def test_a_stopped_run_keeps_its_frames(tmp_path, kill):
         assert (tmp_path / "landmarks.csv").exists()
 
 
-@pytest.mark.parametrize("world", ["synthetic:desk?frames=1", "synthetic:desk?frames=3&black=0:3"])
-def test_pictures_of_short_and_empty_runs(tmp_path, world):
-    run(open_sequence(world), options(tmp_path))
-    data = RunData.read(tmp_path, "short")
-    assert len(data.online) == len(data.status) == len(data.deviations)
-    assert data.positions.shape == (len(data.covariances), 3)
-
-
 def test_a_missing_right_image_is_no_error(tmp_path):
     class OneEyed(Broken):
         def frames(self, start=0, stop=None):
@@ -219,12 +188,6 @@ def test_a_missing_right_image_is_no_error(tmp_path):
 
     summary = run(OneEyed(0), options(tmp_path))
     assert summary["frames"] == 12
-
-
-def test_out_that_is_a_file(tmp_path):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(SlamError, match="out"):
-        run(open_sequence(WORLD), options(tmp_path / "out"))
 
 
 @pytest.mark.parametrize(("text", "range_"), [(None, (0, None)), ("3:9", (3, 9)), (":9", (0, 9)), ("3:", (3, None))])

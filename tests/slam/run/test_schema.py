@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.commands.cli import app
 from slam.config import SystemConfig
 from slam.geometry.euler import rotation
 from slam.geometry.se3 import pose
@@ -16,7 +15,7 @@ from slam.object_data import MovingObject, ObjectEstimate
 from slam.run.outputs import RunFiles
 from slam.run.repeat import Origin
 from slam.run.runner import RunOptions, run
-from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, TWIST, header, markdown
+from slam.run.schema import FILES, OLD_LANDMARKS, TABLES, header, markdown
 from slam.sequences import open_sequence
 
 PAGE = Path(__file__).parents[3] / "docs" / "files.md"
@@ -76,21 +75,6 @@ def test_the_schema_has_every_file_and_every_column(done):
         assert all(column["meaning"] for column in columns)
 
 
-def test_the_schema_has_every_setting(done):
-    out, _ = done
-    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))["settings"]
-    config = json.loads((out / "config.json").read_text(encoding="utf-8"))
-
-    def leaves(tree, prefix):
-        for key, value in tree.items():
-            yield from leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
-
-    assert set(leaves(config["settings"], "")) | set(leaves(config["in_force"], "")) == set(schema)
-    assert all(setting["meaning"] for setting in schema.values())
-    assert schema["map.separation"]["unit"] == "px"
-    assert schema["models.motion.acceleration"]["unit"] == "m/s / √s"
-
-
 def test_rows_of_objects_are_what_the_system_said(done):
     out, _ = done
     rows = [{name: float(value) for name, value in row.items()} for row in rows_of(out / "objects.csv")]
@@ -113,17 +97,6 @@ def test_rows_of_objects_are_what_the_system_said(done):
         np.testing.assert_allclose(upper, e.covariance[np.triu_indices(6)], rtol=1e-6)
 
 
-def test_units_of_a_covariance_are_those_of_its_components(done):
-    out, _ = done
-    files = json.loads((out / "schema.json").read_text(encoding="utf-8"))["files"]
-    columns = {column["name"]: column for column in files["objects.csv"]["columns"]}
-    assert columns["c00"]["unit"] == columns["c12"]["unit"] == "rad²"
-    assert columns["c03"]["unit"] == "rad·m"
-    assert columns["c45"]["unit"] == "m²"
-    assert "rz and tx" in columns["c23"]["meaning"]
-    assert len(TWIST) == 6
-
-
 def test_the_page_has_the_columns_as_they_are():
     text = PAGE.read_text(encoding="utf-8")
     for name, table in TABLES.items():
@@ -131,19 +104,3 @@ def test_the_page_has_the_columns_as_they_are():
         assert "\n".join(markdown(table)) in text, (
             f"docs/files.md: the columns of {name} are not those of slam.run.schema"
         )
-
-
-def test_the_page_has_every_file_and_every_key(done):
-    out, summary = done
-    text = PAGE.read_text(encoding="utf-8")
-    for name in FILES:
-        assert f"`{name}`" in text
-    config = json.loads((out / "config.json").read_text(encoding="utf-8"))
-    schema = json.loads((out / "schema.json").read_text(encoding="utf-8"))
-    for key in {*config, *summary, *schema}:
-        assert f"`{key}`" in text, f"docs/files.md does not name {key}"
-
-
-def test_the_page_names_commands_that_exist():
-    names = {command.name for command in app.registered_commands}
-    assert {"run", "plot", "settings"} <= names

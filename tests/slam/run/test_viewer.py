@@ -28,11 +28,6 @@ def test_without_a_display_one_line_says_what_to_do(monkeypatch):
         Viewer("live")
 
 
-def test_not_a_run(tmp_path):
-    with pytest.raises(SlamError, match="finished run"):
-        view_run(tmp_path, str(tmp_path / "a.rrd"))
-
-
 class Unreachable:
     """A recording whose viewer has gone."""
 
@@ -90,9 +85,3 @@ def test_a_run_is_kept_for_rerun(tmp_path):
     view_run(tmp_path / "run", str(after))
     assert live.stat().st_size > 3 * 3000  # three images, compressed, are in it
     assert after.stat().st_size > 1000
-
-
-def test_a_name_that_is_no_utf8(tmp_path):
-    pytest.importorskip("rerun")
-    with pytest.raises(SlamError, match="the name is not in UTF-8"):
-        Viewer(str(tmp_path / "\udc80.rrd"))
