@@ -11,7 +11,7 @@ from slam.data import IdArray, Observations
 from slam.mapping.config import MapConfig
 from slam.mapping.selection import new_landmarks
 from slam.models import EstimatorModels, models_for
-from slam.run.recorded import RecordedFrame, RecordedRows, Recording
+from slam.run.recorded import RecordedFrame, Recording
 from slam.worlds.observe import SimulatedFeatures
 from slam.worlds.sequence import WorldSequence
 
@@ -39,7 +39,7 @@ def true_recording(
     if models is None:
         models = replace(models_for(sequence.kind), pixel_sigma=max(sequence.values["sigma"], _LEAST_SIGMA))
     frames = _frames(sequence, models, config or MapConfig(), keep)
-    return Recording.of(frames, sequence.rig, models, sequence.name, sequence.ground_truth)
+    return Recording(sequence.name, sequence.rig, models, tuple(frames), sequence.ground_truth)
 
 
 def with_mismatches(recording: Recording, share: float, seed: int = 0) -> Recording:
@@ -51,13 +51,14 @@ def with_mismatches(recording: Recording, share: float, seed: int = 0) -> Record
         seed: of the random choice.
     """
     rng = np.random.default_rng(seed)
-    rows, source = recording.observed, np.arange(len(recording.observed))
-    for k in range(len(recording)):
-        first, last = np.searchsorted(rows.frame, [k, k + 1])
-        wrong = first + np.flatnonzero(rng.random(last - first) < share)
+    frames = []
+    for frame in recording:
+        seen = frame.observed
+        source, wrong = np.arange(len(seen)), np.flatnonzero(rng.random(len(seen)) < share)
         source[wrong] = _deranged(wrong, rng)
-    observed = RecordedRows(rows.frame, rows.ids, rows.uv_left[source], rows.uv_right[source])
-    return replace(recording, observed=observed)
+        mixed = Observations(seen.ids, seen.uv_left[source], seen.uv_right[source])
+        frames.append(replace(frame, observed=mixed))
+    return replace(recording, frames=tuple(frames))
 
 
 def _deranged(rows: IdArray, rng: np.random.Generator) -> IdArray:

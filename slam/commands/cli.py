@@ -123,7 +123,7 @@ def run_command(
     from slam.commands.background_compilation import compiled_in_background
     from slam.commands.display import Progress
     from slam.commands.folders import run_folder
-    from slam.commands.run import Wanted, prepare, shown
+    from slam.commands.run import prepare, shown
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
@@ -135,11 +135,10 @@ def run_command(
         raise ConfigurationError("--mask goes with a SEQUENCE; --config repeats a run with its own")
     if draw_map and draw is None:
         raise ConfigurationError("--draw-map draws beside the frames: give --draw FILE.mp4, or a folder, too")
-    wanted = Wanted(
-        sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
-    )
     with noting_inputs() as inputs:
-        opened, options, origin = prepare(wanted)
+        opened, options, origin = prepare(
+            sequence, config, backend, frontend, settings or (), frames, kind, format, prior_map, mono, calibration
+        )
     progress = Progress(_frame_count(opened, options.start, options.stop), _title(opened, options.backend), quiet)
     with ExitStack() as stack:
         folder = stack.enter_context(run_folder(out, opened.name, options.backend))

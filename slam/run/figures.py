@@ -103,13 +103,15 @@ def draw_map_3d(runs: list[RunData], path: Path, most: int = 400) -> None:
         axis.plot(p[:, 0], p[:, 2], -p[:, 1], color=colour, lw=1.5, label="path")
         for colour, label in ((_SEEN, "landmarks seen now, 2σ"), (_UNSEEN, "landmarks not seen now, 2σ")):
             axis.plot([], [], [], color=colour, lw=1, label=label)
-        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]", title=run.name)
+        axis.set(xlabel="right [m]", ylabel="forward [m]", zlabel="up [m]")
+        axis.set_title(run.name, y=0.92)
         for side in (axis.xaxis, axis.yaxis, axis.zaxis):
             side.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.yaxis.labelpad = axis.zaxis.labelpad = 9  # clear of the numbers
         axis.set_box_aspect(np.ptp([axis.get_xlim(), axis.get_ylim(), axis.get_zlim()], axis=1))  # one scale for all
         axis.view_init(elev=25, azim=-65)
-    figure.axes[0].legend(loc="lower left", fontsize=8, frameon=False)
+    labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="lower center", bbox_to_anchor=(0.5, 0.05), ncols=3, fontsize=8, frameon=False)
     with whole_file(path) as file:
         figure.savefig(file, dpi=110, metadata={"Software": None}, bbox_inches="tight")
 

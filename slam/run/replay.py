@@ -75,8 +75,7 @@ def _step(
     times.append(time.perf_counter())
     estimate = require_estimate(backend.estimate(landmarks=False), backend)
     times.append(time.perf_counter())
-    first = bool(len(recording.added)) and k == recording.added.frame[0]
-    status, reason = _status(report, first)
+    status, reason = _status(report, k == recording.first)
     seen, new = len(frame.observed), len(frame.added)
     return FrameResult(
         index=k,
@@ -91,7 +90,7 @@ def _step(
         added=frame.added.ids,
         added_features=np.arange(seen, seen + new),
         erased=frame.removed,
-        map_size=recording.map_size(k),
+        map_size=int(recording.map_sizes[k]),
         revision=frame.revision,
         milliseconds=dict(zip(_STAGES, 1e3 * np.diff(times))),
     )

@@ -166,7 +166,7 @@ def run_recording(
     """
     config = options.config
     backend = registry.create("backends", options.backend, recording.rig, models=config.models, **config.backend)
-    results = zip(recording.numbers.tolist(), replay(recording, backend, association=config.association))
+    results = zip((f.number for f in recording), replay(recording, backend, association=config.association))
     record = RunRecord()
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
 
@@ -284,8 +284,8 @@ class _Run:
                 f"{options.record}: not written: the camera was lost, and a new back end took over in frame "
                 f"{self.system.restarted[0]}; what is recorded is for one"
             )
-        whole = Recording.of(self.tape, sequence.rig, options.config.models, sequence.name, sequence.ground_truth)
-        return replace(whole, kind=sequence.kind)
+        models, truth = options.config.models, sequence.ground_truth
+        return Recording(sequence.name, sequence.rig, models, tuple(self.tape), truth, kind=sequence.kind)
 
     def _finish(self, files: RunFiles, ended: str, score: ObjectScore | None) -> dict[str, Any]:
         """Write the last files, each whether or not another fails, and return the summary."""
