@@ -1,8 +1,7 @@
-"""The SURF front end against OpenCV's SIFT and ORB: speed, quality, stereo, start-up.
+"""The SURF front end against OpenCV's SIFT and ORB: speed, quality, stereo.
 
 ``python benchmarks/surf.py``               all of it, as ratios of medians of CPU time in one run
-``python benchmarks/surf.py speed stereo``  some of: speed threads quality dimensions stereo points start threshold
-``--figure FILE``                           the curves over D_threshold as a picture
+``python benchmarks/surf.py speed stereo``  some of: speed quality stereo
 
 Uses the images under the environment variable SLAM_DATA where it is set, else rendered ones.
 """
@@ -11,12 +10,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -26,9 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import slam
 from benchmarks.plain_surf import plain_descriptors
-from frontends.surf import Keypoints, Surf, SurfFrontend
-from slam.config import SystemConfig
-from slam.geometry import se3
+from frontends.surf import Surf, SurfFrontend
 from slam.geometry.rig import StereoRig
 
 SIZES = ((320, 240), (752, 480), (1241, 376))
@@ -84,18 +78,6 @@ def speed() -> None:
         for name in tasks:
             ratios = f"{ms['SIFT'] / ms[name]:.1f} x | {ms['ORB'] / ms[name]:.2f} x"
             print(f"| {width}x{height} ({len(surf.detect(image))}) | {name} | {ms[name]:.2f} | {ratios} |")
-
-
-def threads() -> None:
-    """Wall time of one thread and two."""
-    print("\n## Threads: wall time\n")
-    image = test_image(752, 480)
-    threshold = with_features(image)
-    surfs = {f"{n} threads": Surf(threshold, threads=n) for n in (1, 2)}
-    ms = medians({k: lambda s=s: s.detect_and_describe(image) for k, s in surfs.items()}, 41, time.perf_counter)
-    (a, da), (b, db) = (s.detect_and_describe(image) for s in surfs.values())
-    same = a.uv.tobytes() == b.uv.tobytes() and da.tobytes() == db.tobytes()
-    print(f"{ms}: two threads are {ms['1 threads'] / ms['2 threads']:.2f} times as fast; same bytes: {same}")
 
 
 def turned(degrees: float, factor: float, size: tuple[int, int]) -> np.ndarray:
@@ -211,20 +193,6 @@ def quality() -> None:
     print("| mean | " + " | ".join(f"{r:.3f} / {m:.3f} / {e:.2f}" for r, m, e in np.mean(rows, axis=0)) + " |")
 
 
-def dimensions() -> None:
-    """Time of describing in 16 and in 64 dimensions."""
-    print("\n## 16-D against 64-D: CPU time of description (paper A, III.B: 45 % less for 100 to 800 features)\n")
-    image = test_image(752, 480)
-    everything = Surf(0.0).detect(image)
-    for count in (100, 400, 800):
-        keypoints: Keypoints = everything.select(np.arange(count))
-        surfs = {(d, u): Surf(descriptor=d, upright=u) for d in (16, 64) for u in (True, False)}
-        ms = medians({str(k): lambda s=s, k=keypoints: s.describe(image, k) for k, s in surfs.items()})
-        for upright in (True, False):
-            saved = 1 - ms[str((16, upright))] / ms[str((64, upright))]
-            print(f"{count} features, {'upright' if upright else 'oriented'}: {100 * saved:.0f} % saved")
-
-
 def edges(values: np.ndarray, reach: int = 6) -> np.ndarray:
     """Pixels (H, W) with a step of depth, or disparity, by more than 3 % from pixel to pixel within `reach`."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -309,122 +277,16 @@ def kitti(folder: Path) -> None:
     )
 
 
-def points() -> None:
-    """Paper A's first experiment: error of estimated points in EKF SLAM, with either descriptor."""
-    print("\n## Known points in EKF SLAM: error of the estimated positions, 16-D and 64-D\n")
-    for world in ("aisle?frames=150", "desk?frames=150"):
-        for descriptor in (16, 64):
-            sequence = slam.open_sequence(f"synthetic:{world}")
-            config = SystemConfig.for_kind(sequence.kind)
-            frontend = SurfFrontend(sequence.rig, descriptor=descriptor, features=400)
-            system = slam.StereoSlam(sequence.rig, frontend=frontend, backend="ekf", config=config)
-            for frame in sequence:
-                system.process(frame)
-            errors, edge = point_errors(sequence, system, len(sequence) - 1)
-            print(f"{world}, {descriptor}-D, points in view at the end:")
-            for name, off in (("on surfaces", errors[~edge]), ("near depth edges", errors[edge])):
-                median, most = 1e3 * np.median(off), 1e3 * np.percentile(off, 90)
-                print(f"  {len(off)} {name}: median error {median:.1f} mm, 90 % below {most:.1f} mm")
-
-
-def point_errors(sequence, system, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) [m] along the line of sight between the map's points and the true surface, in the last frame.
-
-    And whether a depth edge is near (N,): there the pixel that the point falls on may show the other surface.
-    """
-    truth = sequence.ground_truth.poses
-    T_left_first = se3.inverse(truth[last]) @ truth[0]  # the system's world is its first left camera
-    local = se3.transform(T_left_first, system.backend.estimate().positions)
-    uv = sequence.rig.left.project(local)
-    seen = sequence.rig.left.in_image(uv) & (local[:, 2] > 0)
-    u, v = np.rint(uv[seen]).astype(int).T
-    table = sequence.depth(last)
-    depth = table[v, u]
-    known = depth > 0
-    return np.abs(local[seen, 2][known] - depth[known]), edges(table)[v, u][known]
-
-
-START = """
-import time; wall, cpu = time.perf_counter(), time.process_time()
-import numpy as np
-import frontends
-from slam.data import StereoFrame
-from slam.geometry.rig import StereoRig
-image = np.random.default_rng(0).integers(0, 255, (120, 188), np.uint8).repeat(4, 0).repeat(4, 1)
-frontend = frontends.create("surf", StereoRig.rectified_pair(450.0, 376.0, 240.0, 0.11, 752, 480))
-count = len(frontend.extract(StereoFrame(0, 0.0, image, image)))
-print(f"{time.perf_counter() - wall:.2f} s wall, {time.process_time() - cpu:.2f} s CPU to the first {count} features")
-"""
-
-
-def start() -> None:
-    """From the start of Python's imports to the first features, with nothing compiled and then from the cache."""
-    print("\n## Start\n")
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-        for name in ("cold", "warm", "warm"):
-            done = subprocess.run([sys.executable, "-c", START], env=environment, capture_output=True, text=True)
-            print(f"{name}: {done.stdout.strip()}   {done.stderr.strip()}")
-
-
-def threshold(figure: Path | None = None) -> None:
-    """Features and time over D_threshold and octave, and radius by octave (paper A, III.A)."""
-    print("\n## D_threshold: features, CPU time of detection [ms], median radius [px] by octave, 320x240\n")
-    image = test_image(320, 240)
-    print("| D_threshold | octave 1 | octave 2 | ms, one octave | ms, two octaves |\n" + "| --- " * 5 + "|")
-    limits = (0, 10, 100, 300, 1000, 3000, 10_000)
-    tasks = {f"{limit} {n}": partial(Surf(limit, n).detect, image) for limit in limits for n in (1, 2)}
-    ms = medians(tasks, 41)
-    rows = []
-    for limit in limits:
-        octave = Surf(limit).detect(image).octave
-        rows.append((limit, (octave == 0).sum(), (octave == 1).sum(), ms[f"{limit} 1"], ms[f"{limit} 2"]))
-        print("| {} | {} | {} | {:.2f} | {:.2f} |".format(*rows[-1]))
-    everything = Surf(100).detect(image)
-    for octave in (0, 1):
-        radius = 0.5 * everything.size[everything.octave == octave]
-        print(f"octave {octave + 1}: radius {np.median(radius):.1f} px (of {radius.min():.1f} to {radius.max():.1f})")
-    if figure:
-        draw(np.array(rows), everything, figure)
-
-
-def draw(rows: np.ndarray, keypoints: Keypoints, figure: Path) -> None:
-    """Curves over D_threshold, and the radii, as a picture."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    fig, (a, b, c) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    x = np.maximum(rows[:, 0], 1)
-    a.stackplot(x, rows[:, 1], rows[:, 2], labels=["octave 1", "octave 2"], colors=["#4477aa", "#ccbb44"])
-    a.set(xscale="log", xlabel="D_threshold", ylabel="features", title="Features")
-    b.plot(x, rows[:, 3], "o-", x, rows[:, 4], "s-")
-    b.set(xscale="log", xlabel="D_threshold", ylabel="CPU time [ms]", ylim=(0, None), title="Detection")
-    b.legend(["one octave", "two octaves"])
-    radii = [0.5 * keypoints.size[keypoints.octave == o] for o in (0, 1)]
-    c.hist(radii, bins=np.arange(3, 30), stacked=True, color=["#4477aa", "#ccbb44"], label=["octave 1", "octave 2"])
-    c.set(xlabel="radius [px]", ylabel="features", title="Radius by octave")
-    for axis in (a, c):
-        axis.legend()
-    figure.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(figure, dpi=110)
-
-
-SECTIONS = {f.__name__: f for f in (speed, threads, quality, dimensions, stereo, points, start, threshold)}
+SECTIONS = {f.__name__: f for f in (speed, quality, stereo)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sections", nargs="*", choices=[*SECTIONS, []], metavar="SECTION", help=", ".join(SECTIONS))
-    parser.add_argument("--figure", type=Path, help="write the curves over D_threshold here")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     for name in arguments.sections or SECTIONS:
-        if name == "threshold":
-            threshold(arguments.figure)
-        else:
-            SECTIONS[name]()
+        SECTIONS[name]()
 
 
 if __name__ == "__main__":

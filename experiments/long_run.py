@@ -17,13 +17,12 @@ error and NEES. At the end, time and memory of the first and the last thousand f
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -270,41 +269,6 @@ def table(done: Sequence[Checkpoint]) -> str:
     )
 
 
-def write_csv(path: Path, done: Sequence[Checkpoint]) -> None:
-    """A row per checkpoint."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([f.name for f in fields(Checkpoint)])
-        writer.writerows(map(astuple, done))
-
-
-def draw(path: Path, runs: dict[str, list[Checkpoint]]) -> None:
-    """Time, memory, least eigenvalue and NEES along the runs."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    panels = (
-        ("milliseconds", "CPU time of a frame [ms]", "linear"),
-        ("beyond", "memory beyond start and path [MB]", "linear"),
-        ("least", "least eigenvalue (correlations)", "log"),
-        ("nees", "NEES of the pose (6 expected)", "linear"),
-    )
-    figure, axes = plt.subplots(2, 2, figsize=(8, 6), sharex=True, layout="constrained")
-    for panel, (what, label, scale) in zip(axes.flat, panels):
-        for name, done in runs.items():
-            panel.plot([c.frame for c in done], [getattr(c, what) for c in done], ".-", label=name)
-        panel.set(ylabel=label, yscale=scale)
-        if scale == "linear":
-            panel.set_ylim(bottom=0)
-    for panel in axes[1]:
-        panel.set_xlabel("frame")
-    axes[0, 0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
 def setting(text: str) -> tuple[str, object]:
     """``key=value``; the value is JSON (``true``, ``50``) or a plain word, as with ``slam run --set``."""
     key, _, value = text.partition("=")
@@ -323,21 +287,11 @@ def main() -> int:
     parser.add_argument("--set", nargs="*", type=setting, default=[], metavar="KEY=VALUE", help="back-end options")
     arguments = parser.parse_args()
     frames = 200 if arguments.quick else arguments.frames
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    runs: dict[str, list[Checkpoint]] = {}
-    texts = []
     for name in arguments.backend:
         for world in arguments.world:
-            done = runs[f"{name}, {world}"] = []
-            for c in run(name, frames, max(1, min(1000, frames // 4)), WORLDS[world](), arguments.seed,
-                         **dict(arguments.set)):  # fmt: skip
-                done.append(c)
-                print(f"{name} {world} {cells(c)}", file=sys.stderr, flush=True)
-                write_csv(arguments.out / f"{name}_{world}.csv", done)
-            texts.append(f"# {name}, {world}, {frames} frames\n\n{table(done)}")
-            (arguments.out / "long_run.md").write_text("\n\n".join(texts) + "\n")
-            draw(arguments.out / "long_run.png", runs)
-    print("\n\n".join(texts))
+            every, options = max(1, min(1000, frames // 4)), dict(arguments.set)
+            done = list(run(name, frames, every, WORLDS[world](), arguments.seed, **options))
+            print(f"# {name}, {world}, {frames} frames\n\n{table(done)}\n", flush=True)
     return 0
 
 

@@ -3,17 +3,15 @@
     SLAM_DATA=/path/to/data python experiments/sensitivity.py [--quick] [--only TEXT] [--out FILE]
 
 Features are extracted once. Each run then gives them to a system in which one constant is changed, and compares the
-camera's path and the moving bodies' motion with the truth. A run is left out where the default run never reads the
-constant. Constants that are compiled into kernels, that are read on import, or that belong to the front end are not
-measured. A constant takes about ten seconds of CPU time. The table is written after each, and a later call goes on with
-those that are missing.
+camera's path and the moving bodies' motion with the truth. Constants that are compiled into kernels, that are read on
+import, or that belong to the front end are not measured. A constant takes about ten seconds of CPU time. The table is
+written after each, and a later call goes on with those that are missing.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import dis
 import importlib
 import json
 import os
@@ -25,7 +23,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from types import CodeType, FrameType
 from typing import Any
 
 import numpy as np
@@ -134,7 +131,7 @@ def run(index: int, backend: str, noise_seed: int | None = None) -> Errors:
     return Errors(camera, float(np.mean(moved)) if moved else None, covered, blob)
 
 
-# --- which constants a run reads ---
+# --- which constants can be changed ---
 
 
 def name_of(parameter: Parameter) -> str:
@@ -168,50 +165,6 @@ def measured(parameter: Parameter) -> bool:
             everywhere += 1
             inside += id(node) in held
     return inside == everywhere
-
-
-def _lines_that_read(code: CodeType, names: frozenset[str]) -> dict[int, set[str]]:
-    """Names that each line of a code object reads as globals or as attributes of modules."""
-    found: dict[int, set[str]] = {}
-    for line in dis.get_instructions(code):
-        if line.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_ATTR") and line.argval in names and line.positions:
-            found.setdefault(line.positions.lineno or 0, set()).add(line.argval)
-    return found
-
-
-def names_read(index: int, backend: str, names: frozenset[str]) -> set[tuple[str, str]]:
-    """Files and names of constants that a run reads."""
-    known: dict[CodeType, dict[int, set[str]]] = {}
-    read: set[tuple[str, str]] = set()
-    roots = tuple(str(ROOT / room) for room in ("slam", "backends"))
-
-    def enter(frame: FrameType, event: str, _: Any) -> Any:
-        code = frame.f_code
-        if code not in known:
-            known[code] = _lines_that_read(code, names) if code.co_filename.startswith(roots) else {}
-        lines = known[code]
-        if not lines:
-            return None
-        file = Path(code.co_filename).relative_to(ROOT).as_posix()
-
-        def follow(frame: FrameType, event: str, _: Any) -> Any:
-            read.update((file, name) for name in lines.get(frame.f_lineno, ()))
-            return follow
-
-        return follow
-
-    sys.settrace(enter)
-    try:
-        run(index, backend)
-    finally:
-        sys.settrace(None)
-    return read
-
-
-def is_read(parameter: Parameter, read: set[tuple[str, str]]) -> bool:
-    """Whether a constant is among those that were read, in its own module or in one that imports it or the module."""
-    own = (parameter.file, parameter.name) in read
-    return own or (not parameter.name.startswith("_") and any(name == parameter.name for _, name in read))
 
 
 # --- measuring ---
@@ -257,39 +210,36 @@ def limited(seconds: float) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Default:
-    """The default run of one case with one back end: its errors, the constants it reads, its CPU time [s]."""
+    """The default run of one case with one back end: its errors, and its CPU time [s]."""
 
     index: int
     backend: str
     errors: Errors
-    read: set[tuple[str, str]]
     seconds: float
 
     @classmethod
-    def of(cls, index: int, backend: str, names: frozenset[str]) -> Default:
+    def of(cls, index: int, backend: str) -> Default:
         """Measure it."""
         run(index, backend)  # compiles and loads
         start = time.process_time()
         errors = run(index, backend)
-        seconds = time.process_time() - start
-        return cls(index, backend, errors, names_read(index, backend, names), seconds)
+        return cls(index, backend, errors, time.process_time() - start)
 
 
 def ratios(parameter: Parameter, factor: float, defaults: list[Default]) -> dict[str, float | str]:
     """Errors of the camera and of the bodies over the default's: means over the cases, the worse back end.
 
-    "same" where all runs that read the constant give the same bytes, "fails" where one does not end well.
+    "same" where all runs give the same bytes, "fails" where one does not end well.
     """
-    readers = [d for d in defaults if is_read(parameter, d.read)]
     found: dict[tuple[int, str], Errors] = {}
     try:
         with changed(parameter, factor):
-            for d in readers:
+            for d in defaults:
                 with limited(_PATIENCE * max(d.seconds, 1.0)):
                     found[d.index, d.backend] = run(d.index, d.backend)
     except _FAILURES:
         return {"camera": "fails", "bodies": "fails"}
-    if all(found[d.index, d.backend].path == d.errors.path for d in readers):
+    if all(found[d.index, d.backend].path == d.errors.path for d in defaults):
         return {"camera": "same", "bodies": "same"}
     pairs = [(found.get((d.index, d.backend), d.errors), d) for d in defaults]
     camera = [(new.camera / d.errors.camera, d.backend) for new, d in pairs]
@@ -333,16 +283,13 @@ def main() -> int:
     present = {name_of(p): p for p in find()}
     table["ratios"] = {name: found for name, found in table["ratios"].items() if name in present}
     wanted = [p for name, p in present.items() if arguments.only in name and measured(p)]
-    names = frozenset(p.name for p in wanted)
     count = 1 if arguments.quick else len(cases())
-    defaults = [Default.of(i, b, names) for i in range(count) for b in BACKENDS]
+    defaults = [Default.of(i, b) for i in range(count) for b in BACKENDS]
     wanted.sort(key=lambda p: [p.file.startswith(room) for room in _ORDER].index(True))
-    unread = [p for p in wanted if not any(is_read(p, d.read) for d in defaults)]
-    wanted = [p for p in wanted if p not in unread][: 1 if arguments.quick else None]
+    wanted = wanted[: 1 if arguments.quick else None]
     if "scatter" not in table:
         table["scatter"] = scatter(defaults, 1 if arguments.quick else _PERTURBATIONS)
     table["cases"] = [c.name for c in cases()[:count]]
-    table["ratios"] |= {name_of(p): [{"camera": "not read", "bodies": "not read"}] * len(FACTORS) for p in unread}
     table["complete"] = False
     for parameter in wanted:
         name = name_of(parameter)
