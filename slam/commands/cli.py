@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slam.commands import completion
-from slam.commands.error_exit import lasting_streams, one_line_errors
+from slam.commands.error_exit import one_line_errors
 from slam.commands.options import (
     BackendOption,
     CalibrationOption,
@@ -68,7 +68,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that knows no sigma
             stream.reconfigure(errors="backslashreplace")
-    with one_line_errors(), lasting_streams():
+    with one_line_errors():
         logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
         logging.getLogger("slam.runtime.compilation").setLevel(logging.INFO)
         require_address_space()

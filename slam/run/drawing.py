@@ -56,9 +56,8 @@ def draw_objects(image: np.ndarray, result: FrameResult, rig: StereoRig, width: 
     for u, v in result.features.uv_left[moving]:
         cv2.circle(picture, _pixel(u, v, scale), radius + 1, _RING, 1, cv2.LINE_AA)
         cv2.circle(picture, _pixel(u, v, scale), radius, _MOVING, 2, cv2.LINE_AA)
-    labels: list[tuple[int, int, int, int]] = []
     for thing, pixels in zip(result.objects, corners):  # over all else
-        _draw_label(picture, thing, pixels, scale, labels)
+        _draw_label(picture, thing, pixels, scale)
     return picture
 
 
@@ -110,37 +109,21 @@ def _draw_object(
     return rig.left.project(transform(T_left_object, corners))
 
 
-def _draw_label(
-    picture: np.ndarray, thing: MovingObject, corners: Array, scale: int, labels: list[tuple[int, int, int, int]]
-) -> None:
-    """Number and speed of a body above its box, clear of the `labels` drawn before; its rectangle is added to them."""
+def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale: int) -> None:
+    """Number and speed of a body above its box, inside the picture."""
     import cv2
 
     if not np.isfinite(corners).all():
         return
-    u, v = corners.min(axis=0)
     speed = float(np.linalg.norm(thing.estimate.velocity[3:]))
     state = f"{speed:.2f} m/s" if thing.moving else "at rest"
     text = f"{thing.id}  {state if thing.estimate.measured else 'not seen'}"
-    at = _clear_place(_pixel(u, v - 3, scale), text, picture.shape, labels)
-    cv2.rectangle(picture, labels[-1][:2], labels[-1][2:], _RING, cv2.FILLED)
-    cv2.putText(picture, text, at, _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
-
-
-def _clear_place(
-    at: tuple[int, int], text: str, shape: tuple[int, ...], labels: list[tuple[int, int, int, int]]
-) -> tuple[int, int]:
-    """Where a label's lower left corner goes: inside the picture, below the labels that it would cover [px]."""
-    import cv2
-
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
-    u = min(max(at[0], 0), max(shape[1] - width, 0))
-    v = min(max(at[1], height), shape[0] - base)
-    for left, top, right, bottom in sorted(labels, key=lambda label: label[1]):
-        if u < right and u + width > left and v - height < bottom and v + base > top:
-            v = bottom + height
-    labels.append((u, v - height, u + width, v + base))
-    return u, v
+    left, top = _pixel(*(corners.min(axis=0) - (0, 3)), scale)
+    u = min(max(left, 0), max(picture.shape[1] - width, 0))
+    v = min(max(top, height), picture.shape[0] - base)
+    cv2.rectangle(picture, (u, v - height), (u + width, v + base), _RING, cv2.FILLED)
+    cv2.putText(picture, text, (u, v), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
 
 
 def _line(

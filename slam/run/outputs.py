@@ -34,7 +34,6 @@ _WHOLE = (
     "summary.json", "summary.png",
 )  # fmt: skip
 
-_SPARE = 8  # file descriptors kept for the last files
 #: All files that a run leaves in its folder.
 NAMES = (*_ROWS, *_WHOLE)
 
@@ -68,9 +67,6 @@ class RunFiles:
             )
             self._frames.write(csv_rows([FRAME_COLUMNS]))
             self._objects.write(csv_rows([OBJECT_COLUMNS]))
-            self._spare = stack.enter_context(ExitStack())
-            for _ in range(_SPARE):
-                self._spare.callback(os.close, os.open(os.devnull, os.O_RDONLY))
             self._stack = stack.pop_all()
 
     def __enter__(self) -> RunFiles:
@@ -80,10 +76,6 @@ class RunFiles:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
-
-    def free_spare(self) -> None:
-        """Give back the file descriptors that are kept for the last files, should a run have used up all others."""
-        self._spare.close()
 
     def write_frame(self, number: int, result: FrameResult, loop: int | str = "", refused: int | str = "") -> None:
         """Append one frame to trajectory.txt, frames.csv and objects.csv.

@@ -213,7 +213,6 @@ class _Run:
                 ended, stopped_by = f"stopped: {one_line(text_of(error)) or type(error).__name__}", error
                 raise
             finally:
-                files.free_spare()
                 if self.live is not None and self.live.ended_early and stopped_by is None:
                     ended = "ended by the user"
                 summary = self._finish(files, ended, score)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import signal
 import stat
 import subprocess
 import sys
 import time
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -177,37 +174,6 @@ def test_a_closed_terminal_leaves_a_summary(tmp_path, ignored):
 
 
 # --- limits of the machine ---
-
-
-def test_the_last_files_are_written_where_no_file_descriptor_is_left(tmp_path):
-    held: list[int] = []
-
-    def use_up(*_):
-        with suppress(OSError):
-            while True:
-                held.append(os.open(os.devnull, os.O_RDONLY))
-
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (len(list(Path("/proc/self/fd").iterdir())) + 40, limits[1]))
-    options = RunOptions("ekf", "none", SystemConfig(), tmp_path / "out", record=tmp_path / "a.npz")
-    try:
-        runner.run(Scripted(None, 0), options, frontend=_Frontend(), watches=[use_up])
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-        for descriptor in held:
-            os.close(descriptor)
-    assert held and all((tmp_path / "out" / name).is_file() for name in LAST) and (tmp_path / "a.npz").is_file()
-
-
-@pytest.mark.parametrize("stream", ["stdout", "stderr"])
-def test_a_full_disk_behind_a_standard_stream_takes_nothing_from_the_work(stream):
-    with Path("/dev/full").open("w") as full:
-        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, stream: full}
-        done = subprocess.run([sys.executable, "-m", "slam", "list"], text=True, timeout=300, **streams)
-    if stream == "stdout":
-        assert done.returncode == 2 and done.stderr == "slam: standard output: No space left on device\n"
-    else:
-        assert done.returncode == 0 and "back ends" in done.stdout
 
 
 def test_too_little_address_space_is_one_line():
