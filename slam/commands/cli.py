@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slam.commands import completion
 from slam.commands.error_exit import one_line_errors
 from slam.commands.options import (
     BackendOption,
@@ -210,7 +209,7 @@ def plot_command(
     ] = None,
     figure: Annotated[
         str,
-        typer.Option(metavar="NAME", help="summary, path, map, errors or time.", autocompletion=completion.figures),
+        typer.Option(metavar="NAME", help="summary, path, map, errors or time."),
     ] = "summary",
     width: Annotated[
         float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
@@ -244,7 +243,6 @@ def compare_command(
             metavar="SEQUENCE",
             help="Folders, or synthetic:NAME?key=value.",
             show_default=False,
-            autocompletion=completion.sequences,
         ),
     ],
     out: Annotated[
@@ -252,16 +250,13 @@ def compare_command(
     ],
     backends: Annotated[
         str,
-        typer.Option(
-            metavar="A,B,...", help="Back ends; the first is the reference.", autocompletion=completion.backends
-        ),
+        typer.Option(metavar="A,B,...", help="Back ends; the first is the reference."),
     ] = ",".join(ONLINE),
     frontends: Annotated[
         str,
         typer.Option(
             metavar="A,B,...",
             help="Front ends; simulated: a world's own features, no images.",
-            autocompletion=completion.frontends,
         ),
     ] = "",
     variant: Annotated[
@@ -297,9 +292,7 @@ def compare_command(
 def calibrate_command(
     sequences: Annotated[
         list[str],
-        typer.Argument(
-            metavar="SEQUENCE", help="Recordings of one rig.", show_default=False, autocompletion=completion.sequences
-        ),
+        typer.Argument(metavar="SEQUENCE", help="Recordings of one rig.", show_default=False),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
         "rig_errors.json"

@@ -7,7 +7,6 @@ from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
-from slam.compare.paper import write_paper
 from slam.compare.plan import CLOSED_LOOP, SIMULATED, Plan, Trial, Variant, is_world, parse_variant
 from slam.compare.report import cautions, conclusions, write_report
 from slam.compare.scheduler import DaskScheduler, LocalScheduler, Scheduler
@@ -94,7 +93,6 @@ def compare(
 
         runs = sweep(plan, out, scheduler, ended, overwrite)
     write_tables(plan, runs, out)
-    write_paper(plan, runs, out)
     report = write_report(plan, runs, out, where)
     if not quiet:
         every = groups(plan, runs)

@@ -7,15 +7,12 @@ from typing import Annotated
 
 import typer
 
-from slam.commands import completion
-
 SequenceArgument = Annotated[
     str,
     typer.Argument(
         metavar="SEQUENCE",
         help="A folder, or synthetic:NAME?key=value.",
         show_default=False,
-        autocompletion=completion.sequences,
     ),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the files.")]
@@ -30,12 +27,11 @@ SetOption = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.",
-        autocompletion=completion.settings,
     ),
 ]
 BackendOption = Annotated[
     str | None,
-    typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf.", autocompletion=completion.backends),
+    typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf."),
 ]
 FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames, B left out.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")]
@@ -46,7 +42,6 @@ OptionalSequence = Annotated[
         metavar="SEQUENCE",
         help="A folder, a ROS recording, camera:0, or synthetic:NAME?key=value; with --config the earlier one.",
         show_default=False,
-        autocompletion=completion.sequences,
     ),
 ]
 ConfigOption = Annotated[
@@ -55,21 +50,15 @@ ConfigOption = Annotated[
 ]
 FrontendOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="NAME", help="Front end, see `slam list`; default: surf.", autocompletion=completion.frontends
-    ),
+    typer.Option(metavar="NAME", help="Front end, see `slam list`; default: surf."),
 ]
 KindOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="KIND", help="handheld or driving; default: the sequence's own.", autocompletion=completion.kinds
-    ),
+    typer.Option(metavar="KIND", help="handheld or driving; default: the sequence's own."),
 ]
 FormatOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="FORMAT", help="Format; default: found out from the folder.", autocompletion=completion.formats
-    ),
+    typer.Option(metavar="FORMAT", help="Format; default: found out from the folder."),
 ]
 RecordOption = Annotated[
     Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")

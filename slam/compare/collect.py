@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from slam.compare.measure import figures
 from slam.data import FrameResult, IdArray
-from slam.evaluation.association_truth import SurfacePoints, TrueWorld
+from slam.evaluation.association_truth import SurfacePoints
 from slam.evaluation.consistency import stretch_nees
 from slam.evaluation.summary import with_truth
 from slam.geometry.alignment import Alignment
@@ -57,7 +57,7 @@ class Collector:
 
     def __init__(self, sequence: Sequence, start: int = 0, score: bool = True) -> None:
         self.sequence, self.start, self.score = sequence, start, score
-        self._truth = SurfacePoints(cast(TrueWorld, sequence)) if sequence.format == "synthetic" else None
+        self._truth = SurfacePoints(sequence) if sequence.format == "synthetic" else None
         self._record, self._lifetimes = RunRecord(), Lifetimes()
         self._rows: list[tuple[float, ...]] = []  # NIS, its degrees of freedom, and map size of frames with a pose
         self._sizes: list[int] = []

@@ -1,4 +1,4 @@
-"""The pictures of a comparison: for its report as SVG texts, for papers as PDF files."""
+"""The pictures of a comparison, for its report as SVG texts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from slam.errors import SlamError
 from slam.evaluation.metrics import chi_square_band
 from slam.files import read_numbers
 from slam.geometry.se3 import Array
-from slam.naming import printable
 from slam.run.figures import place_of_truth, well_known
 from slam.run.plots import drawn
 from slam.run.run_data import RunData
@@ -177,7 +176,6 @@ def _round(rows: Array) -> list[list[float]]:
 _STYLE: Mapping[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "slam",
-    "pdf.fonttype": 42,
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.spines.top": False,
@@ -212,13 +210,3 @@ def as_svg(figure: Figure) -> str:
     with rc_context(dict(_STYLE)):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
-
-
-def as_pdf(figure: Figure, title: str) -> bytes:
-    """A picture as PDF with embedded TrueType fonts: the same bytes for the same data, without a date."""
-    from matplotlib import rc_context
-
-    content = io.BytesIO()
-    with rc_context(dict(_STYLE)):
-        figure.savefig(content, format="pdf", metadata={"CreationDate": None, "Title": printable(title)})
-    return content.getvalue()

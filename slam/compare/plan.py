@@ -6,7 +6,6 @@ import hashlib
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from slam.errors import ConfigurationError
@@ -152,11 +151,6 @@ class Trial:
 def is_world(sequence: str) -> bool:
     """Whether a sequence is a synthetic world."""
     return sequence.startswith(SYNTHETIC)
-
-
-def folder_name(sequence: str) -> str:
-    """The name of a recording's folder or file, without where it lies and without options."""
-    return Path(sequence.partition("?")[0]).name or sequence
 
 
 def short_name(text: str) -> str:

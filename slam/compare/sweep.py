@@ -1,13 +1,11 @@
 """All trials of a comparison, each once: a sweep that was stopped continues where it was.
 
-A trial's folder appears at once with all its files, ``result.json`` among them, and is its own checkpoint.
+A trial's folder is its own checkpoint: ``result.json`` is written last.
 """
 
 from __future__ import annotations
 
 import json
-import secrets
-import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -42,8 +40,7 @@ RUNS, SWEEP = "runs", "sweep.json"
 
 #: What a comparison leaves in its folder.
 NAMES = (
-    SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html", "tables.tex",
-    "figures.tex", "figures/",
+    SWEEP, f"{RUNS}/", "runs.csv", "means.csv", "differences.csv", "timings.csv", "report.html",
 )  # fmt: skip
 
 
@@ -188,33 +185,19 @@ def _keep(
     files: Files | None,
     error: BaseException | None,
 ) -> None:
-    """Put a trial's files in their place, all at once; one that raised is a failed run, with its reason."""
+    """Put a trial's files in their place; one that raised is a failed run, with its reason."""
     trial = jobs[job.name]
     if files is None:
         files = result_files(trial, failure(error or SlamError("nothing came back")))
     folder = out / RUNS / trial.folder
     with naming_folder(folder):
-        if folder.exists():  # without a whole result, or to be replaced: of what else is there nothing is
-            (folder / RESULT).unlink(missing_ok=True)
-            _write_all(folder, files)
-        else:
-            part = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.part")
-            part.mkdir(parents=True)
-            try:
-                _write_all(part, files)
-                part.rename(folder)
-            except OSError:
-                shutil.rmtree(part, ignore_errors=True)
-                raise
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / RESULT).unlink(missing_ok=True)
+        for name in sorted(files, key=lambda name: name == RESULT):  # last: what is there then is whole
+            remove_file(folder / name)
+            (folder / name).write_bytes(files[name])
     if on_done is not None:
         on_done(trial)
-
-
-def _write_all(folder: Path, files: Files) -> None:
-    """Write a trial's files, its result last."""
-    for name in sorted(files, key=lambda name: name == RESULT):
-        remove_file(folder / name)
-        (folder / name).write_bytes(files[name])
 
 
 def _is_done(trial: Trial, out: Path) -> bool:

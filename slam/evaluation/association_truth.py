@@ -2,47 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from slam.data import IdArray
 from slam.geometry.camera import PinholeCamera
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
-from slam.geometry.trajectory import Trajectory
-
-
-class TrueWorld(Protocol):
-    """What is asked of a sequence with known truth; `slam.worlds.WorldSequence` has it."""
-
-    @property
-    def rig(self) -> StereoRig:
-        """The cameras."""
-        ...
-
-    @property
-    def ground_truth(self) -> Trajectory:
-        """Pose of the left camera at every frame."""
-        ...
-
-    def depth(self, k: int) -> np.ndarray:
-        """True distance along the left camera's axis in frame k (H, W) [m], 0 where nothing is."""
-        ...
-
-    def object_ids(self, k: int) -> np.ndarray:
-        """Object of every pixel of frame k's left image (H, W), 0 for the still world."""
-        ...
 
 
 class SurfacePoints:
     """Which point of the still world each landmark is: the one that its feature showed at first sight.
 
     Args:
-        world: the sequence with its truth.
+        world: the sequence with its truth, as `slam.worlds.WorldSequence` has it.
     """
 
-    def __init__(self, world: TrueWorld) -> None:
+    def __init__(self, world: Any) -> None:
         self._world = world
         self._points: dict[int, Array] = {}
 

@@ -1,4 +1,4 @@
-"""What people see on a terminal: help, versions, completion, and nothing clipped at 80 columns."""
+"""What people see on a terminal: help, versions, and nothing clipped at 80 columns."""
 
 from __future__ import annotations
 
@@ -44,28 +44,6 @@ def test_short_options_are_the_long_ones(tmp_path):
     done = invoke("run", "synthetic:desk?frames=2&width=64&height=48", "-o", str(tmp_path / "out"), "-q")
     assert (done.exit_code, done.output) == (0, "")
     assert (tmp_path / "out" / "summary.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [
-        (["run", "--backend", "s"], {"smoother"}),
-        (["run", "synthetic:de"], {"synthetic:desk"}),
-        (["run", "--set", "map.max_l"], {"map.max_landmarks="}),
-        (["run", "--kind", ""], {"handheld", "driving"}),
-        (["run", "--format", "kitti"], {"kitti", "kitti-raw"}),
-        (["compare", "--backends", "ekf,sm"], {"ekf,smoother"}),
-        (["plot", "--figure", "e"], {"errors"}),
-    ],
-)
-def test_the_shell_completes_words(words, offered):
-    environment = {
-        "_SLAM_COMPLETE": "complete_bash",
-        "COMP_WORDS": " ".join(["slam", *words]),
-        "COMP_CWORD": str(len(words)),
-    }
-    done = CliRunner().invoke(app, [], prog_name="slam", env=environment)
-    assert set(done.output.split()) == offered
 
 
 def test_lengths_below_a_metre_are_in_millimetres_and_bodies_are_in_the_table(capsys):

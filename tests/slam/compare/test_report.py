@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import csv
-import re
 from html import escape
 
 import pytest
 from rich.console import Console
 
 from slam.commands import display
-from slam.compare.paper import write_paper
 from slam.compare.report import conclusions, write_report
 from slam.compare.statistics import Verdict
 from slam.compare.tables import count_tests, groups, write_tables
@@ -29,13 +27,6 @@ def three(tmp_path_factory):
 def text(three):
     out, of, runs, _ = three
     return write_report(of, runs, out, "here").read_text()
-
-
-@pytest.fixture(scope="module")
-def paper(three):
-    out, of, runs, _ = three
-    write_paper(of, runs, out)
-    return out
 
 
 def test_the_headlines_name_what_is_certainly_worse_beside_what_is_better(three):
@@ -61,44 +52,12 @@ def test_p_is_adjusted_over_all_groups_of_the_report(three):
     assert all(float(row["low"]) < float(row["mean"]) < float(row["high"]) for row in means)
 
 
-def test_tables_for_latex(paper):
-    tables = (paper / "tables.tex").read_text()
-    captions = re.findall(r"\\caption\{(.*)\}\n", tables)
-    assert len(captions) == 4
-    assert sum("Closed loop: each back end steers" in caption for caption in captions) == 2
-    for columns, body in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", tables, re.S):
-        rows = [line for line in body.splitlines() if line.endswith("\\\\")]
-        assert len(rows) > 3
-        assert {row.count(" & ") for row in rows} == {len(columns) - 1}
-    assert tables.isascii()
-
-
-def test_figures_for_papers(paper):
-    figures = (paper / "figures.tex").read_text()
-    names = re.findall(r"\\includegraphics\[width=\\linewidth\]\{(.*)\}", figures)
-    assert sorted(f"{name}.pdf" for name in names) == sorted(
-        path.relative_to(paper).as_posix() for path in (paper / "figures").iterdir()
-    )
-    assert {name.rsplit("_", 1)[1] for name in names} == {"trials", "paths", "errors", "nees", "time"}
-    captions = re.findall(r"\\caption\{(.*)\}\n", figures)
-    assert len(captions) == len(names) == 10
-    assert all("Closed loop: " in caption or "Replay: " in caption for caption in captions)
-    assert figures.isascii()
-    for name in names:
-        content = (paper / f"{name}.pdf").read_bytes()
-        assert content.startswith(b"%PDF")
-        assert b"CreationDate" not in content
-        assert b"/Type3" not in content  # fonts that many publishers refuse
-
-
 def test_one_trial_and_nothing_that_completed(tmp_path):
     of = plan(1)
     runs = make(tmp_path, of, failed=(("ekf", 0), ("smoother", 0)))
     write_tables(of, runs, tmp_path)
-    write_paper(of, runs, tmp_path)
     text = write_report(of, runs, tmp_path, "here").read_text()
     assert "4 of 4 runs failed" in text
-    assert not list((tmp_path / "figures").iterdir())
 
 
 def test_one_trial_says_that_it_proves_nothing(tmp_path):
