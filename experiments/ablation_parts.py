@@ -84,10 +84,7 @@ def no_first_frames() -> AbstractContextManager[object]:
 
 
 #: Settings with which every part that may be worth something is on, by kind of motion.
-BASE = {
-    "driving": ("association.align=true", "map.target_in_view=150", "backend.landmarks=euclidean"),
-    "handheld": (),
-}
+BASE = {"driving": ("association.align=true", "map.target_in_view=150", "backend.landmarks=euclidean"), "handheld": ()}
 
 
 @dataclass(frozen=True)

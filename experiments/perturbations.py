@@ -36,11 +36,7 @@ from slam.sequences import Sequence, open_sequence
 from slam.system import StereoSlam
 
 _DAY = "kitti_raw/2011_09_26/2011_09_26_drive_"
-DRIVES = {
-    "KITTI 06": "kitti_odometry/sequences/06",
-    "raw 0001": f"{_DAY}0001_sync",
-    "raw 0013": f"{_DAY}0013_sync",
-}
+DRIVES = {"KITTI 06": "kitti_odometry/sequences/06", "raw 0001": f"{_DAY}0001_sync", "raw 0013": f"{_DAY}0013_sync"}
 SPOILT = ("KITTI 06", "raw 0001")  # drives that are run with spoilt images
 FIGURES = (*(f"ATE {name} [m]" for name in ONLINE), "frames", *(f"lost {name}" for name in ONLINE))
 

@@ -207,10 +207,7 @@ def plot_command(
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="PNG, PDF or SVG; default: a PNG in the first folder."),
     ] = None,
-    figure: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="summary, path, map, errors or time."),
-    ] = "summary",
+    figure: Annotated[str, typer.Option(metavar="NAME", help="summary, path, map, errors or time.")] = "summary",
     width: Annotated[
         float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
     ] = None,
@@ -238,30 +235,19 @@ def settings_command(
 @app.command("compare", short_help="Compare back ends on the same recordings.")
 def compare_command(
     sequences: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SEQUENCE",
-            help="Folders, or synthetic:NAME?key=value.",
-            show_default=False,
-        ),
+        list[str], typer.Argument(metavar="SEQUENCE", help="Folders, or synthetic:NAME?key=value.", show_default=False)
     ],
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="DIR", help="Folder; a comparison that was stopped in it goes on.")
     ],
-    backends: Annotated[
-        str,
-        typer.Option(metavar="A,B,...", help="Back ends; the first is the reference."),
-    ] = ",".join(ONLINE),
+    backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back ends; the first is the reference.")] = ",".join(
+        ONLINE
+    ),
     frontends: Annotated[
-        str,
-        typer.Option(
-            metavar="A,B,...",
-            help="Front ends; simulated: a world's own features, no images.",
-        ),
+        str, typer.Option(metavar="A,B,...", help="Front ends; simulated: a world's own features, no images.")
     ] = "",
     variant: Annotated[
-        list[str] | None,
-        typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:..."),
+        list[str] | None, typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:...")
     ] = None,
     settings: SetOption = None,
     mask: MaskOption = None,
@@ -291,8 +277,7 @@ def compare_command(
 @app.command("calibrate", short_help="Find a stereo rig's error from its recordings.")
 def calibrate_command(
     sequences: Annotated[
-        list[str],
-        typer.Argument(metavar="SEQUENCE", help="Recordings of one rig.", show_default=False),
+        list[str], typer.Argument(metavar="SEQUENCE", help="Recordings of one rig.", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="For `slam run --calibration`.")] = Path(
         "rig_errors.json"

@@ -8,12 +8,7 @@ from typing import Annotated
 import typer
 
 SequenceArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="SEQUENCE",
-        help="A folder, or synthetic:NAME?key=value.",
-        show_default=False,
-    ),
+    str, typer.Argument(metavar="SEQUENCE", help="A folder, or synthetic:NAME?key=value.", show_default=False)
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the files.")]
 RunOutOption = Annotated[
@@ -29,10 +24,7 @@ SetOption = Annotated[
         help="A setting, e.g. map.max_landmarks=300; once per setting; see `slam settings`.",
     ),
 ]
-BackendOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf."),
-]
+BackendOption = Annotated[str | None, typer.Option(metavar="NAME", help="Back end, see `slam list`; default: ekf.")]
 FramesOption = Annotated[str | None, typer.Option(metavar="A:B", help="Range of frames, B left out.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no table.")]
 PictureOption = Annotated[bool, typer.Option("--picture/--no-picture", help="Leave a picture of the run.")]
@@ -48,18 +40,11 @@ ConfigOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="config.json of an earlier run, to repeat it; other options change it."),
 ]
-FrontendOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Front end, see `slam list`; default: surf."),
-]
+FrontendOption = Annotated[str | None, typer.Option(metavar="NAME", help="Front end, see `slam list`; default: surf.")]
 KindOption = Annotated[
-    str | None,
-    typer.Option(metavar="KIND", help="handheld or driving; default: the sequence's own."),
+    str | None, typer.Option(metavar="KIND", help="handheld or driving; default: the sequence's own.")
 ]
-FormatOption = Annotated[
-    str | None,
-    typer.Option(metavar="FORMAT", help="Format; default: found out from the folder."),
-]
+FormatOption = Annotated[str | None, typer.Option(metavar="FORMAT", help="Format; default: found out from the folder.")]
 RecordOption = Annotated[
     Path | None, typer.Option(metavar="FILE.npz", help="Record what the back end is given, for `slam replay`.")
 ]

@@ -110,10 +110,7 @@ class Collector:
         errors = errors[np.isfinite(errors)]
         if not len(errors):
             return {}
-        return {
-            "landmark_error_m": float(np.median(errors)),
-            "landmark_error_90_m": float(np.quantile(errors, 0.9)),
-        }
+        return {"landmark_error_m": float(np.median(errors)), "landmark_error_90_m": float(np.quantile(errors, 0.9))}
 
     def _series(self, online: Trajectory) -> Array:
         """Error, claimed deviations, NEES and NIS of every frame, relative to the first pose."""

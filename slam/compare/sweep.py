@@ -69,11 +69,7 @@ class Run:
 
 
 def sweep(
-    plan: Plan,
-    out: Path,
-    scheduler: Scheduler,
-    on_done: Callable[[Trial], None] | None = None,
-    overwrite: bool = False,
+    plan: Plan, out: Path, scheduler: Scheduler, on_done: Callable[[Trial], None] | None = None, overwrite: bool = False
 ) -> list[Run]:
     """Run what is not done yet, and read all runs of the plan, in its order.
 

@@ -11,13 +11,7 @@ import numpy as np
 
 from slam.errors import TrajectoryError
 from slam.evaluation.consistency import consistency_figures
-from slam.evaluation.metrics import (
-    absolute_errors,
-    associate,
-    plane_errors,
-    relative_errors,
-    segment_errors,
-)
+from slam.evaluation.metrics import absolute_errors, associate, plane_errors, relative_errors, segment_errors
 from slam.geometry.se3 import Array, inverse, so3_log
 from slam.geometry.trajectory import Trajectory, TruthNoise
 from slam.rig_error import CommonError
@@ -71,10 +65,7 @@ def _against_gps(estimate: Trajectory, gps: Array) -> dict[str, float]:
         errors = plane_errors(estimate, gps)
     except TrajectoryError:
         return {}
-    return {
-        "GPS distance RMSE [m]": float(np.sqrt(np.mean(errors**2))),
-        "GPS distance max [m]": float(errors.max()),
-    }
+    return {"GPS distance RMSE [m]": float(np.sqrt(np.mean(errors**2))), "GPS distance max [m]": float(errors.max())}
 
 
 def _where_possible(part: Callable[..., dict[str, float]], *arguments: object) -> dict[str, float]:

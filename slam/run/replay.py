@@ -10,15 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from slam.data import (
-    FrameResult,
-    FrameStatus,
-    Observations,
-    Prediction,
-    StereoFeatures,
-    UpdateReport,
-    UpdateStatus,
-)
+from slam.data import FrameResult, FrameStatus, Observations, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, RevisingBackend
