@@ -21,10 +21,6 @@ from slam.sequences import open_sequence
 
 _COLUMNS = 3  # most recordings with a column of their own
 
-#: What a parameter of each unit is multiplied by in the table, and its unit there; of pure numbers by name.
-_SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}
-_SHARES = {"f": "%", "aspect": "%", "down": "% of baseline", "forward": "% of baseline"}
-
 
 def calibrate(
     texts: Sequence[str],
@@ -74,7 +70,7 @@ def _print(done: Calibrated) -> None:
         table.add_column("apart", justify="right")
     for row, name in enumerate(joint.names):
         beliefs = [joint, *(one.posterior for one in shown)]
-        factor, unit = _unit(name, joint.units[row], done.focal)
+        factor, unit = done.units[row]
         cells = [f"{factor * p.mean[row]:.2f} ± {factor * p.sigma[row]:.2f}" for p in beliefs]
         table.add_row(name, unit, *cells, *([] if done.agreed is None else [_sigmas(done.agreed.largest[row])]))
     console.print(table)
@@ -83,14 +79,6 @@ def _print(done: Calibrated) -> None:
         console.print(f"({number}) {one.name}: {one.frames} frames, {one.pairs} pairs of views{tells}", markup=False)
     if done.agreed is not None:
         console.print(done.agreed.words, markup=False)
-
-
-def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
-    """What a parameter is multiplied by to be shown, and the unit that it then has."""
-    if unit == "focal lengths":
-        return focal, "px"
-    share = _SHARES.get(name.removeprefix("left_").removeprefix("right_"))
-    return (100.0, share) if share else _SHOWN[unit]
 
 
 def _sigmas(difference: float) -> str:

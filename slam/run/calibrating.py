@@ -30,6 +30,10 @@ from slam.system import StereoSlam
 _BACKEND, _FRONTEND = "ekf", "surf"  # poses are a first guess alone
 _SETTINGS = ("objects.mode=off",)
 
+#: What a parameter of each unit is multiplied by in the table, and its unit there; of pure numbers by name.
+_SHOWN = {"rad": (1e3, "mrad"), "1": (1e3, "10⁻³")}
+_SHARES = {"f": "%", "aspect": "%", "down": "% of baseline", "forward": "% of baseline"}
+
 _NO_PAIRS = (
     "no two views far enough apart were compared: rows alone say next to nothing of disparities; "
     "take longer recordings in which the camera moves on"
@@ -93,7 +97,7 @@ class Calibrated:
         agreed: whether they agree; None where one alone shows motion.
         off: how far pixels of the corrected calibration are from the corrected pixels, root mean square [px].
         warning: a line on why little can be expected of it; empty for none.
-        focal: of the rig [px].
+        units: of each parameter, what it is multiplied by for people, and the unit that it then has.
     """
 
     found: Sequence[Found]
@@ -101,7 +105,7 @@ class Calibrated:
     agreed: Agreement | None
     off: float
     warning: str
-    focal: float
+    units: Sequence[tuple[float, str]]
 
 
 @one_blas_thread
@@ -136,7 +140,9 @@ def calibrate(
     kept = joint_calibration(model, evidence, systematic)
     agreed = agreement(model, evidence, systematic)
     corrected = corrected_rig(model, kept.posterior.mean)
-    every = [{"sequence": o.name, "frames": o.frames, "pairs": o.pairs, **o.posterior.to_json()} for o in found]
+    every = [
+        {"sequence": one.name, "frames": one.frames, "pairs": one.pairs, **one.posterior.to_json()} for one in found
+    ]
     warning = "" if any(one.pairs for one in found) else _NO_PAIRS
     tree = {**kept.to_json(), "recordings": every, "agreement": None if agreed is None else agreed.words}
     tree["warnings"] = [warning] if warning else []
@@ -145,8 +151,16 @@ def calibrate(
         write_opencv(targets.opencv, corrected.rig)
     if targets.kalibr is not None:
         write_kalibr(targets.kalibr, corrected.rig)
-    off = float(np.hypot(corrected.left_off, corrected.right_off))
-    return Calibrated(found, kept, agreed, off, warning, model.focal)
+    units = [_unit(name, unit, model.focal) for name, unit in zip(model.names, model.units)]
+    return Calibrated(found, kept, agreed, float(np.hypot(corrected.left_off, corrected.right_off)), warning, units)
+
+
+def _unit(name: str, unit: str, focal: float) -> tuple[float, str]:
+    """What a parameter is multiplied by to be shown, and the unit that it then has."""
+    if unit == "focal lengths":
+        return focal, "px"
+    share = _SHARES.get(name.removeprefix("left_").removeprefix("right_"))
+    return (100.0, share) if share else _SHOWN[unit]
 
 
 def _require_one_rig(sequences: Sequence[StereoSequence]) -> None:
