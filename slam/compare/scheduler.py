@@ -18,8 +18,6 @@ from typing import Any, Protocol
 
 from slam.errors import SlamError
 
-_SHARED_DEATHS = 2  # a job whose worker has died so often is next run alone, so that no other is to blame
-
 #: Read by the libraries when they are loaded, which is before a worker's first job.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -59,7 +57,7 @@ class Scheduler(Protocol):
 class LocalScheduler:
     """Worker processes on this machine, each with one thread for linear algebra.
 
-    When a worker dies (killed, out of memory) the pool is rebuilt and goes on; the jobs that were running run again.
+    When a worker dies (killed, out of memory) the jobs that were running run again, each alone, and then the others.
 
     Attributes:
         workers: number of processes.
@@ -70,15 +68,10 @@ class LocalScheduler:
     def run(self, jobs: Iterable[Job], deliver: Deliver) -> None:
         """See `Scheduler`."""
         waiting = deque(jobs)
-        deaths: dict[str, int] = {}
-        alone: deque[Job] = deque()
         while waiting:
-            for job in _in_pool(waiting, self.workers, deliver):
-                deaths[job.name] = deaths.get(job.name, 0) + 1
-                (alone if deaths[job.name] >= _SHARED_DEATHS else waiting).append(job)
-        while alone:
-            for job in _in_pool(deque([alone.popleft()]), 1, deliver):
-                deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
+            for lost in _in_pool(waiting, self.workers, deliver):  # alone, so that no other is to blame
+                for job in _in_pool(deque([lost]), 1, deliver):
+                    deliver(job, None, WorkerDiedError("its worker process died, also where it ran alone"))
 
 
 def _in_pool(waiting: deque[Job], workers: int, deliver: Deliver) -> list[Job]:

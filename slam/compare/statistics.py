@@ -99,11 +99,6 @@ class Difference:
         return bool(self.mean > 0) if self.metric.better == "higher" else bool(self.mean < 0)
 
     @property
-    def wins(self) -> int:
-        """Pairs in which the one that is better on average is better."""
-        return self.lower if self.mean < 0 else self.higher
-
-    @property
     def varies(self) -> bool:
         """Whether the test can come out either way: two pairs or more, not all equal. Only these are a test."""
         return bool(np.isfinite(self.p)) and self.lower + self.higher > 0
@@ -140,8 +135,8 @@ def difference(metric: Metric, reference: Array, other: Array) -> Difference:
     if metric.better == "one":
         a, b = _dishonesty(a), _dishonesty(b)
     d = b - a
-    low, high, p = interval_and_test(d)
-    p = p if metric.better else float("nan")
+    low, high = interval(d)
+    p = sign_flip(d) if metric.better and len(d) > 1 else float("nan")
     mean = float(d.mean()) if len(d) else float("nan")
     signs = int((d < 0).sum()), int((d > 0).sum())
     return Difference(metric, len(d), int((~both).sum()), *means, mean, low, high, p, p, *signs)
@@ -186,13 +181,6 @@ def interval(values: Array) -> tuple[float, float]:
     if np.ptp(values) == 0:  # no spread to resample
         return float(values[0]), float(values[0])
     return _bootstrap(tuple(values.tolist()))
-
-
-def interval_and_test(d: Array) -> tuple[float, float, float]:
-    """Bounds of the mean of paired differences (N,), see `interval`, and the test test's p; NaN below two pairs."""
-    if len(d) < 2:
-        return float("nan"), float("nan"), float("nan")
-    return *interval(d), sign_flip(d)
 
 
 @lru_cache(maxsize=4096)  # tables, report and the words on the terminal ask for the same
