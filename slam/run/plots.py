@@ -47,7 +47,6 @@ _HEADROOM = 1.2  # height of a map over that of what it shows: room for the lege
 _MOST_MAPS = 3  # side by side in the summary
 _PAGE = 8.0  # [in] below which text is small, as in a paper
 _LEAST_HEIGHT = 7.8  # [in] of the summary, below which legends take the place of the panels
-_HANDLE = 4.8  # width of what stands beside a label of a legend, in sizes of the font
 _COLUMN = 5.0  # [in] below which panels do not stand side by side
 _STYLE: dict[str, Any] = {
     "font.size": 9, "axes.titlesize": 10, "figure.titlesize": 11, "legend.fontsize": 8, "svg.hashsalt": "slam",
@@ -403,14 +402,7 @@ def _width(axis: Axes) -> float:
 
 def _legend_below(axis: Axes, handles: Sequence[Artist], labels: Sequence[str]) -> None:
     """A legend below a panel in as many columns as there is room for, all of it inside the picture."""
-    from matplotlib import rcParams
-
-    room = 72 * _width(axis) / rcParams["legend.fontsize"]
-    widths_of = (
-        (n, sum(_HANDLE + _LETTER * max(map(len, column)) for column in np.array_split(labels, n)))
-        for n in range(1, len(labels) + 1)
-    )
-    columns = max((n for n, wide in widths_of if wide < room), default=1)
+    columns = max(1, int(_width(axis) / (0.5 + 0.07 * max(map(len, labels), default=1))))
     axis.figure.legend(handles, labels, loc="outside lower center", ncols=min(5, columns), frameon=False)
 
 
