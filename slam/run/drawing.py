@@ -119,11 +119,12 @@ def _draw_label(picture: np.ndarray, thing: MovingObject, corners: Array, scale:
     state = f"{speed:.2f} m/s" if thing.moving else "at rest"
     text = f"{thing.id}  {state if thing.estimate.measured else 'not seen'}"
     (width, height), base = cv2.getTextSize(text, _FONT, _TEXT, 1)
-    left, top = _pixel(*(corners.min(axis=0) - (0, 3)), scale)
-    u = min(max(left, 0), max(picture.shape[1] - width, 0))
-    v = min(max(top, height), picture.shape[0] - base)
-    cv2.rectangle(picture, (u, v - height), (u + width, v + base), _RING, cv2.FILLED)
-    cv2.putText(picture, text, (u, v), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
+    u, v = corners.min(axis=0)
+    left, top = _pixel(u, v - 3, scale)
+    x = min(max(left, 0), max(picture.shape[1] - width, 0))
+    y = min(max(top, height), picture.shape[0] - base)
+    cv2.rectangle(picture, (x, y - height), (x + width, y + base), _RING, cv2.FILLED)
+    cv2.putText(picture, text, (x, y), _FONT, _TEXT, body_colour(thing.id), 1, cv2.LINE_AA)
 
 
 def _line(

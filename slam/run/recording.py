@@ -180,10 +180,10 @@ def _array(arrays: Mapping[str, np.ndarray], key: str, dimensions: int, kind: ty
 
 
 def _rig(tree: dict[str, Any]) -> StereoRig:
-    cameras = (
+    left, right = (
         PinholeCamera(**{**tree[side], "distortion": tuple(tree[side]["distortion"])}) for side in ("left", "right")
     )
-    return StereoRig(*cameras, np.array(tree["R"], float), np.array(tree["b"], float))
+    return StereoRig(left, right, np.array(tree["R"], float), np.array(tree["b"], float))
 
 
 def _models(tree: dict[str, Any]) -> EstimatorModels:
