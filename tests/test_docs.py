@@ -326,7 +326,6 @@ def test_names_of_the_code_in_the_text_exist(page):
 #: What is put in place of what the reader has, by page. On all pages worlds have a few frames.
 FOR_THE_READER = {
     "README.md": {"path/to/kitti_or_euroc_folder": "synthetic:desk?frames=3"},
-    "docs/sequences.md": {"sys.argv[1:]": "('synthetic:desk?frames=3', 'walk')"},
     "docs/worlds.md": {"box=1": "box=1&width=160&height=120"},
 }
 #: Run by a test of its own.
