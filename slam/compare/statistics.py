@@ -37,18 +37,7 @@ _EXACT = 16  # pairs up to which all 2ᴺ patterns of signs are tried; for more 
 
 
 class Verdict(StrEnum):
-    """What may be concluded of a difference, by `ALPHA`, `HINT_ALPHA` and `LEVEL`.
-
-    Attributes:
-        CERTAIN: the interval leaves out zero, and the Holm-adjusted p is at most `ALPHA`.
-        LIKELY: the interval leaves out zero, and p is at most `ALPHA`, the adjusted one is not.
-        HINT: the interval leaves out zero or there is none; p is above `ALPHA` and at most `HINT_ALPHA`.
-        OPEN: the interval holds zero, or p is above `HINT_ALPHA`.
-        EQUAL: every pair is the same to the last digit.
-        SINGLE: one pair: a difference without any spread to judge it by.
-        NONE: no pair.
-        UNTESTED: a figure of which neither more nor less is better.
-    """
+    """What may be concluded of a difference: see `Difference.verdict`, and ``docs/comparing.md``."""
 
     CERTAIN = "certain"
     LIKELY = "likely"
@@ -108,11 +97,11 @@ class Difference:
         """What may be concluded."""
         if not self.pairs:
             return Verdict.NONE
-        if not self.lower and not self.higher:
+        if not self.lower and not self.higher:  # every pair is the same to the last digit
             return Verdict.EQUAL
         if not self.metric.better:
             return Verdict.UNTESTED
-        if self.pairs == 1:
+        if self.pairs == 1:  # without any spread to judge it by
             return Verdict.SINGLE
         if self.low <= 0 <= self.high or self.p > HINT_ALPHA:
             return Verdict.OPEN

@@ -83,11 +83,7 @@ def load(
 ) -> Repeat:
     """Read the ``config.json`` of a run.
 
-    Args:
-        path: the file, or the run's folder.
-        sequence: taken in place of the run's own.
-        prior_map: taken in place of the run's own.
-        calibration: likewise.
+    `path` is the file, or the run's folder; the others are taken in place of the run's own.
 
     Raises:
         SlamError: it cannot be read, is none of a run of a sequence, or a file of its is not found any more.
@@ -98,21 +94,18 @@ def load(
         tree = _restored(read_object(file))
         if str(tree.get("command", "")).startswith("slam replay"):
             raise SlamError(f"{file}: that of a replay; repeat it with: {tree['command']}")
-        source, known, kept = tree.get("source") or {}, tree.get("prior_map"), tree.get("calibration")
-        start, stop = tree["frames"]
-        origin = Origin(
-            str(tree.get("command", "")),
-            sequence or (_found(source, file) if source else ""),
-            source.get("format"),
-            str(tree.get("kind", "handheld")),
-            prior_map or (Path(_found(known, file)) if known else None),
-            bool(tree.get("mono", False)),
-            calibration or (Path(_found(kept, file)) if kept else None),
+        source, (start, stop) = tree.get("source") or {}, tree["frames"]
+        known, kept = (
+            given or (Path(_found(tree[key], file)) if tree.get(key) else None)
+            for key, given in (("prior_map", prior_map), ("calibration", calibration))
         )
-        config = SystemConfig.from_json(tree["settings"])
+        origin = Origin(
+            str(tree.get("command", "")), sequence or (_found(source, file) if source else ""), source.get("format"),
+            str(tree.get("kind", "handheld")), known, bool(tree.get("mono", False)), kept,
+        )  # fmt: skip
         names = str(tree["frontend"]), str(tree["backend"])
-        stop = None if stop is None else int(stop)
-        return Repeat(origin, *names, config, int(start), stop, dict(tree.get("versions", {})))
+        config, made_with = SystemConfig.from_json(tree["settings"]), dict(tree.get("versions", {}))
+        return Repeat(origin, *names, config, int(start), None if stop is None else int(stop), made_with)
     except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise SlamError(f"{file}: not the config.json of a run: {error!r}") from error
 
