@@ -14,34 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from slam.commands import options as of
 from slam.commands.error_exit import one_line_errors
-from slam.commands.options import (
-    BackendOption,
-    CalibrationOption,
-    ConfigOption,
-    DrawMapOption,
-    DrawOption,
-    FormatOption,
-    FramesOption,
-    FrontendOption,
-    KindOption,
-    LiveOption,
-    MapOption,
-    MaskOption,
-    MonoOption,
-    OptionalSequence,
-    OutOption,
-    OverlapOption,
-    OverwriteOption,
-    PictureOption,
-    QuietOption,
-    RecordOption,
-    RunOutOption,
-    SaveMapOption,
-    SequenceArgument,
-    SetOption,
-    ViewerOption,
-)
 from slam.commands.signals import catch_signals, leaving, whole_frames
 from slam.registry import ONLINE
 from slam.runtime.memory import require_address_space
@@ -94,29 +68,29 @@ def common_options(
 
 @app.command("run", short_help="Run one sequence through one back end.")
 def run_command(
-    sequence: OptionalSequence = None,
-    out: RunOutOption = None,
-    config: ConfigOption = None,
-    backend: BackendOption = None,
-    frontend: FrontendOption = None,
-    settings: SetOption = None,
-    frames: FramesOption = None,
-    kind: KindOption = None,
-    format: FormatOption = None,
-    record: RecordOption = None,
-    prior_map: MapOption = None,
-    save_map: SaveMapOption = None,
-    mono: MonoOption = False,
-    calibration: CalibrationOption = None,
-    mask: MaskOption = None,
-    viewer: ViewerOption = None,
-    draw: DrawOption = None,
-    draw_map: DrawMapOption = False,
-    overlap: OverlapOption = True,
-    live: LiveOption = False,
-    picture: PictureOption = True,
-    overwrite: OverwriteOption = False,
-    quiet: QuietOption = False,
+    sequence: of.OptionalSequence = None,
+    out: of.RunOutOption = None,
+    config: of.ConfigOption = None,
+    backend: of.BackendOption = None,
+    frontend: of.FrontendOption = None,
+    settings: of.SetOption = None,
+    frames: of.FramesOption = None,
+    kind: of.KindOption = None,
+    format: of.FormatOption = None,
+    record: of.RecordOption = None,
+    prior_map: of.MapOption = None,
+    save_map: of.SaveMapOption = None,
+    mono: of.MonoOption = False,
+    calibration: of.CalibrationOption = None,
+    mask: of.MaskOption = None,
+    viewer: of.ViewerOption = None,
+    draw: of.DrawOption = None,
+    draw_map: of.DrawMapOption = False,
+    overlap: of.OverlapOption = True,
+    live: of.LiveOption = False,
+    picture: of.PictureOption = True,
+    overwrite: of.OverwriteOption = False,
+    quiet: of.QuietOption = False,
 ) -> None:
     """Run one sequence through one back end."""
     from slam.commands.background_compilation import compiled_in_background
@@ -172,12 +146,12 @@ def _watches(stack: ExitStack, opened: Sequence, viewer: str | None, draw: Path 
 @app.command("replay", short_help="Feed a back end recorded measurements.")
 def replay_command(
     recording: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Made by `slam run --record`.")],
-    out: RunOutOption = None,
-    backend: BackendOption = None,
-    settings: SetOption = None,
-    picture: PictureOption = True,
-    overwrite: OverwriteOption = False,
-    quiet: QuietOption = False,
+    out: of.RunOutOption = None,
+    backend: of.BackendOption = None,
+    settings: of.SetOption = None,
+    picture: of.PictureOption = True,
+    overwrite: of.OverwriteOption = False,
+    quiet: of.QuietOption = False,
 ) -> None:
     """Give a back end the same measurements that another one was given."""
     from slam.commands.display import Progress
@@ -211,7 +185,7 @@ def plot_command(
     width: Annotated[
         float | None, typer.Option(metavar="MM", help="Width of the picture, such as 88 for a journal's column.")
     ] = None,
-    overwrite: OverwriteOption = False,
+    overwrite: of.OverwriteOption = False,
 ) -> None:
     """Draw finished runs, those of one sequence in one picture: path, map, errors with 3 sigma, time per stage."""
     from slam.commands.plot import plot_runs
@@ -249,15 +223,15 @@ def compare_command(
     variant: Annotated[
         list[str] | None, typer.Option(metavar="VARIANT", help="A front end with settings, NAME:FRONTEND:KEY=VALUE:...")
     ] = None,
-    settings: SetOption = None,
-    mask: MaskOption = None,
+    settings: of.SetOption = None,
+    mask: of.MaskOption = None,
     trials: Annotated[int, typer.Option(metavar="N", min=1, help="Seeds 0 to N - 1 of every synthetic world.")] = 12,
-    frames: FramesOption = None,
+    frames: of.FramesOption = None,
     replay: Annotated[bool, typer.Option(help="Also feed the first back end's measurements to all.")] = True,
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes; default: the number of cores.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to be used.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="30 frames, 2 trials: does it work?")] = False,
-    overwrite: OverwriteOption = False,
+    overwrite: of.OverwriteOption = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no conclusions.")] = False,
 ) -> None:
     """Compare back ends on the same recordings: tables, what is certain and what is not, and one HTML report."""
@@ -288,12 +262,12 @@ def calibrate_command(
     kalibr: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="The same in the form of Kalibr's camchain.")
     ] = None,
-    settings: SetOption = None,
-    frames: FramesOption = None,
-    format: FormatOption = None,
-    mask: MaskOption = None,
-    overwrite: OverwriteOption = False,
-    quiet: QuietOption = False,
+    settings: of.SetOption = None,
+    frames: of.FramesOption = None,
+    format: of.FormatOption = None,
+    mask: of.MaskOption = None,
+    overwrite: of.OverwriteOption = False,
+    quiet: of.QuietOption = False,
 ) -> None:
     """Find what a rig's calibration is off by, from all its recordings together, and whether they agree."""
     from slam.commands.calibrate import calibrate
@@ -309,9 +283,9 @@ def calibrate_command(
 
 @app.command("render", short_help="Write a built-in sequence as a folder.")
 def render_command(
-    sequence: SequenceArgument,
-    out: OutOption,
-    frames: FramesOption = None,
+    sequence: of.SequenceArgument,
+    out: of.OutOption,
+    frames: of.FramesOption = None,
     truth_images: Annotated[bool, typer.Option(help="Depth and object images as well.")] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
@@ -337,7 +311,7 @@ def render_command(
 def view_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Left by `slam run`.", show_default=False)],
     target: Annotated[str, typer.Option("--to", metavar="live|FILE.rrd", help="A window, or a file.")] = "live",
-    overwrite: OverwriteOption = False,
+    overwrite: of.OverwriteOption = False,
 ) -> None:
     """Show a finished run in Rerun: path, objects and map; `slam run --viewer` shows its images, too."""
     from slam.run.viewer import view_run
@@ -356,7 +330,7 @@ def list_command(
 
 
 @app.command("warm-up", short_help="Compile all kernels beforehand.")
-def warm_up_command(quiet: QuietOption = False) -> None:
+def warm_up_command(quiet: of.QuietOption = False) -> None:
     """Compile all kernels, so that no run has to: for images of containers, and after an update."""
     from slam.commands.background_compilation import compiled_in_background
     from slam.run.warm_up import warm_up
@@ -369,10 +343,10 @@ def warm_up_command(quiet: QuietOption = False) -> None:
 
 @app.command("demo", short_help="Try both back ends on a built-in scene.")
 def demo_command(
-    out: OutOption = Path("slam_demo"),
+    out: of.OutOption = Path("slam_demo"),
     frames: Annotated[int, typer.Option(metavar="N", min=10, help="Number of frames.")] = 150,
-    overwrite: OverwriteOption = False,
-    quiet: QuietOption = False,
+    overwrite: of.OverwriteOption = False,
+    quiet: of.QuietOption = False,
 ) -> None:
     """Run both back ends on a built-in scene, compare them, and draw pictures."""
     from slam.commands.demo import demo

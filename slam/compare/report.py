@@ -11,29 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from slam.compare import figures
+from slam.compare import figures, wording
 from slam.compare.measure import COMPLETED, Metric, number
 from slam.compare.plan import Plan
 from slam.compare.statistics import FEWEST, LEVEL, Difference, Verdict
 from slam.compare.sweep import SWEEP, Run
 from slam.compare.tables import RUN_COLUMNS, Group, count_tests, groups, mean_figures, run_head
-from slam.compare.wording import (
-    STRENGTH,
-    WORDS,
-    Line,
-    badge,
-    caution,
-    direction,
-    failures,
-    headline,
-    honesty,
-    in_short,
-    measurements,
-    shown_interval,
-    shown_mean,
-    shown_p,
-    shown_spread,
-)
 from slam.files import read_object, write_text
 from slam.run.style import stage_name, stages
 
@@ -57,7 +40,7 @@ class Conclusions:
     name: str
     verdict: list[str]
     failed: str
-    headlines: list[Line]
+    headlines: list[wording.Line]
     honesty: list[str]
 
 
@@ -76,10 +59,10 @@ def conclusions(every: Sequence[Group]) -> list[Conclusions]:
         found.append(
             Conclusions(
                 f"{group.sequence}{variant}, {group.mode}",
-                [in_short(differences, first, other) for other, differences in own.items()],
-                failures({b: group.failures(b) for b in group.runs}, group.trials),
-                [line for other, differences in own.items() for line in headline(differences, other)],
-                honesty(nees, group.trials),
+                [wording.in_short(differences, first, other) for other, differences in own.items()],
+                wording.failures({b: group.failures(b) for b in group.runs}, group.trials),
+                [line for other, differences in own.items() for line in wording.headline(differences, other)],
+                wording.honesty(nees, group.trials),
             )
         )
     return found
@@ -87,7 +70,7 @@ def conclusions(every: Sequence[Group]) -> list[Conclusions]:
 
 def cautions(every: Sequence[Group]) -> str:
     """What the trials of the group that has most can show at best; empty where they are enough."""
-    return caution(max(group.trials for group in every), count_tests(every))
+    return wording.caution(max(group.trials for group in every), count_tests(every))
 
 
 def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Path:
@@ -116,7 +99,7 @@ def write_report(plan: Plan, runs: Sequence[Run], out: Path, workers: str) -> Pa
         short=conclusions(every),
         caution=cautions(every),
         tests=count_tests(every),
-        strengths=[(verdict.value, WORDS[verdict], STRENGTH[verdict]) for verdict in _TESTED],
+        strengths=[(verdict.value, wording.WORDS[verdict], wording.STRENGTH[verdict]) for verdict in _TESTED],
         fewest=FEWEST,
         level=round(100 * LEVEL),
         sections=_sections(plan, every),
@@ -138,7 +121,7 @@ def _sections(plan: Plan, every: Sequence[Group]) -> list[dict[str, Any]]:
     sections = []
     for at in range(0, len(every), len(plan.modes)):
         first = every[at]
-        given = measurements(first.mode, plan.backends[0])
+        given = wording.measurements(first.mode, plan.backends[0])
         sections.append(
             {
                 "title": first.sequence + ("" if len(plan.variants) == 1 else f" · {first.variant.name}"),
@@ -162,7 +145,7 @@ def _table(group: Group) -> dict[str, Any]:
         if not run.completed
     }
     return {
-        "title": measurements(group.mode, next(iter(group.runs))),
+        "title": wording.measurements(group.mode, next(iter(group.runs))),
         "rows": [_row(group, metric) for metric in group.shown],
         "reasons": sorted(reasons),
     }
@@ -170,7 +153,7 @@ def _table(group: Group) -> dict[str, Any]:
 
 def _row(group: Group, metric: Metric) -> dict[str, Any]:
     failed, label = [0] * len(group.runs), metric.title
-    means = [shown_spread(metric, *mean_figures(group.finite(b, metric.key))[:2]) for b in group.runs]
+    means = [wording.shown_spread(metric, *mean_figures(group.finite(b, metric.key))[:2]) for b in group.runs]
     if metric is COMPLETED:
         failed, label = list(map(group.failures, group.runs)), metric.label
         means = [(f"{group.trials - count} of {group.trials}", "") for count in failed]
@@ -182,12 +165,12 @@ def _cells(d: Difference) -> dict[str, str]:
     """A difference's cells; the badge's colour is the direction, its strength the verdict."""
     return {
         "verdict": d.verdict.value,
-        "direction": direction(d),
-        "words": badge(d.verdict, direction(d)),
-        "mean": shown_mean(d),
-        "interval": shown_interval(d),
-        "p": shown_p(d.p) if d.varies else "–",
-        "p_holm": shown_p(d.p_holm) if d.varies else "–",
+        "direction": wording.direction(d),
+        "words": wording.badge(d.verdict, wording.direction(d)),
+        "mean": wording.shown_mean(d),
+        "interval": wording.shown_interval(d),
+        "p": wording.shown_p(d.p) if d.varies else "–",
+        "p_holm": wording.shown_p(d.p_holm) if d.varies else "–",
     }
 
 
