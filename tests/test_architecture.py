@@ -5,21 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
-
-from tests.scripts import load_script
-
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.fixture(scope="module")
-def architecture():
-    return load_script("docs/make_architecture.py")
-
-
-def test_the_table_is_current(architecture):
-    text = (ROOT / architecture.PAGE).read_text(encoding="utf-8")
-    assert text == architecture.page(text, ROOT), "run: python docs/make_architecture.py"
 
 
 def test_the_files_that_the_page_names_exist():

@@ -74,10 +74,3 @@ def test_every_experiment_has_its_script(results):
 
 def test_the_first_page_has_the_readmes_results(results):
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == results.first_page()
-
-
-def test_the_api_pages_list_what_their_modules_hold():
-    make = load_script("docs/make_api.py")
-    for page in make.PAGES:
-        text = page.read_text(encoding="utf-8")
-        assert make.written(text) == text, f"docs/api/{page.name}: run python docs/make_api.py"
