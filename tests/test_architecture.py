@@ -1,4 +1,4 @@
-"""The picture of the rooms and their imports is that of the code as it is."""
+"""The files that the architecture page names exist."""
 
 from __future__ import annotations
 

@@ -19,16 +19,7 @@ from slam.files import whole_file
 from slam.geometry.se3 import inverse
 from slam.geometry.trajectory import Trajectory
 from slam.naming import unknown
-from slam.run.figures import (
-    draw_map,
-    draw_path,
-    is_revised,
-    place_of_truth,
-    position_errors,
-    stretch,
-    well_known,
-    widths,
-)
+from slam.run import figures
 from slam.run.run_data import RunData
 from slam.run.style import DASHES, backend_colours, repeated, stage_colour, stage_name, stages
 
@@ -252,16 +243,16 @@ def _path_panel(axis: Axes, runs: Sequence[RunData]) -> None:
     paths, truth = _in_one_world(runs)
     if truth is not None:
         axis.plot(*truth.positions[:, [0, 2]].T, "--", color=_TRUTH, lw=1.0, label="true path", zorder=3)
-    for colour, width, run, path in zip(_colours(runs), widths(len(runs), 2.0), runs, paths):
-        draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
+    for colour, width, run, path in zip(_colours(runs), figures.widths(len(runs), 2.0), runs, paths):
+        figures.draw_path(axis, run, path, run.name, color=colour, lw=width, alpha=0.75)
         axis.plot(*path.positions[:1, [0, 2]].T, "o", color=colour, ms=4)
-        if is_revised(run):
+        if figures.is_revised(run):
             final = path.poses[0] @ inverse(run.online.poses[0]) @ run.final.poses
             axis.plot(*final[:, [0, 2], 3].T, ":", color=colour, lw=0.7 * width, label=f"{run.name}, final")
     _set_title(axis, "Path from above, online unless said otherwise (dot: start)")
     axis.set(xlabel="right [m]", ylabel="forward [m]")
     shown = paths if truth is None else [*paths, truth]
-    if not stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
+    if not figures.stretch(axis, np.concatenate([path.positions[:, [0, 2]] for path in shown])):
         axis.set_aspect("equal", adjustable="datalim")
     axis.legend(frameon=False)
     axis.grid(color="0.9", lw=0.5)
@@ -273,10 +264,10 @@ def _colours(runs: Sequence[RunData]) -> list[str]:
 
 def _map_panel(axis: Axes, run: RunData, colour: str) -> None:
     """The map from above with ellipses."""
-    draw_map(axis, run, run.truth, colour)
+    figures.draw_map(axis, run, run.truth, colour)
     _widen(axis)
     axis.set_ylim(top=axis.get_ylim()[0] + _HEADROOM * float(np.ptp(axis.get_ylim())))
-    known, every = len(well_known(run)), len(run.positions)
+    known, every = len(figures.well_known(run)), len(run.positions)
     shown = "2σ ellipses" if known == every else f"2σ ellipses of the {known} that are well known"
     _set_title(axis, f"Map of {run.name}: {every} landmarks, {shown}")
     axis.legend(loc="upper left", ncols=2, fontsize="small", frameon=True, framealpha=0.8, edgecolor="none")
@@ -296,7 +287,7 @@ def _error_panels(axes: Sequence[Axes], runs: Sequence[RunData]) -> None:
     series = [_errors_of(run) for run in runs]
     shown = [error if known else sigma for _, error, sigma in series]
     factor, unit = _unit(max((float(np.nanmax(np.abs(values), initial=0.0)) for values in shown), default=0.0))
-    styles = zip(_colours(runs), repeated(DASHES, len(runs)), widths(len(runs), 1.1))
+    styles = zip(_colours(runs), repeated(DASHES, len(runs)), figures.widths(len(runs), 1.1))
     for (colour, dashes, width), run, (time, error, sigma) in zip(styles, runs, series):
         untracked = (run.online.stamps - run.online.stamps[:1])[~run.measured]
         for axis, e, s in zip(axes, factor * error.T, factor * sigma.T):
@@ -355,7 +346,7 @@ def _median_of_later(times: np.ndarray) -> float:
 def _errors_of(run: RunData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time, error and standard deviation; without truth the error is zero."""
     if run.truth is not None:
-        return position_errors(run, run.truth)
+        return figures.position_errors(run, run.truth)
     stamps = run.online.stamps
     return stamps - stamps[0], np.zeros((len(stamps), 3)), run.deviations
 
@@ -365,13 +356,13 @@ def _in_one_world(runs: Sequence[RunData]) -> tuple[list[Trajectory], Trajectory
     first = next((run for run in runs if run.truth is not None), None)
     if first is None or first.truth is None:
         return [run.online for run in runs], None
-    to_first = place_of_truth(first, first.truth)
+    to_first = figures.place_of_truth(first, first.truth)
     paths = []
     for run in runs:
         if run is first or run.truth is None:
             paths.append(run.online)
             continue
-        in_truth = inverse(place_of_truth(run, run.truth)) @ run.online.poses
+        in_truth = inverse(figures.place_of_truth(run, run.truth)) @ run.online.poses
         paths.append(Trajectory(run.online.stamps, to_first @ in_truth))
     return paths, Trajectory(first.truth.stamps, to_first @ first.truth.poses)
 
