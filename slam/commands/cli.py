@@ -95,8 +95,7 @@ def run_command(
     """Run one sequence through one back end."""
     from slam.commands.background_compilation import compiled_in_background
     from slam.commands.display import Progress
-    from slam.commands.folders import run_folder
-    from slam.commands.run import prepare, shown
+    from slam.commands.run import prepare, run_folder, shown
     from slam.errors import ConfigurationError
     from slam.files import noting_inputs
     from slam.outputs import require_outputs
@@ -155,8 +154,7 @@ def replay_command(
 ) -> None:
     """Give a back end the same measurements that another one was given."""
     from slam.commands.display import Progress
-    from slam.commands.folders import run_folder
-    from slam.commands.run import command_line
+    from slam.commands.run import command_line, run_folder
     from slam.config import SystemConfig
     from slam.outputs import require_outputs
     from slam.run.recording import load_recording

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from slam.config import SystemConfig
-from slam.errors import ConfigurationError
+from slam.errors import ConfigurationError, SlamError
 from slam.outputs import Output
 from slam.run import drawing
 from slam.run import viewer as viewing
@@ -20,6 +22,8 @@ from slam.sequences import Sequence as StereoSequence
 from slam.sequences import open_sequence
 
 _BACKEND, _FRONTEND = "ekf", "surf"
+RESULTS = Path("results")
+_LONGEST = 60  # characters of a sequence's name in a folder's
 
 
 def prepare(
@@ -90,3 +94,48 @@ def _repeated(before: Repeat, default: SystemConfig, frontend: str, backend: str
 def command_line() -> str:
     """The command that is running, as it can be typed again."""
     return shlex.join(["slam", *sys.argv[1:]])
+
+
+@contextmanager
+def run_folder(out: Path | None, sequence: str, backend: str) -> Iterator[Path]:
+    """The folder for a run; one that was made here is removed where nothing was written into it.
+
+    Args:
+        out: as asked for; None for ``results/<sequence>-<backend>-<n>`` with the first number that is free.
+        sequence: its name.
+        backend: name.
+
+    Raises:
+        SlamError: a folder cannot be made.
+    """
+    if out is not None:
+        yield out
+        return
+    folder = _claimed(f"{_short(sequence)}-{_short(backend)}")
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
+
+
+def _claimed(name: str) -> Path:
+    """A new folder of this name and the first free number; made here, so that no other run can take it."""
+    number = 1
+    while True:
+        folder = RESULTS / f"{name}-{number}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            if not RESULTS.is_dir():
+                raise SlamError(f"{RESULTS}: a file where the folder of all results should be; give --out") from None
+            number += 1
+        except OSError as error:
+            raise SlamError(f"cannot write to {folder}: {error.strerror or error}; give --out") from error
+
+
+def _short(text: str) -> str:
+    """A name for a folder: of a world its name alone."""
+    plain = re.sub(r"[^A-Za-z0-9._]+", "_", text.partition("?")[0]).strip("_.")
+    return plain[-_LONGEST:] or "run"
