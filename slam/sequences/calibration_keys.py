@@ -91,7 +91,7 @@ class Entries:
         for known, names, options in _FORMS:
             if not self.form and any(name in self._values for name in names):
                 self.form, self.options = known, options
-        zero = any(name in self._values for name in ("k0", "m0", "d0", "cameramatrix0", "camera0fx"))
+        zero = any(name in self._values for name in ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx"))
         counts = ("0", "1") if zero else ("1", "2")
         self._sides = [
             (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")

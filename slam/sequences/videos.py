@@ -17,8 +17,7 @@ from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halves
-from slam.sequences.quiet import quiet_libraries
+from slam.sequences.images import MOST_PIXELS, Size, halves, silent_opencv
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -50,7 +49,7 @@ class VideoPairs:
         paths = [path for path in (self.left, self.right) if path is not None]
         with ExitStack() as stack:
             videos = [stack.enter_context(open_video(path)) for path in paths]
-            with quiet_libraries():
+            with silent_opencv():
                 for _ in range(start):
                     for video in videos:
                         video.grab()
@@ -103,8 +102,8 @@ def open_video(path: Path) -> Iterator[Any]:
 
     require_content(path)  # a pipe would be waited for
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
-    with quiet_libraries():
-        capture = cv2.VideoCapture(str(path))
+    with silent_opencv():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
     try:
         if not capture.isOpened():
             raise SequenceError(f"{path}: not a readable video")
@@ -112,7 +111,7 @@ def open_video(path: Path) -> Iterator[Any]:
             raise SequenceError(f"{path}: frames of more than {MOST_PIXELS} pixels are not read")
         yield capture
     finally:
-        with quiet_libraries():
+        with silent_opencv():
             capture.release()
 
 
@@ -128,7 +127,7 @@ def _describe(path: Path) -> tuple[int, float, Size]:
             raise SequenceError(f"{path}: no frame of the video can be decoded")
         if count <= 0:
             count = 1
-            with quiet_libraries():
+            with silent_opencv():
                 while count < _MOST_FRAMES and video.grab():
                     count += 1
     return count, rate, (first.shape[1], first.shape[0])
@@ -139,7 +138,7 @@ def _next_grey(video: Any) -> np.ndarray | None:
     import cv2
 
     try:
-        with quiet_libraries():
+        with silent_opencv():
             good, image = video.read()
     except cv2.error:
         return None
