@@ -139,8 +139,7 @@ class SurfFrontend:
             return image
         import cv2
 
-        maps = self.rig.rectified.maps[side]
-        return cv2.remap(image, maps.x, maps.y, cv2.INTER_LINEAR)
+        return cv2.remap(image, self.rig.rectified.maps[side], None, cv2.INTER_LINEAR)
 
     def _rectified_mask(self, mask: NDArray) -> NDArray[np.uint8]:
         """The mask, 0 and 1, in the rectified left image."""
