@@ -21,7 +21,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences import rigs
-from slam.sequences.base import RecordedSequence
+from slam.sequences.base import RecordedSequence, delivered
 from slam.sequences.calibration import naming
 from slam.sequences.camera_info import rig_from_camera_infos
 from slam.sequences.faults import FaultLog
@@ -133,14 +133,7 @@ class RosPairs:
                 partner = next(right, None) if right_row >= 0 else None
                 if image is None:
                     return
-                if isinstance(image, SequenceError):
-                    faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {image}")
-                    continue
-                if isinstance(partner, SequenceError):
-                    line = f"frame {index} is given without its right image: {partner}"
-                    faults.report("right images unreadable, frames given without them", line)
-                    partner = None
-                yield StereoFrame(index, float(self.stamps[index]), image, partner)
+                yield from delivered(index, float(self.stamps[index]), image, partner, faults)
 
     def _images(
         self, bag: Bag, messages: Messages, rows: IntArray
