@@ -21,45 +21,6 @@ SIZE = (64, 48)
 # ------------------------------------------------------------------------------------------------ names, stamps
 
 
-def rename(folder: Path, names: list[str]) -> None:
-    for path, name in zip(sorted(folder.iterdir()), names, strict=True):
-        path.rename(folder / name)
-
-
-@pytest.mark.parametrize(
-    ("names", "stamps"),
-    [
-        ([f"{1_403_715_273_000_000_000 + i * 50_000_000}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
-        ([f"{1_403_715_273_000_000 + i * 50_000}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
-        ([f"{1_403_715_273_000 + i * 50}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
-        ([f"{2_000_000_000 * (i + 1)}.png" for i in range(6)], 2.0 * np.arange(1, 7)),
-        ([f"1403715273.{5 * i:02d}.png" for i in range(6)], 1_403_715_273 + 0.05 * np.arange(6)),
-        ([f"frame{i:04d}.png" for i in (3, 4, 5, 7, 8, 9)], 0.1 * np.array([0, 1, 2, 4, 5, 6])),
-        (["a.png", "b.png", "c.png", "d.png", "e.png", "f.png"], 0.1 * np.arange(6)),
-        ([f"{i:06d}_x0.png" for i in range(6)], 0.1 * np.arange(6)),
-    ],
-    ids=[
-        "nanoseconds",
-        "microseconds",
-        "milliseconds",
-        "since-the-start",
-        "seconds",
-        "numbers",
-        "letters",
-        "last-number-is-none",
-    ],
-)
-def test_names_give_stamps_or_numbers_or_order(two_folders: Path, names: list[str], stamps: np.ndarray) -> None:
-    for side in ("left", "right"):
-        rename(two_folders / side, names)
-    sequence = open_sequence(two_folders)
-    frames = list(sequence)
-    assert np.allclose([f.stamp for f in frames], stamps, atol=1e-6, rtol=0)
-    assert all(f.right is not None and f.right.mean() > f.left.mean() + 90 for f in frames)
-    assumed = any("10 frames per second assumed" in w for w in sequence.warnings)
-    assert assumed == (stamps[0] == 0)
-
-
 def test_times_and_rate_can_be_told(two_folders: Path) -> None:
     assert np.allclose(open_sequence(f"{two_folders}?fps=20").stamps, 0.05 * np.arange(6))
     (two_folders / "t.txt").write_text("".join(f"{7 + 0.3 * i}\n" for i in range(6)))

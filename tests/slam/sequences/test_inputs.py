@@ -34,53 +34,42 @@ def in_order(sequence) -> bool:
 # ------------------------------------------------------------------------------------------------ names
 
 
-@pytest.mark.parametrize(
-    ("left", "right", "stamps"),
-    [
-        (lambda i: f"{i + 7}_cam0.png", lambda i: f"{i + 7}_cam1.png", 0.1 * np.arange(6)),
-        (lambda i: f"frame{i + 7}_1226x370.png", lambda i: f"frame{i + 7}_1226x370.png", 0.1 * np.arange(6)),
-        (lambda i: f"seq{1 + i // 4}_{i % 4}.png", lambda i: f"seq{1 + i // 4}_{i % 4}.png", 0.1 * np.arange(6)),
-        (
-            lambda i: f"img_CAMERA1_{1261228749.918590 + 0.049999 * i:.6f}_left.png",
-            lambda i: f"img_CAMERA1_{1261228749.918590 + 0.049999 * i:.6f}_right.png",
-            1261228749.918590 + 0.049999 * np.arange(6),
-        ),
-        (lambda i: f"l_{10**18 + i * 10**8}_a.png", lambda i: f"r_{10**18 + i * 10**8}.png", 1e9 + 0.1 * np.arange(6)),
-        (
-            lambda i: f"cam-{1_700_000_000}.{97000 + 1500 * i}.png",  # microseconds without padding
-            lambda i: f"cam-{1_700_000_000}.{97000 + 1500 * i}.png",
-            1.7e9 + 0.097 + 0.0015 * np.arange(6),
-        ),
-        (lambda i: f"{9.95 + 0.05 * i:.3f}.png", lambda i: f"{9.951 + 0.05 * i:.3f}.png", 9.95 + 0.05 * np.arange(6)),
-        (
-            lambda i: f"20230405_120000_{90 * i:03d}.png",
-            lambda i: f"20230405_120000_{90 * i:03d}.png",
-            1680696000 + 0.09 * np.arange(6),
-        ),
-        (
-            lambda i: f"2023-04-05-12-00-{i // 2:02d}_{i}.png",  # counted on when the second is over
-            lambda i: f"2023-04-05-12-00-{i // 2:02d}_{i}.png",
-            0.1 * np.arange(6),
-        ),
-    ],
-    ids=[
-        "unpadded",
-        "size-in-name",
-        "two-numbers",
-        "malaga",
-        "inside",
-        "unpadded-usec",
-        "since-a-start",
-        "date",
-        "date-and-count",
-    ],
-)
-def test_names_are_read_as_numbers_and_stamps(two_folders: Path, left, right, stamps) -> None:
-    for side, name in (("left", left), ("right", right)):
-        rename(two_folders / side, name)
+NAMES = {  # of the left and the right images, and the stamps that they say; plain numbers count frames at 10 Hz
+    "nanoseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000_000 + i * 50_000_000, 1_403_715_273, 0.05),
+    "microseconds": ("{}", "{}", lambda i: 1_403_715_273_000_000 + i * 50_000, 1_403_715_273, 0.05),
+    "milliseconds": ("{}", "{}", lambda i: 1_403_715_273_000 + i * 50, 1_403_715_273, 0.05),
+    "since a start": ("{}", "{}", lambda i: 2_000_000_000 * (i + 1), 2.0, 2.0),
+    "seconds": ("1403715273.{:02d}", "1403715273.{:02d}", lambda i: 5 * i, 1_403_715_273, 0.05),
+    "seconds since a start": ("{:.3f}", "{:.3f}", lambda i: 9.95 + 0.05 * i, 9.95, 0.05),
+    "unpadded microseconds": (
+        "cam-1700000000.{}",
+        "cam-1700000000.{}",
+        lambda i: 97000 + 1500 * i,
+        1.7e9 + 0.097,
+        0.0015,
+    ),
+    "inside": ("l_{}_a", "r_{}", lambda i: 10**18 + i * 10**8, 1e9, 0.1),
+    "malaga": ("img_C1_{:.6f}_left", "img_C1_{:.6f}_right", lambda i: 1261228749.91 + 0.04 * i, 1261228749.91, 0.04),
+    "date": ("20230405_120000_{:03d}", "20230405_120000_{:03d}", lambda i: 90 * i, 1680696000, 0.09),
+    "numbers": ("frame{:04d}", "frame{:04d}", lambda i: 3 + i, 0.0, 0.1),
+    "unpadded": ("{}_cam0", "{}_cam1", lambda i: 7 + i, 0.0, 0.1),
+    "size in name": ("frame{}_1226x370", "frame{}_1226x370", lambda i: 7 + i, 0.0, 0.1),
+    "last number is none": ("{:06d}_x0", "{:06d}_x0", lambda i: i, 0.0, 0.1),
+    "letters": ("{}", "{}", "abcdef".__getitem__, 0.0, 0.1),
+    "two numbers": ("seq{0[0]}_{0[1]}", "seq{0[0]}_{0[1]}", lambda i: (1 + i // 4, i % 4), 0.0, 0.1),
+    "date and count": ("2023-04-05-12-00-{0[0]:02d}_{0[1]}",) * 2 + (lambda i: (i // 2, i), 0.0, 0.1),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_read_as_numbers_and_stamps(two_folders: Path, name: str) -> None:
+    left, right, number, first, step = NAMES[name]
+    for side, form in (("left", left), ("right", right)):
+        rename(two_folders / side, lambda i, form=form: form.format(number(i)) + ".png")
     sequence = open_sequence(two_folders)
     assert in_order(sequence)
-    assert np.allclose(sequence.stamps, stamps, atol=2e-6, rtol=0)
+    assert np.allclose(sequence.stamps, first + step * np.arange(6), atol=2e-6, rtol=0)
+    assert any("10 frames per second assumed" in w for w in sequence.warnings) == (first == 0)
 
 
 def test_a_guess_is_said_with_what_was_guessed(two_folders: Path) -> None:
