@@ -14,12 +14,9 @@ _RANGES = {  # least and largest values
     "threads": (1, 256),
     "octaves": (1, 4),
     "layers": (2, 3),
-    "grid": (1, 1000),
     "min_depth": (1e-6, 1e9),
     "max_depth": (1e-6, float("inf")),
     "epipolar": (0.1, 100.0),
-    "min_correlation": (0.0, 1.0),
-    "uniqueness": (0.0, 1.0),
 }
 
 
@@ -31,18 +28,14 @@ class SurfConfig:
         features: number of features aimed at in the left image.
         threshold: D_threshold at the start (paper A, III.A), on OpenCV's scale for 8-bit images.
         adaptive: adapt D_threshold from frame to frame to keep the number of features.
-        min_threshold, max_threshold: limits of D_threshold in the adaptation.
         octaves: number of octaves, 1 to 4 (paper A: 2).
         layers: number of layers searched in each octave, 2 or 3.
         descriptor: dimensions of the descriptors, 16 (paper A, III.B) or 64.
         upright: features have no orientation; for cameras that do not roll.
         localise: find position and size in a continuous scale space: features stay in place when the image moves
             or grows, at some cost in time.
-        grid: columns and rows of the grid over which features are spread; each cell has an equal share.
         min_depth, max_depth: range of depths [m] looked for in stereo matching; max_depth may be infinite.
         epipolar: largest distance of the right pixel from the epipolar line [px].
-        min_correlation: least normalised correlation of the left and right image patches.
-        uniqueness: largest ratio of ``1 - correlation`` of the best and the next best place on the epipolar line.
         threads: number of threads; the results do not depend on it.
 
     Raises:
@@ -52,29 +45,22 @@ class SurfConfig:
     features: int = 800
     threshold: float = 300.0
     adaptive: bool = True
-    min_threshold: float = 5.0
-    max_threshold: float = 20000.0
     octaves: int = 2
     layers: int = 2
     descriptor: int = 64
     upright: bool = True
     localise: bool = True
-    grid: tuple[int, int] = (8, 5)
     min_depth: float = 0.3
     max_depth: float = float("inf")
     epipolar: float = 1.5
-    min_correlation: float = 0.8
-    uniqueness: float = 0.8
     threads: int = 2
 
     def __post_init__(self) -> None:
         require_not_negative(self, _RANGES, "surf")
         if self.descriptor not in (16, 64):
             raise ConfigurationError(f"surf: descriptor must be 16 or 64, got {self.descriptor}")
-        object.__setattr__(self, "grid", (int(self.grid[0]), int(self.grid[1])))
-        for low, high in (("min_threshold", "max_threshold"), ("min_depth", "max_depth")):
-            if getattr(self, low) > getattr(self, high):
-                raise ConfigurationError(f"surf: {low} {getattr(self, low)} lies above {high} {getattr(self, high)}")
+        if self.min_depth > self.max_depth:
+            raise ConfigurationError(f"surf: min_depth {self.min_depth} lies above max_depth {self.max_depth}")
 
     @classmethod
     def with_options(cls, config: SurfConfig | None = None, **options: Any) -> SurfConfig:
