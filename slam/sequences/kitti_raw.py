@@ -58,7 +58,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
     """
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
-        cameras = choose_pair(folder, "image_{}", _PAIRS)
+        cameras = choose_pair(folder, _PAIRS)
         data = next((name for name in _DATA if (folder / f"image_{cameras[0]}" / name).exists()), _DATA[0])
         left_all, right_all = (numbered(folder / f"image_{c}" / data, faults) for c in cameras)
         path = times_file(folder, options, left_all.folder.parent / "timestamps.txt")

@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -79,15 +79,8 @@ def open_folder(path: Path, options: Given) -> RecordedSequence:
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
-@dataclass(frozen=True)
-class Messages:
-    """When the messages of a topic were taken and recorded, in the order of the recording.
-
-    Attributes:
-        topic: name.
-        stamps: of their headers (N,) [ns].
-        recorded: when they were written (N,) [ns].
-    """
+class Messages(NamedTuple):
+    """When the messages of a topic were taken, by their headers, and recorded, in the order of the recording [ns]."""
 
     topic: str
     stamps: IntArray
