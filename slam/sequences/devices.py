@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from slam.errors import SequenceError
-from slam.sequences.images import silent_opencv
+from slam.sequences.quiet import quiet_libraries
 
 _TIMEOUT = 5000  # [ms] for an answer from the network
 
@@ -48,7 +48,7 @@ def open_device(address: str, width: int | None = None, height: int | None = Non
     if "!" not in address and "://" not in address and os.path.isfile(address):  # noqa: PTH113 unlike Path's, no errors
         hint = f"with both images side by side it is run as '{address}?layout=sbs', at its own rate with --live"
         raise SequenceError(f"camera:{address}: a file, not a camera; {hint}")
-    with silent_opencv():
+    with quiet_libraries():
         if address.isdecimal() and len(address) < 4:
             capture = cv2.VideoCapture(int(address))
         elif "!" in address:
@@ -73,7 +73,7 @@ def read_image(device: Device) -> np.ndarray | None:
     import cv2
 
     try:
-        with silent_opencv():
+        with quiet_libraries():
             good, image = device.retrieve()
     except cv2.error:
         return None

@@ -6,14 +6,13 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from slam.errors import SequenceError
 from slam.files import read_bytes
+from slam.sequences.quiet import quiet_libraries
 
 Size = tuple[int, int]
 
@@ -26,20 +25,6 @@ MOST_PIXELS = 2**26
 _LARGEST = 8 * MOST_PIXELS  # bytes of a file
 _KINDS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")  # Pillow's names; PPM is PGM, too
 _PNG, _JPEG, _JPEG_SCAN, _JPEG_END = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", 0xDA, b"\xff\xd9"
-
-
-@contextmanager
-def silent_opencv() -> Iterator[None]:
-    """Keep OpenCV from printing what is about to be reported as an error of ours."""
-    import cv2
-
-    log = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging  # the place differs between its versions
-    level = log.getLogLevel()  # type: ignore[union-attr, unused-ignore]
-    log.setLogLevel(0)  # type: ignore[union-attr, unused-ignore]
-    try:
-        yield
-    finally:
-        log.setLogLevel(level)  # type: ignore[union-attr, unused-ignore]
 
 
 def read_image(path: Path, size: Size | None = None) -> np.ndarray:
@@ -70,9 +55,9 @@ def decode_image(data: bytes, what: str, size: Size | None = None) -> np.ndarray
     if fault:
         raise SequenceError(f"{what}: {fault}")
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    with silent_opencv():
+    with quiet_libraries():
         try:
-            image = cv2.imdecode(np.frombuffer(_without_profile(data), np.uint8), flags)
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except (cv2.error, SystemError, MemoryError) as error:
             raise SequenceError(f"{what}: cannot be decoded") from error
     if image is None:
@@ -132,12 +117,6 @@ def _header_size(data: bytes) -> Size | None:
         return MOST_PIXELS + 1, 1
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error):  # of damaged headers
         return None
-
-
-def _without_profile(data: bytes) -> bytes:
-    """A PNG without its colour profile, over many of which libpng prints a warning for every image."""
-    at = data.find(b"iCCP", 0, data.find(b"IDAT")) if data.startswith(_PNG) else -1
-    return data if at < 0 else data[: at - 4] + data[at + 8 + struct.unpack_from(">I", data, at - 4)[0] :]
 
 
 def _png_fault(data: bytes) -> str:

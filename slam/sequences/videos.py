@@ -17,7 +17,8 @@ from slam.files import require_content
 from slam.geometry.se3 import Array
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import FASTEST, SLOWEST
-from slam.sequences.images import MOST_PIXELS, Size, halves, silent_opencv
+from slam.sequences.images import MOST_PIXELS, Size, halves
+from slam.sequences.quiet import quiet_libraries
 
 #: Endings of video files, in lower case.
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg"})
@@ -49,7 +50,7 @@ class VideoPairs:
         paths = [path for path in (self.left, self.right) if path is not None]
         with ExitStack() as stack:
             videos = [stack.enter_context(open_video(path)) for path in paths]
-            with silent_opencv():
+            with quiet_libraries():
                 for _ in range(start):
                     for video in videos:
                         video.grab()
@@ -102,7 +103,7 @@ def open_video(path: Path) -> Iterator[Any]:
 
     require_content(path)  # a pipe would be waited for
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
-    with silent_opencv():
+    with quiet_libraries():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
     try:
         if not capture.isOpened():
@@ -111,7 +112,7 @@ def open_video(path: Path) -> Iterator[Any]:
             raise SequenceError(f"{path}: frames of more than {MOST_PIXELS} pixels are not read")
         yield capture
     finally:
-        with silent_opencv():
+        with quiet_libraries():
             capture.release()
 
 
@@ -127,7 +128,7 @@ def _describe(path: Path) -> tuple[int, float, Size]:
             raise SequenceError(f"{path}: no frame of the video can be decoded")
         if count <= 0:
             count = 1
-            with silent_opencv():
+            with quiet_libraries():
                 while count < _MOST_FRAMES and video.grab():
                     count += 1
     return count, rate, (first.shape[1], first.shape[0])
@@ -138,7 +139,7 @@ def _next_grey(video: Any) -> np.ndarray | None:
     import cv2
 
     try:
-        with silent_opencv():
+        with quiet_libraries():
             good, image = video.read()
     except cv2.error:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from slam.errors import SequenceError
 from slam.sequences.images import MOST_PIXELS, read_image
+from slam.sequences.quiet import quiet_libraries
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (90, 120)).astype(np.uint8), (0, 0), 1.5)
 
@@ -142,4 +144,10 @@ def test_a_damaged_image_prints_nothing(tmp_path, capfd):
     extra = chunk + struct.pack(">I", zlib.crc32(chunk[4:]))
     (tmp_path / "a.png").write_bytes(png(64, 48, zlib.compress(bytes(65 * 48)), extra))
     assert read_image(tmp_path / "a.png").shape == (48, 64)
+    (tmp_path / "b.png").write_bytes(png(64, 48, b"no stream"))
+    with pytest.raises(SequenceError, match=r"b\.png"):
+        read_image(tmp_path / "b.png")
     assert capfd.readouterr().err == ""
+    with quiet_libraries(), quiet_libraries():
+        os.write(2, b"libpng warning: x\nanother thread's line\n")
+    assert capfd.readouterr().err == "another thread's line\n"
