@@ -66,6 +66,8 @@ def _range_fault(number: Any, limits: tuple[float, float] | None, positive: bool
     """What is required of a number outside its range; empty if it is inside."""
     whole = isinstance(number, numbers.Integral)
     text = "positive and finite" if positive else "finite and not negative"
+    if limits is not None and number == limits[1]:  # which may be infinite
+        return ""
     if not (whole or np.isfinite(number)) or number < 0 or (positive and number == 0):
         return text
     least, most = limits or (0 if whole else LEAST, _COUNTS if whole else MOST)

@@ -27,6 +27,11 @@ def patch_windows(spread: float) -> NDArray[np.float32]:
     return out
 
 
+def _work_space() -> tuple[NDArray[np.float32], ...]:
+    """Samples; the patch and its gradients; the other image's patch; the weighted patch and gradients."""
+    return np.empty(25 * 26, np.float32), *np.empty((7, _LARGEST), np.float32)
+
+
 @helper
 def _window_of(size):
     """Number and half width of the window [px] in which a feature of some size [px] is compared."""
@@ -56,8 +61,9 @@ def _sample(pixels, shape, x, y, half, rows, lanes, out):
 
 
 @vector_helper
-def _gradients(sampled, rows, lanes, patch, gx, gy):
+def _gradients(space, rows, lanes):
     """The patch, and its gradients, of samples that are one pixel wider on each side."""
+    sampled, patch, gx, gy = space[:4]
     stride, half = lanes + 2, np.float32(0.5)
     for r in range(rows):
         at, to = np.uint64((r + 1) * stride + 1), np.uint64(r * lanes)
@@ -69,12 +75,13 @@ def _gradients(sampled, rows, lanes, patch, gx, gy):
 
 
 @vector_helper
-def _template(patch, dx, dy, window, k, n, weighted, gx, gy):
+def _template(space, window, k, n):
     """Weighted patch and gradients of n pixels, and their weighted sums.
 
     Returns the patch's mean and standard deviation; the gradients' sums x, y; the normal matrix xx, xy, yy of the
     gradients less their means; and the sums of gradients times patch, x, y.
     """
+    _, patch, dx, dy, _, weighted, gx, gy = space
     zero = np.float32(0.0)
     s, ss, sx, sy, xx, xy, yy, px, py = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for j in range(n):
@@ -95,8 +102,9 @@ def _template(patch, dx, dy, window, k, n, weighted, gx, gy):
 
 
 @vector_helper
-def _compare(patch, window, k, n, weighted, gx, gy):
-    """Weighted sums over a patch: itself, its square, times the template, times the gradients x and y."""
+def _compare(space, window, k, n):
+    """Weighted sums over the other patch: itself, its square, times the template, times the gradients x and y."""
+    patch, weighted, gx, gy = space[4:]
     zero = np.float32(0.0)
     s, ss, both, px, py = zero, zero, zero, zero, zero
     for j in range(n):
@@ -108,11 +116,6 @@ def _compare(patch, window, k, n, weighted, gx, gy):
         px += gx[j] * v
         py += gy[j] * v
     return s, np.sqrt(max(ss - s * s, zero)), both, px, py
-
-
-def _work_space() -> tuple[NDArray[np.float32], ...]:
-    """For samples; the patch and its gradients; the weighted patch and gradients."""
-    return np.empty(25 * 26, np.float32), *(np.empty(_LARGEST, np.float32) for _ in range(7))
 
 
 def refine(
@@ -147,52 +150,46 @@ def refine(
     out = np.full((len(uv), 2), np.nan)
     _refine(
         left.reshape(-1), right.reshape(-1), left.shape, uv, size, start, min_correlation, np.array(reaches),
-        windows, *_work_space(), out,
+        windows, _work_space(), out,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _refine(
-    left, right, shape, uv, size, start, min_correlation, reaches, windows, sampled, patch, dx, dy, other, weighted,
-    gx, gy, out,
-):  # fmt: skip
-    """The same into `out`, on flat images and with work space."""
+def _refine(left, right, shape, uv, size, start, min_correlation, reaches, windows, space, out):
+    """The same into `out`, on flat images."""
     for i in range(len(uv)):
         x0, y0 = start[i, 0], start[i, 1]
         if np.isnan(x0):
             continue
         k, half = _window_of(size[i])
         rows, lanes = 2 * half + 1, 2 * half + 2
-        if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, sampled):
+        if not _sample(left, shape, uv[i, 0], uv[i, 1], half + 1, rows + 2, lanes + 2, space[0]):
             continue
-        _gradients(sampled, rows, lanes, patch, dx, dy)
+        _gradients(space, rows, lanes)
         for w in range(len(windows)):
             x0, y0 = _best_place(
-                right, shape, x0, y0, reaches[w, 0], reaches[w, 1], min_correlation, windows[w], k, half, patch, dx,
-                dy, other, weighted, gx, gy,
-            )  # fmt: skip
+                right, shape, x0, y0, reaches[w, 0], reaches[w, 1], min_correlation, windows[w], k, half, space
+            )
             if np.isnan(x0):
                 break
             out[i, 0], out[i, 1] = x0, y0
 
 
 @helper
-def _best_place(
-    image, shape, x0, y0, reach_x, reach_y, min_correlation, window, k, half, patch, dx, dy, other, weighted, gx, gy
-):
+def _best_place(image, shape, x0, y0, reach_x, reach_y, min_correlation, window, k, half, space):
     """Where an image looks like a patch with these gradients, by steps from (x0, y0); NaN where nowhere."""
     rows, lanes = 2 * half + 1, 2 * half + 2
     n = rows * lanes
-    mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(patch, dx, dy, window, k, n, weighted, gx, gy)
+    mean, deviation, sx, sy, xx, xy, yy, tx, ty = _template(space, window, k, n)
     det = xx * yy - xy * xy
     if deviation < 1e-3 or det <= 1e-4 * (xx + yy) ** 2:
         return np.nan, np.nan
     x, y = x0, y0
     for _ in range(_ITERATIONS):
-        if not _sample(image, shape, x, y, half, rows, lanes, other):
+        if not _sample(image, shape, x, y, half, rows, lanes, space[4]):
             break
-        mean2, deviation2, both, px, py = _compare(other, window, k, n, weighted, gx, gy)
+        mean2, deviation2, both, px, py = _compare(space, window, k, n)
         if deviation2 < 1e-3:
             break
         gain = deviation / deviation2
@@ -252,29 +249,27 @@ def align_patches(
     out = np.full((len(start), 2), np.nan)
     _align_patches(
         image.reshape(-1), image.shape, patches, centres, warps, size, start, min_correlation, reach, windows,
-        *_work_space(), out,
+        _work_space(), out,
     )  # fmt: skip
     return out
 
 
 @kernel
 def _align_patches(
-    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, sampled, patch, dx, dy, other,
-    weighted, gx, gy, out,
+    image, shape, patches, centres, warps, size, start, min_correlation, reach, windows, space, out
 ):  # fmt: skip
-    """The same into `out`, on a flat image and with work space."""
+    """The same into `out`, on a flat image."""
     for i in range(len(start)):
         if not (0.0 <= start[i, 0] < shape[1] and 0.0 <= start[i, 1] < shape[0]):
             continue
         k, half = _window_of(size[i])
         rows, lanes = 2 * half + 1, 2 * half + 2
-        if not _sample_warped(patches[i], centres[i], warps[i], half + 1, rows + 2, lanes + 2, sampled):
+        if not _sample_warped(patches[i], centres[i], warps[i], half + 1, rows + 2, lanes + 2, space[0]):
             continue
-        _gradients(sampled, rows, lanes, patch, dx, dy)
+        _gradients(space, rows, lanes)
         out[i, 0], out[i, 1] = _best_place(
-            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, patch, dx, dy,
-            other, weighted, gx, gy,
-        )  # fmt: skip
+            image, shape, start[i, 0], start[i, 1], reach, reach, min_correlation, windows, k, half, space
+        )
 
 
 @helper

@@ -49,12 +49,13 @@ def _place_boxes(px, py, cosine, sine, extent, least, last_x, last_y, stride, pl
 
 
 @vector_helper
-def _average_cells(pixels, shape, x, y, width, angle, extent, place, weight, cells):
+def _average_cells(pixels, shape, x, y, width, angle, extent, space):
     """Cell means of a turned square about (x, y): axis-aligned boxes of whole pixels about the turned cell centres.
 
     Boxes are `extent` [px] wide, each edge rounded by itself. Those that would leave the image are pushed back to its
     edge.
     """
+    place, weight, cells, _ = space
     n = cells.shape[0]
     cosine, sine = np.float32(width * np.cos(angle)), np.float32(width * np.sin(angle))
     least = np.int32(extent)  # rounding makes boxes this wide, or a pixel wider
@@ -73,8 +74,9 @@ def _average_cells(pixels, shape, x, y, width, angle, extent, place, weight, cel
 
 
 @vector_helper
-def _sum_areas(cells, weights, sums, descriptors, row):
+def _sum_areas(space, weights, descriptors, row):
     """Wavelet sums of the sub-areas, scaled to a unit vector; zero where the square has no texture."""
+    cells, sums = space[2:]
     areas = weights.shape[0] // 5
     total = np.float32(0.0)
     for p in range(areas):
@@ -121,18 +123,17 @@ def describe(
         weights: see `gaussian_weights`.
     """
     out = np.zeros((len(x), 4 * (len(weights) // _SUB) ** 2), np.float32)
-    n, lanes = weights.shape[0] + 1, weights.shape[1]
-    _describe(
-        integral.reshape(-1), integral.shape, x, y, size, angle, box, weights, np.zeros((3, lanes), np.int32),
-        np.zeros(lanes, np.float32), np.zeros((n, lanes + _LANES), np.float32), np.zeros((4, lanes), np.float32), out,
-    )  # fmt: skip
+    rows, lanes = weights.shape  # of wavelets; work space is for boxes, cells, and sums of sub-areas
+    cells, sums = np.zeros((rows + 1, lanes + _LANES), np.float32), np.zeros((4, lanes), np.float32)
+    space = np.zeros((3, lanes), np.int32), np.zeros(lanes, np.float32), cells, sums
+    _describe(integral.reshape(-1), integral.shape, x, y, size, angle, box, weights, space, out)
     return out
 
 
 @kernel
-def _describe(pixels, shape, x, y, size, angle, box, weights, place, weight, cells, sums, out):
-    """The same into `out`, on the flat integral image and with work space."""
+def _describe(pixels, shape, x, y, size, angle, box, weights, space, out):
+    """The same into `out`, on the flat integral image."""
     for k in range(x.size):
         width = size[k] * (1.2 / 9.0)
-        _average_cells(pixels, shape, x[k], y[k], width, angle[k], box * width, place, weight, cells)
-        _sum_areas(cells, weights, sums, out, k)
+        _average_cells(pixels, shape, x[k], y[k], width, angle[k], box * width, space)
+        _sum_areas(space, weights, out, k)

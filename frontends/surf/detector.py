@@ -97,8 +97,10 @@ def _mark_peaks(above, before, row, after, below, rival, threshold, mask):
 
 
 @helper
-def _neighbourhood(ring, slots, j, pixels, stride, step, centres, offsets, weights, layer, row, cube):
+def _neighbourhood(space, j, pixels, stride, filters, layer, row):
     """Fill the 3x3x3 responses around a peak of a layer; False as soon as one of them is not below it."""
+    _, ring, _, _, _, slots, cube, _ = space
+    step = filters.step
     inner = ring.shape[0]
     v = ring[layer - 1, slots[1], j]
     for dl in range(-1, 2):
@@ -111,11 +113,11 @@ def _neighbourhood(ring, slots, j, pixels, stride, step, centres, offsets, weigh
                     cube[dl + 1, di, dj] = r
     for dl in range(-1, 2, 2):
         if not 1 <= layer + dl <= inner:
-            centre = centres[layer + dl]
+            centre = filters.centre[layer + dl]
             for k in _CENTRE_FIRST:
                 di, dj = k // 3, k % 3
                 at = step * (row - centre + di - 1) * stride + step * (j - centre + dj - 1)
-                r, _ = _response_at(pixels, np.uint64(at), offsets, weights, layer + dl)
+                r, _ = _response_at(pixels, np.uint64(at), filters.offsets, filters.weights, layer + dl)
                 if r >= v:
                     return False
                 cube[dl + 1, di, dj] = r
@@ -145,8 +147,9 @@ def _newton_step(c, offset):
 
 
 @helper
-def _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube, offset, out, found):
+def _collect(space, pixels, stride, filters, layer, row, out, found):
     """Candidates among the marked columns of a row, appended to `out`; returns how many `out` holds then."""
+    _, _, _, words, mask, _, cube, offset = space
     step, size = filters.step, filters.sizes[layer]
     ds = size - filters.sizes[layer - 1]
     centre = filters.centre[layer]
@@ -154,9 +157,7 @@ def _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube
         if words[word] == 0:
             continue
         for j in range(8 * word, 8 * word + 8):
-            if mask[j] == 0 or not _neighbourhood(
-                ring, slots, j, pixels, stride, step, filters.centre, filters.offsets, filters.weights, layer, row, cube
-            ):
+            if mask[j] == 0 or not _neighbourhood(space, j, pixels, stride, filters, layer, row):
                 continue
             if not _newton_step(cube, offset):
                 continue
@@ -195,26 +196,26 @@ def detect_octave(
     columns, inner = (integral.shape[1] - 1) // filters.step, len(filters.sizes) - 2
     top, bottom = first_row - 1 - filters.centre[-2], last_row + 1 + filters.centre[-2]  # that inner layers read
     phases = column_phases(integral, filters.step, max(top, 0) * filters.step, (bottom + 1) * filters.step)
-    buffer = np.empty(3 * filters.step * phases.shape[2], np.int32)
     ring = np.zeros((inner, 3, columns + 1), np.float32)  # three rows of each layer; row i lies in slot i % 3
     words = np.zeros((columns + 7) // 8, np.uint64)
+    space = (
+        np.empty(3 * filters.step * phases.shape[2], np.int32), ring, ring.reshape(-1), words, words.view(np.uint8),
+        np.empty(3, np.int64), np.empty((3, 3, 3)), np.empty(3),
+    )  # fmt: skip
     # At most one strict maximum in each 2x2 block of a layer.
     out = np.empty((max(16, (last_row - first_row + 2) * (columns + 1) // 4 * inner), COLUMNS))
     found = _scan(
         integral.reshape(-1), integral.shape, phases.reshape(-1), phases.shape, filters, np.float32(threshold),
-        first_row, last_row, buffer, ring, ring.reshape(-1), words, words.view(np.uint8), np.empty(3, np.int64),
-        np.empty((3, 3, 3)), np.empty(3), out,
+        first_row, last_row, space, out,
     )  # fmt: skip
     out[:found, 5] = octave
     return out[:found].copy()
 
 
 @kernel
-def _scan(
-    pixels, shape, phases, phases_shape, filters, threshold, first_row, last_row, buffer, ring, responses, words, mask,
-    slots, cube, offset, out,
-):  # fmt: skip
-    """The search itself, on flat arrays and with work space; returns the number of candidates written to `out`."""
+def _scan(pixels, shape, phases, phases_shape, filters, threshold, first_row, last_row, space, out):
+    """The search itself, on flat arrays; returns the number of candidates written to `out`."""
+    buffer, ring, responses, _, mask, slots, _, _ = space
     step, height, width, stride = filters.step, shape[0] - 1, shape[1] - 1, shape[1]
     rows, columns, inner = height // step, width // step, ring.shape[0]
     found = np.int64(0)
@@ -242,5 +243,5 @@ def _scan(
                 ring[layer - 1, slots[0], a:b], here[a - 1 :], here[a:b], here[a + 1 :], ring[layer - 1, slots[2], a:b],
                 rival, threshold, mask[a:b],
             )  # fmt: skip
-            found = _collect(ring, slots, words, mask, pixels, stride, filters, layer, row, cube, offset, out, found)
+            found = _collect(space, pixels, stride, filters, layer, row, out, found)
     return found

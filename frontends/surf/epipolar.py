@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,7 @@ _CONTENDER = 0.5  # cost: correlation of a column below which the places beside 
 _NEIGHBOURS = 2  # columns about the best place that are no rivals of it
 
 
-@dataclass(frozen=True, eq=False)
-class HalfImage:
+class HalfImage(NamedTuple):
     """An image at half resolution, ready for correlation.
 
     Attributes:
@@ -101,11 +100,12 @@ def _zero_mean_patch(image, x, y, patch):
 
 
 @vector_helper
-def _correlate(pixels, weights, stride, y, first, count, patch, own, scores):
+def _correlate(image, stride, y, first, count, patch, own, scores):
     """Normalised correlation of a patch with the places at columns first, first + 1, ... of row y, into `scores`.
 
     It goes on to the end of a vector register: `_LANES - 1` more scores and, in the images, pixels at most.
     """
+    pixels, weights = image.flat_pixels, image.flat_weight
     count = (count + _LANES - 1) & -_LANES
     for j in range(count):
         scores[j] = np.float32(0.0)
@@ -147,12 +147,13 @@ def _place_of(scores, value):
 
 
 @vector_helper
-def _height(pixels, weights, between, stride, y, x, patch, own, score, side):
+def _height(image, stride, y, x, patch, own, score, side):
     """Best correlation of a patch with the places from column x, where it is `score`, to half a column to a side.
 
     Linear interpolation between two patches, that correlate by `alike` with each other and by s and n with a third,
     correlates with that by the root of ``(s² - 2 alike s n + n²) / (1 - alike²)`` at best, if that lies between them.
     """
+    pixels, weights, between = image.flat_pixels, image.flat_weight, image.between
     zero, one, area = np.float32(0.0), np.float32(1.0), np.float32(_SIDE * _SIDE)
     sa, sb, bb, ab, product = zero, zero, zero, zero, zero
     for r in range(_SIDE):
@@ -177,12 +178,13 @@ def _height(pixels, weights, between, stride, y, x, patch, own, score, side):
 
 
 @vector_helper
-def _unresolved(pixels, between, stride, x, y):
+def _unresolved(image, stride, x, y):
     """How much too low a height may be by noise, and by linear interpolation between places half a column apart.
 
     It is half of the share of the variance about (x, y) that interpolation between whole columns leaves unexplained,
     over 4: a share that falls with the fourth power of the distance in smooth images, and more slowly in coarse ones.
     """
+    pixels, between = image.flat_pixels, image.between
     s, ss, ee = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for r in range(_SIDE):
         start = np.uint64((y - _HALF + r) * stride + x - _HALF)
@@ -198,17 +200,18 @@ def _unresolved(pixels, between, stride, x, y):
 
 
 @helper
-def _search(pixels, weights, between, stride, rows, band, y, first, last, patch, own, scores):
+def _search(image, shape, band, y, first, last, patch, own, scores):
     """Best place of a patch in columns first..last of the rows within `band` of y: x, y and correlation.
 
     And the heights of it and of its rival, the correlations with the best places between columns, by which they are
     compared: a wrong place of a repeated pattern that happens to lie on a whole column looks better than the true one
     that does not.
     """
+    rows, stride = shape
     begin, count = np.int64(0), last - first + 1  # no literal number: Numba would compile a helper again for it
     found, row, score, height, rival = -1, -1, np.float32(-1.0), np.float32(-1.0), np.float32(-1.0)
     for v in range(max(y - band, _HALF), min(y + band, rows - 1 - _HALF) + 1):
-        _correlate(pixels, weights, stride, v, first, count, patch, own, scores)
+        _correlate(image, stride, v, first, count, patch, own, scores)
         best, better = _largest(scores, begin, count), False
         if best > score:
             better = True
@@ -223,7 +226,7 @@ def _search(pixels, weights, between, stride, rows, band, y, first, last, patch,
             if not itself and (not apart or s < _CONTENDER or s < before or s < after):
                 continue
             side = 1 if after >= before or first + j == _HALF else -1
-            top = _height(pixels, weights, between, stride, v, first + j, patch, own, s, side)
+            top = _height(image, stride, v, first + j, patch, own, s, side)
             if itself:
                 height = top
             else:
@@ -258,42 +261,34 @@ def search_rows(
     """
     out = np.full((len(uv), 2), np.nan)
     patch, scores = np.empty((_SIDE, _SIDE), np.float32), np.empty(left.pixels.shape[1] + _LANES, np.float32)
-    _search_rows(
-        left.pixels, left.weight, left.flat_pixels, left.flat_weight, left.between, right.pixels, right.weight,
-        right.flat_pixels, right.flat_weight, right.between, uv, 0.5 * low, 0.5 * high, band, min_correlation,
-        uniqueness, patch, scores, out,
-    )  # fmt: skip
+    _search_rows(left, right, uv, 0.5 * low, 0.5 * high, band, min_correlation, uniqueness, patch, scores, out)
     return out
 
 
 @kernel
-def _search_rows(
-    left, left_weight, a, aw, a_between, right, right_weight, b, bw, b_between, uv, low, high, band, min_correlation,
-    uniqueness, patch, scores, out,
-):  # fmt: skip
-    """The same into `out`, at half resolution, with the images flat as well, and with work space."""
-    height, width = left.shape
+def _search_rows(left, right, uv, low, high, band, min_correlation, uniqueness, patch, scores, out):
+    """The same into `out`, at half resolution, with work space for a patch and the scores of a row."""
+    height, width = left.pixels.shape
     for i in range(len(uv)):
         px, py = 0.5 * (uv[i, 0] - 0.5), 0.5 * (uv[i, 1] - 0.5)
         x, y = int(np.rint(px)), int(np.rint(py))
-        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left_weight[y, x] == 0.0:
+        if not (_HALF <= x < width - _HALF and _HALF <= y < height - _HALF) or left.weight[y, x] == 0.0:
             continue
         found, row = x, y
         for back in range(2):  # to the right image, and from there to the left one again
             if back:
-                image, own, pixels, weights, between = right, right_weight[row, found], a, aw, a_between
-                unresolved = _unresolved(b, b_between, width, found, row)
+                here, there = right, left
                 from_, to = np.floor(found + low), np.ceil(found + high)
             else:
-                image, own, pixels, weights, between = left, left_weight[row, found], b, bw, b_between
-                unresolved = _unresolved(a, a_between, width, found, row)
+                here, there = left, right
                 from_, to = np.floor(found - high), np.ceil(found - low)
             first, last = max(_HALF, int(from_)), min(width - 1 - _HALF, int(to))
             if last <= first and not back:
                 break
-            _zero_mean_patch(image, found, row, patch)
+            unresolved, own = _unresolved(here, width, found, row), here.weight[row, found]
+            _zero_mean_patch(here.pixels, found, row, patch)
             place, line, score, best, rival = _search(
-                pixels, weights, between, width, height, band, row, first, last, patch, own, scores
+                there, here.pixels.shape, band, row, first, last, patch, own, scores
             )
             if score < min_correlation or 1.0 - best > uniqueness * (1.0 - rival - unresolved):
                 break

@@ -23,6 +23,10 @@ from slam.geometry.rig import StereoRig
 
 _SURPLUS = 1.35  # cost: features detected for each one needed, to have a choice when spreading them
 _CHOICE = 1.5  # cost: features localised for each one kept: some prove to be no maxima
+_THRESHOLDS = 5.0, 20000.0  # limits of the D_threshold that is adapted
+_GRID = 8, 5  # cost: columns and rows over which features are spread: each cell has an equal share
+_CORRELATION = 0.8  # least one of the left and the right patch
+_UNIQUENESS = 0.8  # largest ratio of 1 - correlation of the best and the next best place on the epipolar line
 _TRIES = 4  # cost: detections at most in one image
 _REACH = 3.0  # largest sub-pixel correction along the row [px]
 _FINE_REACH = 1.5  # largest further correction by the narrow window, either way [px]
@@ -60,7 +64,7 @@ class SurfFrontend:
         self._surf = Surf(
             config.threshold, config.octaves, config.layers, config.descriptor, config.upright, config.threads
         )
-        self._threshold = float(np.clip(config.threshold, config.min_threshold, config.max_threshold))
+        self._threshold = float(np.clip(config.threshold, *_THRESHOLDS))
         self._white = FullScale()
         self._windows = np.stack([patch_windows(0.4), patch_windows(0.3)])  # a wide and a narrow one
         self._mask = None if mask is None else self._rectified_mask(np.asarray(mask))
@@ -108,9 +112,9 @@ class SurfFrontend:
         self, images: ImagePair, patches: Patches, warps: NDArray, uv_left: NDArray, uv_right: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Where patches are in a later pair of images, see `slam.interfaces.AligningFrontend`."""
-        least, size = self.config.min_correlation, patches.size
+        size = patches.size
         left = align_patches(
-            images.left, patches.images, patches.centres, warps, size, uv_left, least, _REACH, self._windows[0]
+            images.left, patches.images, patches.centres, warps, size, uv_left, _CORRELATION, _REACH, self._windows[0]
         )
         if images.right is None:
             return left, np.full_like(left, np.nan)
@@ -139,8 +143,7 @@ class SurfFrontend:
             return image
         import cv2
 
-        maps = self.rig.rectified.maps[side]
-        return cv2.remap(image, maps.x, maps.y, cv2.INTER_LINEAR)
+        return cv2.remap(image, self.rig.rectified.maps[side], None, cv2.INTER_LINEAR)
 
     def _rectified_mask(self, mask: NDArray) -> NDArray[np.uint8]:
         """The mask, 0 and 1, in the rectified left image."""
@@ -170,7 +173,7 @@ class SurfFrontend:
             threshold = self._threshold
             keypoints = self._surf.detect_in(integral, white, self._mask, threshold)
             if c.adaptive:
-                self._threshold = adapted_threshold(threshold, len(keypoints), target, c.min_threshold, c.max_threshold)
+                self._threshold = adapted_threshold(threshold, len(keypoints), target, *_THRESHOLDS)
             if 2 * len(keypoints) >= target or self._threshold >= threshold:
                 break
         return keypoints, threshold
@@ -185,7 +188,7 @@ class SurfFrontend:
 
     def _spread(self, keypoints: Keypoints, limit: int) -> Keypoints:
         """At most `limit` features, spread over the image."""
-        return keypoints.select(spread(keypoints.uv, limit, self.config.grid, self.rig.width, self.rig.height))
+        return keypoints.select(spread(keypoints.uv, limit, _GRID, self.rig.width, self.rig.height))
 
     def _match(self, views: list[_View], images: ImagePair, uv: NDArray, size: NDArray) -> NDArray[np.float64]:
         """Right pixels (N, 2) of left features in the rectified images, NaN where unmatched."""
@@ -194,7 +197,7 @@ class SurfFrontend:
         band = max(int(np.rint(0.5 * (c.epipolar - _OWN_BAND))), 0)
         left, right = views[0].half, views[1].half
         assert left is not None and right is not None
-        start = search_rows(left, right, uv, low, high, band, _COARSE * c.min_correlation, c.uniqueness)
+        start = search_rows(left, right, uv, low, high, band, _COARSE * _CORRELATION, _UNIQUENESS)
         found = self._refine(images, uv, size, start)
         disparity = uv[:, 0] - found[:, 0]
         off_line = np.abs(found[:, 1] - uv[:, 1]) > c.epipolar
@@ -207,7 +210,7 @@ class SurfFrontend:
         assert images.right is not None
         # Beside a depth edge a narrow window sees less of the other surface; where it fails the wide one stands.
         reaches = (_REACH, c.epipolar), (_FINE_REACH, _FINE_REACH)
-        return refine(images.left, images.right, uv, size, start, c.min_correlation, reaches, self._windows)
+        return refine(images.left, images.right, uv, size, start, _CORRELATION, reaches, self._windows)
 
     def _disparities(self) -> tuple[float, float]:
         """Range of disparities [px] of the rectified pair for the range of depths."""

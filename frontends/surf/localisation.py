@@ -68,11 +68,13 @@ def _response(parts, lanes, x, size):
 
 
 @helper
-def _responses(pixels, stride, x, y, size, step, wide, corners, fractions, parts, lanes, out, layer, row):
+def _responses(pixels, stride, x, y, size, step, wide, space, layer, row):
     """Responses of a filter at (x, y) and, if `wide`, `step` to its left and right; it must lie inside the image.
 
     The vertical part of the filters is common to the three.
     """
+    corners, fractions, parts, cube, _, _, _ = space
+    lanes = parts.size // 3
     half = 0.5 * size + (step if wide else 0.0)
     first = np.int64(x + 0.5 - half)
     n = (np.int64(x + 0.5 + half) + 1 + _LANES - first) & -_LANES
@@ -82,11 +84,11 @@ def _responses(pixels, stride, x, y, size, step, wide, corners, fractions, parts
         corners[k], fractions[k] = np.uint64(whole * stride + first), v - whole
     _vertical_parts(pixels, np.uint64(stride), corners, fractions, n, parts, np.uint64(lanes))
     for j in range(0 if wide else 1, 3 if wide else 2):
-        out[layer, row, j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
+        cube[layer, row, j] = _response(parts, lanes, x + 0.5 - first + (j - 1) * step, size)
 
 
 @helper
-def _sample(pixels, stride, x, y, size, bend, corners, fractions, parts, lanes, cube):
+def _sample(pixels, stride, x, y, size, bend, space):
     """Responses about (x, y, size), as cube[size, y, x]: those of the gradient and, if `bend`, of the curvature."""
     step = _STEP * size
     for layer in range(3):
@@ -95,14 +97,13 @@ def _sample(pixels, stride, x, y, size, bend, corners, fractions, parts, lanes, 
             if bend or sides:
                 wide = sides == 2 or (bend and sides == 1)
                 v, scale = y + (row - 1) * step, size + (layer - 1) * _SIZE_STEP * size
-                _responses(
-                    pixels, stride, x, v, scale, step, wide, corners, fractions, parts, lanes, cube, layer, row
-                )  # fmt: skip
+                _responses(pixels, stride, x, v, scale, step, wide, space, layer, row)
 
 
 @helper
-def _inverse_curvature(c, hessian, inverse):
+def _inverse_curvature(space):
     """Inverse of the Hessian (3, 3) of the responses, in units of the finite differences; False unless a maximum."""
+    c, hessian, inverse = space[3:6]
     v = 2.0 * c[1, 1, 1]
     xx, yy, ss = c[1, 1, 0] + c[1, 1, 2] - v, c[1, 0, 1] + c[1, 2, 1] - v, c[0, 1, 1] + c[2, 1, 1] - v
     xy = 0.25 * (c[1, 2, 2] - c[1, 0, 2] - c[1, 2, 0] + c[1, 0, 0])
@@ -137,18 +138,19 @@ def localise(
     """
     out = np.full((len(x), 4), np.nan)
     lanes = int(_WIDEST * size.max(initial=0.0)) + 2 * _LANES
-    _localise(
-        integral.reshape(-1), integral.shape, x, y, size, reach, np.empty(10, np.uint64), np.empty(10),
-        np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), out,
+    space = (  # corners of a filter, vertical parts, responses, their Hessian and its inverse, and a step
+        np.empty(10, np.uint64), np.empty(10), np.empty(3 * lanes), np.empty((3, 3, 3)), np.empty((3, 3)),
+        np.empty((3, 3)), np.empty(3),
     )  # fmt: skip
+    _localise(integral.reshape(-1), integral.shape, x, y, size, reach, space, out)
     return out
 
 
 @kernel
-def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube, hessian, inverse, step, out):
-    """The same into `out`, on the flat integral image and with work space."""
+def _localise(pixels, shape, x, y, size, reach, space, out):
+    """The same into `out`, on the flat integral image."""
     rows, stride = shape
-    lanes = parts.size // 3
+    cube, _, inverse, step = space[3:]
     for i in range(x.size):
         u, v, s = x[i], y[i], size[i]
         for k in range(_ITERATIONS):
@@ -157,8 +159,8 @@ def _localise(pixels, shape, x, y, size, reach, corners, fractions, parts, cube,
                 break
             # The curvature changes little on the way: it is measured twice, at the start and after two steps.
             bend = k == 0 or k == 2
-            _sample(pixels, stride, u, v, s, bend, corners, fractions, parts, lanes, cube)
-            if bend and not _inverse_curvature(cube, hessian, inverse):
+            _sample(pixels, stride, u, v, s, bend, space)
+            if bend and not _inverse_curvature(space):
                 break
             gx, gy = 0.5 * (cube[1, 1, 2] - cube[1, 1, 0]), 0.5 * (cube[1, 2, 1] - cube[1, 0, 1])
             gs = 0.5 * (cube[2, 1, 1] - cube[0, 1, 1])

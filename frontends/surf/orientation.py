@@ -65,8 +65,9 @@ def _degrees(x, y, out, n):
 
 
 @helper
-def _sample_gradients(pixels, rows, stride, x, y, s, disc, lefts, tops, gx, gy):
+def _sample_gradients(pixels, rows, stride, x, y, s, disc, space):
     """Weighted Haar wavelet responses (x right, y UP) of the samples inside the image; returns how many there are."""
+    lefts, tops, gx, gy = space[:4]
     half = int(np.rint(2.0 * s))
     side = 2 * half
     for k in range(-RADIUS, RADIUS + 1):
@@ -94,12 +95,13 @@ def _sample_gradients(pixels, rows, stride, x, y, s, disc, lefts, tops, gx, gy):
 
 
 @helper
-def _strongest_window(gx, gy, degrees, n, bins, sums):
+def _strongest_window(space, n, bins):
     """Direction [rad] of the largest sum of gradients within a window of 60°, moved in steps of 5°; first one wins.
 
     A window holds the whole degrees less than 30 from its centre. Gradients are summed by bins first; a window is
     then the difference of two running sums, which go on beyond the full circle by a window's width.
     """
+    gx, gy, degrees, sums = space[2:]
     for k in range(sums.shape[1]):  # a slice would take longer to compile
         sums[0, k] = sums[1, k] = 0.0
     for i in range(n):
@@ -133,21 +135,19 @@ def orientations(
         size: their sizes (N,) [px].
     """
     out = np.full(len(x), np.nan)
-    samples = len(DISC.weights)
-    _orientations(
-        integral.reshape(-1), integral.shape, x, y, size, DISC, np.empty(2 * RADIUS + 1, np.int64),
-        np.empty(2 * RADIUS + 1, np.int64), np.empty(samples, np.float32), np.empty(samples, np.float32),
-        np.empty(samples, np.int32), np.empty((2, _BINS + _WINDOW + 1)), out,
-    )  # fmt: skip
+    (lefts, tops), n = np.empty((2, 2 * RADIUS + 1), np.int64), len(DISC.weights)
+    gx, gy = np.empty((2, n), np.float32)
+    space = lefts, tops, gx, gy, np.empty(n, np.int32), np.empty((2, _BINS + _WINDOW + 1))
+    _orientations(integral.reshape(-1), integral.shape, x, y, size, DISC, space, out)
     return out
 
 
 @kernel
-def _orientations(pixels, shape, x, y, size, disc, lefts, tops, gx, gy, degrees, sums, out):
-    """The same into `out`, on the flat integral image and with work space."""
+def _orientations(pixels, shape, x, y, size, disc, space, out):
+    """The same into `out`, on the flat integral image."""
     for i in range(x.size):
         s = size[i] * (1.2 / 9.0)
-        count = _sample_gradients(pixels, shape[0], shape[1], x[i], y[i], s, disc, lefts, tops, gx, gy)
-        _degrees(gx, gy, degrees, count)
+        count = _sample_gradients(pixels, shape[0], shape[1], x[i], y[i], s, disc, space)
+        _degrees(space[2], space[3], space[4], count)
         if count > 0:
-            out[i] = _strongest_window(gx, gy, degrees, count, disc.bins, sums)
+            out[i] = _strongest_window(space, count, disc.bins)

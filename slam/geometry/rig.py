@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +22,6 @@ _FISHEYE_ZOOM = 0.7  # focal length of a fisheye's rectified rig: 2 · atan(0.5 
 def quarter_turn(turns: int) -> Array:
     """Rotation (3, 3) that takes camera axes to those of an image turned so many quarters anticlockwise."""
     return np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns % 4)
-
-
-class RectificationMaps(NamedTuple):
-    """Remapping tables for one camera, float32 (H, W): where each rectified pixel lies in the raw image."""
-
-    x: np.ndarray
-    y: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,14 +333,14 @@ class RectifiedRig:
         return target.project(rays @ R.T)
 
     @cached_property
-    def maps(self) -> tuple[RectificationMaps, RectificationMaps]:
+    def maps(self) -> tuple[np.ndarray, np.ndarray]:
         """Tables for ``cv2.remap``, left and right."""
         v, u = np.mgrid[: self.rig.height, : self.rig.width]
         grid = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
         tables = []
         for uv in (self.unrectify_left(grid), self.unrectify_right(grid)):
             table = np.nan_to_num(uv, nan=-1.0).astype(np.float32).reshape(*u.shape, 2)
-            tables.append(RectificationMaps(table[..., 0].copy(), table[..., 1].copy()))
+            tables.append(np.ascontiguousarray(table))
         return tables[0], tables[1]
 
 

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from slam.data import StereoFrame
+from slam.errors import SequenceError
 from slam.geometry.rig import StereoRig, quarter_turn
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
@@ -88,6 +89,24 @@ class FrameSource(Protocol):
     def read(self, start: int, stop: int, faults: FaultLog) -> Iterator[StereoFrame]:
         """Decode frames `start` to `stop`; unreadable images are reported to `faults` and skipped."""
         ...
+
+
+Image = np.ndarray | SequenceError | None
+
+
+def delivered(index: int, stamp: float, left: Image, right: Image, faults: FaultLog) -> Iterator[StereoFrame]:
+    """The frame of two images, of which each may be the error of reading it: a left one costs the frame, a right one
+    itself.
+    """
+    if isinstance(left, SequenceError):
+        faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {left}")
+        return
+    if isinstance(right, SequenceError):
+        line = f"frame {index} is given without its right image: {right}"
+        faults.report("right images unreadable, frames given without them", line)
+        right = None
+    if left is not None:
+        yield StereoFrame(index, stamp, left, right)
 
 
 @dataclass(frozen=True, eq=False)

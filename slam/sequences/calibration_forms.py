@@ -1,7 +1,8 @@
-"""Calibration files as nested entries: YAML, JSON, XML, and the makers' own files of ZED and depthai cameras."""
+"""Calibration files as nested entries: YAML, JSON, XML, KITTI's, and the makers' own of ZED and depthai cameras."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
@@ -13,7 +14,7 @@ import numpy as np
 
 from slam.errors import CalibrationError
 from slam.geometry.se3 import inverse, pose
-from slam.sequences.calibration import NO_NUMBERS, naming
+from slam.sequences.calibration import NO_NUMBERS, naming, read_kitti
 from slam.sequences.images import Size
 from slam.sequences.yaml_files import read_calibration, read_yaml
 
@@ -32,6 +33,11 @@ def read_form(path: Path, images: Size | None) -> tuple[Mapping[str, Any], str]:
         return _read_xml(path, text), ""
     if text.startswith("[") and "[STEREO]" in text.upper():
         return _read_zed(path, text, images), "ZED's"
+    kitti = re.search(r"^(P|P_rect_0)0[: ]", text, re.MULTILINE)
+    if kitti:
+        rows = read_kitti(path)
+        named = {f"P{side}": rows.get(f"{kitti[1]}{side}") for side in (0, 1)}
+        return {**named, "size": rows.get("S_rect_00")}, "KITTI's"
     root = read_yaml(path)
     if "residual_scale" in root or "self_calibration" in root:
         raise CalibrationError(

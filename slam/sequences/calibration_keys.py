@@ -91,7 +91,7 @@ class Entries:
         for known, names, options in _FORMS:
             if not self.form and any(name in self._values for name in names):
                 self.form, self.options = known, options
-        zero = any(name in self._values for name in ("k0", "m0", "d0", "cameramatrix0", "camera0fx"))
+        zero = any(name in self._values for name in ("k0", "m0", "d0", "p0", "cameramatrix0", "camera0fx"))
         counts = ("0", "1") if zero else ("1", "2")
         self._sides = [
             (word, word[0], count, f"cam{side}", f"camera{count}", f"{word}camera")
@@ -110,7 +110,7 @@ class Entries:
     def numbers(self, role: str, side: int | None, shape: tuple[int, ...] | None) -> Array | None:
         """A finite array of this shape, flat where that is None; None where there is no such entry."""
         found = self.find(role, side)
-        return None if found is None else _array(found[1], found[0], shape)
+        return None if found is None else array(found[1], found[0], shape)
 
     def names(self) -> str:
         """All entries as they are written."""
@@ -199,7 +199,7 @@ def _extrinsics(entries: Entries, unit: float) -> Array | None:
     """``T_right_left`` (4, 4) [m], by whichever entries say it; None where none does."""
     R, t = entries.numbers("R", None, None), entries.numbers("T", None, (3,))
     if R is not None and t is not None:
-        rotation = so3_exp(R) if R.size == 3 else _array(R, "R", (3, 3))
+        rotation = so3_exp(R) if R.size == 3 else array(R, "R", (3, 3))
         return pose(rotation, unit * t)
     if any(all(entries.find(role, side) is not None for side in (0, 1)) for role in ("T_BS", "T_cam_imu")):
         return inverse(body_pose(entries, 1)) @ body_pose(entries, 0)
@@ -282,11 +282,11 @@ def _camera(entries: Entries, side: int, size: Size, fisheye: bool) -> PinholeCa
     if found is None:
         values = [_number(entries.find(name, side) or (name, None)) for name in _PLAIN]
     else:
-        values = _array(found[1], found[0], None).tolist()
+        values = array(found[1], found[0], None).tolist()
         if len(values) != 4 and entries.form in _MISSING:
             raise CalibrationError(f"{found[0]} has {len(values)} numbers, 4 expected")
         if len(values) != 4:
-            values = _array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+            values = array(found[1], found[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     D = entries.numbers("D", side, None)
     if D is None:
         names = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
@@ -317,10 +317,10 @@ def _number(entry: tuple[str, Any]) -> float:
     name, value = entry
     if isinstance(value, bool) or value is None:
         raise CalibrationError(f"{name} is no number")
-    return float(_array(value, name, ())[()])
+    return float(array(value, name, ())[()])
 
 
-def _array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
+def array(value: Any, name: str, shape: tuple[int, ...] | None) -> Array:
     """A finite array of the shape; flat where that is None. OpenCV's matrices are ``{rows, cols, data}``."""
     data = value.get("data") if isinstance(value, Mapping) else value
     try:

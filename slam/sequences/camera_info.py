@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from slam.errors import CalibrationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.sequences.calibration import NO_NUMBERS, require_possible
-from slam.sequences.calibration_keys import Entries, rig_of
+from slam.sequences.calibration_keys import Entries, array, rig_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +38,13 @@ class CameraInfo:
         Raises:
             CalibrationError: it holds what no calibration holds, or only a part of the image is given.
         """
-        K, D, R, P = (
-            _matrix(message, name, shape) for name, shape in (("K", (3, 3)), ("D", (-1,)), ("R", (3, 3)), ("P", (3, 4)))
-        )
+        shapes = {"K": (3, 3), "D": None, "R": (3, 3), "P": (3, 4)}
+        matrices = {n: array(getattr(message, n, getattr(message, n.lower(), None)), n, s) for n, s in shapes.items()}
         size = int(message.width), int(message.height)
         roi = int(message.roi.width), int(message.roi.height)
         if max(int(message.binning_x), int(message.binning_y)) > 1 or roi not in ((0, 0), size):
             raise CalibrationError("binning and regions of interest are not supported")
-        return cls(size, str(message.distortion_model), K, D, R, P)
+        return cls(size, str(message.distortion_model), **matrices)
 
     @property
     def baseline_term(self) -> float:
@@ -73,14 +69,3 @@ def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, rectified: bool, 
         for i in (left, right)
     ]
     return rig_of(Entries(files), left.size, unit, rectified, False)
-
-
-def _matrix(message: Any, name: str, shape: tuple[int, ...]) -> Array:
-    value = getattr(message, name, None)
-    value = getattr(message, name.lower(), None) if value is None else value
-    try:
-        matrix = np.array(value, float).reshape(shape)
-    except NO_NUMBERS:
-        raise CalibrationError(f"{name} is no matrix of shape {shape}") from None
-    require_possible(matrix, name)
-    return matrix

@@ -28,7 +28,7 @@ from slam.sequences.source import (
     read_times,
     times_file,
 )
-from slam.sequences.tables import read_rows, shorten, stamp_and_name
+from slam.sequences.tables import numbers, read_rows, shorten, stamp_and_name
 from slam.sequences.truth import LARGEST, require_truth
 
 #: The motion capture of EuRoC's rooms is good to a millimetre (Burri et al., 2016). Its markers on the vehicle are some
@@ -142,12 +142,9 @@ def _camera_path(path: Path, T_body_camera: Array, faults: FaultLog) -> Trajecto
 
 def _pose_row(text: str) -> list[float]:
     """Stamp [ns], position [m] and quaternion (w, x, y, z) of a row; further columns do not count."""
-    try:
-        row = [float(word) for word in text.split(",")[:8]]
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) < 8 or not np.isfinite(row).all() or max(map(abs, row[4:])) > 2:
-        raise ValueError(f"{shorten(text)} is not stamp, position and unit quaternion")
-    if abs(np.linalg.norm(row[4:]) - 1) > 0.1 or max(map(abs, row[1:4])) > LARGEST or not 0 <= row[0] < 2**63:
-        raise ValueError(f"{shorten(text)} is not stamp, position and unit quaternion")
+    what = "stamp, position and unit quaternion"
+    row = numbers(text, 8, what, ",")
+    far = max(map(abs, row[1:4])) > LARGEST or max(map(abs, row[4:])) > 2
+    if far or abs(np.linalg.norm(row[4:]) - 1) > 0.1 or not 0 <= row[0] < 2**63:
+        raise ValueError(f"{shorten(text)} is not {what}")
     return row

@@ -9,22 +9,8 @@ from typing import Any
 from slam.errors import ConfigurationError
 
 #: Options that every recorded format knows; which of them mean something depends on what is found in the folder.
-OPTIONS = frozenset(
-    {
-        "kind",
-        "mask",
-        "calibration",
-        "unit",
-        "rectified",
-        "fisheye",
-        "tolerance",
-        "times",
-        "fps",
-        "left",
-        "right",
-        "layout",
-    }
-)
+_CALIBRATION, _IMAGES = {"calibration", "unit", "rectified", "fisheye"}, {"left", "right", "layout", "mask"}
+OPTIONS = frozenset({"kind", "tolerance", "times", "fps"} | _CALIBRATION | _IMAGES)
 
 #: Frame rates that are believed [1/s].
 SLOWEST, FASTEST = 1e-3, 1e5

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import numpy as np
 
 from slam.errors import SequenceError
 from slam.files import read_bytes
-from slam.sequences.image_headers import JPEG_SCAN, JPEG_START, PNG_SIGNATURE, Size, header_size
 from slam.sequences.quiet import quiet_libraries
+
+Size = tuple[int, int]
 
 #: Endings of image files, in lower case.
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp"})
@@ -20,7 +23,8 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".t
 MOST_PIXELS = 2**26
 
 _LARGEST = 8 * MOST_PIXELS  # bytes of a file
-_JPEG_END = b"\xff\xd9"
+_KINDS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")  # Pillow's names; PPM is PGM, too
+_PNG, _JPEG, _JPEG_SCAN, _JPEG_END = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", 0xDA, b"\xff\xd9"
 
 
 def read_image(path: Path, size: Size | None = None) -> np.ndarray:
@@ -86,11 +90,10 @@ def _fault(data: bytes, expected: Size | None) -> str:
     """What is wrong with the bytes of an image file, as far as its frame shows; empty if nothing."""
     if not data:
         return "the file is empty"
-    if data.startswith(PNG_SIGNATURE) and (fault := _png_fault(data)):
+    fault = _png_fault(data) if data.startswith(_PNG) else _jpeg_fault(data) if data.startswith(_JPEG) else ""
+    if fault:
         return fault
-    if data.startswith(JPEG_START) and (fault := _jpeg_fault(data)):
-        return fault
-    size = header_size(data)
+    size = _header_size(data)
     if size is None:
         return "not a readable image"
     if expected is not None and size != expected:
@@ -100,9 +103,25 @@ def _fault(data: bytes, expected: Size | None) -> str:
     return ""
 
 
+def _header_size(data: bytes) -> Size | None:
+    """Width and height that an image file's header names; None for no image of a known kind, or a damaged one."""
+    from PIL import Image
+
+    if data.startswith(_PNG):
+        width, height = struct.unpack_from(">II", data, 16)
+        return width, height
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            return Image.open(io.BytesIO(data), formats=_KINDS).size
+    except Image.DecompressionBombError:
+        return MOST_PIXELS + 1, 1
+    except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error):  # of damaged headers
+        return None
+
+
 def _png_fault(data: bytes) -> str:
     """Walk the chunks: each must be whole and agree with its checksum, and the last one must be IEND."""
-    at = len(PNG_SIGNATURE)
+    at = len(_PNG)
     view = memoryview(data)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -110,7 +129,7 @@ def _png_fault(data: bytes) -> str:
         if end > len(data):
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
-        if zlib.crc32(view[at + 4 : end - 4]) != checksum:
+        if zlib.crc32(view[at + 4 : end - 4]) != checksum or (at == len(_PNG) and data[12:16] != b"IHDR"):
             return f"PNG is damaged at byte {at}"
         if data[at + 4 : at + 8] == b"IEND":
             return ""
@@ -120,10 +139,10 @@ def _png_fault(data: bytes) -> str:
 
 def _jpeg_fault(data: bytes) -> str:
     """Walk the segments to the first scan (an embedded preview is jumped over) and look for the end mark."""
-    at = len(JPEG_START)
+    at = len(_JPEG)
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], struct.unpack_from(">H", data, at + 2)[0]
-        if marker == JPEG_SCAN:
+        if marker == _JPEG_SCAN:
             return "" if data.rfind(_JPEG_END, at) >= 0 else f"JPEG is cut off after {len(data)} bytes"
         at += 1 if marker == 0xFF else 2 + length
     return f"JPEG is cut off or damaged at byte {min(at, len(data))}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,17 +34,9 @@ OXTS_NOISE = TruthNoise(rotation=float(np.radians(0.03)), translation=0.02, moun
 _PAIRS = (("0", "1"), ("2", "3"))  # grey first, colour where there is no grey
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where the files of a sequence are.
-
-    Attributes:
-        name: of the sequence.
-        left, right: folders of the images.
-        cameras: their numbers.
-        calibration: the file.
-        times: the file, which may be missing.
-        poses: files of which the first that is there has the truth.
+class _Layout(NamedTuple):
+    """Where the files of a sequence are: of the images, the calibration and the times; the first that is there of
+    `poses` has the truth. The cameras are numbers.
     """
 
     name: str
@@ -68,7 +61,7 @@ def _is_tracking(folder: Path) -> bool:
 def _layout(folder: Path) -> _Layout:
     """Where the files are, of KITTI odometry or of KITTI tracking."""
     if not _is_tracking(folder):
-        a, b = choose_pair(folder, "image_{}", _PAIRS)
+        a, b = choose_pair(folder, _PAIRS)
         poses = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
         left, right = (folder / f"image_{camera}" for camera in (a, b))
         return _Layout(folder.name, left, right, (a, b), folder / "calib.txt", folder / "times.txt", poses)
@@ -96,28 +89,29 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
         left, source = pair_up(left_all, right_all, options, faults, read_times(path, faults), by_number=True)
         size = source.first_size()
         rig, T_reference_left = _rig(folder, where, size, options)
-        truth = _ground_truth(where, left, source.stamps, T_reference_left, faults)
+        poses = next((path for path in where.poses if path.is_file()), None)
+        truth = None if poses is None else read_poses(poses, left, source.stamps, T_reference_left, faults)
     kind = options.get("kind", "driving")
     noise = replace(OXTS_NOISE, wheels=kind == "driving")
     return RecordedSequence(where.name, "kitti", kind, rig, replace(source, size=size), truth, None, warnings, noise)
 
 
-def choose_pair(folder: Path, pattern: str, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
+def choose_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
     """The first pair of cameras of which both folders are there.
 
     Raises:
         SequenceError: no pair is complete.
     """
     for left, right in pairs:
-        if all((folder / pattern.format(c)).is_dir() for c in (left, right)):
+        if all((folder / f"image_{c}").is_dir() for c in (left, right)):
             return left, right
-    names = [pattern.format(c) for p in pairs for c in p]
+    names = [f"image_{c}" for p in pairs for c in p]
     there = [n for n in names if (folder / n).is_dir()]
     files = [n for n in names if (folder / n).is_file()]
     if files:
         raise SequenceError(f"{folder / files[0]}: a file where a folder of images should be")
     found = f"only {', '.join(there)} is there" if there else "no folder of images is there"
-    wanted = " or ".join(f"{pattern.format(a)} and {pattern.format(c)}" for a, c in pairs)
+    wanted = " or ".join(f"image_{a} and image_{c}" for a, c in pairs)
     raise SequenceError(f"{folder}: two cameras are needed ({wanted}), {found}")
 
 
@@ -134,14 +128,6 @@ def _rig(folder: Path, where: _Layout, size: Size, options: Given) -> tuple[Ster
         T_reference_left = pose(np.eye(3), -projection_offset(P_left))
         rig = read_rig(named, size, options) if named else rig_from_projections(P_left, P_right, size)
         return rig, T_reference_left
-
-
-def _ground_truth(
-    where: _Layout, left: Listing, stamps: Array, T_reference_left: Array, faults: FaultLog
-) -> Trajectory | None:
-    """Poses by frame number, from ``poses.txt`` inside or ``poses/NAME.txt`` beside ``sequences``."""
-    path = next((p for p in where.poses if p.is_file()), None)
-    return None if path is None else read_poses(path, left, stamps, T_reference_left, faults)
 
 
 def read_poses(

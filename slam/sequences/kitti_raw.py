@@ -28,7 +28,7 @@ from slam.sequences.names import MOST_FRAMES
 from slam.sequences.oxts import read_oxts
 from slam.sequences.rigs import calibration_files, read_rig
 from slam.sequences.source import RATE, Listing, numbered, pair_up, read_times, times_file
-from slam.sequences.tables import date_time, read_rows, shorten
+from slam.sequences.tables import date_time, numbers, read_rows, shorten
 from slam.sequences.truth import require_truth
 
 #: Synchronised drives have one of a hundred OXTS records a second for each frame, the nearest one [s].
@@ -58,7 +58,7 @@ def open_folder(folder: Path, options: Given) -> RecordedSequence:
     """
     warnings: list[str] = []
     with FaultLog(warnings) as faults:
-        cameras = choose_pair(folder, "image_{}", _PAIRS)
+        cameras = choose_pair(folder, _PAIRS)
         data = next((name for name in _DATA if (folder / f"image_{cameras[0]}" / name).exists()), _DATA[0])
         left_all, right_all = (numbered(folder / f"image_{c}" / data, faults) for c in cameras)
         path = times_file(folder, options, left_all.folder.parent / "timestamps.txt")
@@ -144,13 +144,8 @@ def _gps(path: Path, times: Array | None, faults: FaultLog) -> Array | None:
 
 def _gps_row(text: str) -> list[float]:
     """Frame number and three coordinates [m]."""
-    try:
-        row = [float(word) for word in text.split()]
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    if len(row) != 4 or not np.isfinite(row).all() or not 0 <= row[0] <= MOST_FRAMES or row[0] != int(row[0]):
-        raise ValueError(f"{shorten(text)} is not frame, forward, right, third")
-    if max(map(abs, row)) > MOST_FRAMES:
+    row = numbers(text, 4, "frame, forward, right, third", exactly=True)
+    if row[0] < 0 or row[0] != int(row[0]) or max(map(abs, row)) > MOST_FRAMES:
         raise ValueError(f"{shorten(text)} is not frame, forward, right, third")
     return row
 
@@ -189,21 +184,18 @@ def _ground_truth(
 
 def _poses_360(path: Path, stamps: dict[int, float], faults: FaultLog) -> Trajectory | None:
     """KITTI-360's path of the rectified left camera: rows of a frame's number and 16 numbers of its pose."""
-
-    def parse(text: str) -> list[float]:
-        row = [float(word) for word in text.split()]
-        if len(row) != 17 or not np.isfinite(row).all():
-            raise ValueError(f"{shorten(text)} is not a frame and its pose")
-        return row
-
     try:
-        rows = [row for row in read_rows(path, parse, faults) if row is not None and row[0] in stamps]
+        rows = [row for row in read_rows(path, _row_of_360, faults) if row is not None and row[0] in stamps]
         table = np.array(sorted(rows)).reshape(-1, 17)
         times = np.array([stamps[int(number)] for number in table[:, 0]])
         return require_truth(Trajectory(times, table[:, 1:].reshape(-1, 4, 4)), path)
     except (SequenceError, TrajectoryError) as error:
         faults.report("ground truth", f"{error}; there is no ground truth")
         return None
+
+
+def _row_of_360(text: str) -> list[float]:
+    return numbers(text, 17, "a frame and its pose", exactly=True)
 
 
 def _extrinsics(path: Path) -> Array:

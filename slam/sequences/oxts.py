@@ -12,7 +12,7 @@ from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory
 from slam.sequences.faults import FaultLog
 from slam.sequences.source import number_of
-from slam.sequences.tables import date_time, read_rows, shorten
+from slam.sequences.tables import date_time, numbers, read_rows, shorten
 
 _EARTH_RADIUS = 6378137.0  # [m], equatorial, as the data set's development kit has it
 
@@ -79,13 +79,10 @@ def _record(file: Path, faults: FaultLog) -> list[float] | None:
 
 def _six_numbers(text: str) -> list[float]:
     """The first six numbers of a row."""
-    try:
-        row = [float(word) for word in text.split()[:6]]
-    except ValueError:
-        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
-    angles = (*row[1:2], *row[3:])
-    if len(row) < 6 or not np.isfinite(row).all() or abs(row[0]) >= 90 or max(map(abs, angles)) > 360:
-        raise ValueError(f"{shorten(text)} is not latitude, longitude, altitude, roll, pitch, yaw")
+    what = "latitude, longitude, altitude, roll, pitch, yaw"
+    row = numbers(text, 6, what)
+    if abs(row[0]) >= 90 or max(map(abs, (row[1], *row[3:]))) > 360:
+        raise ValueError(f"{shorten(text)} is not {what}")
     return row
 
 

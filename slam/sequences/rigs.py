@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from slam.errors import CalibrationError, ConfigurationError
 from slam.files import expanded
 from slam.geometry.rig import StereoRig
-from slam.sequences.calibration import kitti_matrix, naming, read_kitti, rig_from_projections
+from slam.sequences.calibration import naming
 from slam.sequences.calibration_keys import read_entries, rig_of
 from slam.sequences.given import flag
 from slam.sequences.images import Size
 from slam.sequences.source import require_size
-from slam.sequences.yaml_files import read_calibration
 
 #: Options of the formats whose calibration is in a file that can be named.
 OPTIONS = frozenset({"calibration", "unit", "rectified", "fisheye"})
@@ -83,22 +81,14 @@ def read_rig(paths: Sequence[Path], size: Size | None, options: Mapping[str, str
         SequenceError: the images are of another size than the calibration is for.
     """
     unit = metres_per_unit(options)
-    form = "KITTI's"
-    allowed: tuple[str, ...] = ()
-    kitti = re.search(r"^(P|P_rect_0)0[: ]", read_calibration(paths[0]), re.MULTILINE) if len(paths) == 1 else None
-    entries = None if kitti else read_entries(paths, size)
-    if entries is not None:
-        form, allowed = entries.form, entries.options
+    entries = read_entries(paths, size)
     rectified, fisheye = flag(options, "rectified"), flag(options, "fisheye")
-    foreign = sorted(({"rectified", "fisheye"} | ({"unit"} if unit != 1 else set())) & set(options) - set(allowed))
+    given = {"rectified", "fisheye"} | ({"unit"} if unit != 1 else set())
+    foreign = sorted((given & set(options)) - set(entries.options))
     if foreign:
-        raise ConfigurationError(f"option {foreign[0]!r} does nothing with {paths[0]}, which is {form}")
-    if kitti:
-        rig = _kitti_rig(paths[0], kitti[1], size)
-    else:
-        assert entries is not None
-        with naming(paths[-1]):
-            rig = rig_of(entries, size, unit, rectified, fisheye)
+        raise ConfigurationError(f"option {foreign[0]!r} does nothing with {paths[0]}, which is {entries.form}")
+    with naming(paths[-1]):
+        rig = rig_of(entries, size, unit, rectified, fisheye)
     if size is not None:
         require_size(size, rig, paths[0])
     return rig
@@ -114,19 +104,6 @@ def metres_per_unit(options: Mapping[str, str]) -> float:
     if unit not in _UNITS:
         raise ConfigurationError(f"unit must be one of {', '.join(_UNITS)}, got {unit!r}")
     return _UNITS[unit]
-
-
-def _kitti_rig(path: Path, prefix: str, size: Size | None) -> StereoRig:
-    """The rig of KITTI's grey cameras; the file of raw drives names the size of the images."""
-    rows = read_kitti(path)
-    with naming(path):
-        left, right = (kitti_matrix(rows, f"{prefix}{side}", (3, 4)) for side in (0, 1))
-        if "S_rect_00" in rows:
-            width, height = kitti_matrix(rows, "S_rect_00", (2,))
-            size = int(width), int(height)
-        if size is None:
-            raise CalibrationError("names no image size: give size=(width, height)")
-        return rig_from_projections(left, right, size)
 
 
 def calibration_files(folder: Path, options: Mapping[str, str]) -> list[Path]:

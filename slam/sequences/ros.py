@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray
 from slam.sequences import rigs
-from slam.sequences.base import RecordedSequence
+from slam.sequences.base import RecordedSequence, delivered
 from slam.sequences.calibration import naming
 from slam.sequences.camera_info import rig_from_camera_infos
 from slam.sequences.faults import FaultLog
@@ -79,15 +79,8 @@ def open_folder(path: Path, options: Given) -> RecordedSequence:
     return RecordedSequence(path.stem, "ros", options.get("kind", "handheld"), rig, source, warnings=warnings)
 
 
-@dataclass(frozen=True)
-class Messages:
-    """When the messages of a topic were taken and recorded, in the order of the recording.
-
-    Attributes:
-        topic: name.
-        stamps: of their headers (N,) [ns].
-        recorded: when they were written (N,) [ns].
-    """
+class Messages(NamedTuple):
+    """When the messages of a topic were taken, by their headers, and recorded, in the order of the recording [ns]."""
 
     topic: str
     stamps: IntArray
@@ -133,14 +126,7 @@ class RosPairs:
                 partner = next(right, None) if right_row >= 0 else None
                 if image is None:
                     return
-                if isinstance(image, SequenceError):
-                    faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {image}")
-                    continue
-                if isinstance(partner, SequenceError):
-                    line = f"frame {index} is given without its right image: {partner}"
-                    faults.report("right images unreadable, frames given without them", line)
-                    partner = None
-                yield StereoFrame(index, float(self.stamps[index]), image, partner)
+                yield from delivered(index, float(self.stamps[index]), image, partner, faults)
 
     def _images(
         self, bag: Bag, messages: Messages, rows: IntArray

@@ -15,6 +15,7 @@ from slam.files import expanded, note_input
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.stamps import IntArray, increasing, pair, trim
+from slam.sequences.base import delivered
 from slam.sequences.faults import FaultLog
 from slam.sequences.given import WIDEST_TOLERANCE, Given
 from slam.sequences.images import IMAGE_SUFFIXES, Size, halves, read_image, size_text
@@ -80,32 +81,18 @@ class ImagePairs:
         without it.
         """
         for index in range(start, stop):
-            right = None
-            try:
-                left = self._read_one(self.left_folder / self.left[index])
-                if self.halves:
-                    left, right = halves(left, self.left[index])
-            except SequenceError as error:
-                faults.report("left images unreadable, frames skipped", f"frame {index} skipped: {error}")
-                continue
-            if not self.halves:
-                right = self._read_right(index, faults)
-            yield StereoFrame(index, float(self.stamps[index]), left, right)
+            left, name = self._read_one(self.left_folder / self.left[index]), self.right[index]
+            right = None if self.halves or name is None else self._read_one(self.right_folder / name)
+            if self.halves and isinstance(left, np.ndarray):
+                left, right = halves(left, self.left[index])
+            yield from delivered(index, float(self.stamps[index]), left, right, faults)
 
-    def _read_right(self, index: int, faults: FaultLog) -> np.ndarray | None:
-        name = self.right[index]
-        if name is None:
-            return None
+    def _read_one(self, path: Path) -> np.ndarray | SequenceError:
+        size = self.size
         try:
-            return self._read_one(self.right_folder / name)
+            return read_image(path, (2 * size[0], size[1]) if self.halves and size is not None else size)
         except SequenceError as error:
-            line = f"frame {index} is given without its right image: {error}"
-            faults.report("right images unreadable, frames given without them", line)
-            return None
-
-    def _read_one(self, path: Path) -> np.ndarray:
-        double = self.halves and self.size is not None
-        return read_image(path, (2 * self.size[0], self.size[1]) if double else self.size)  # type: ignore[index]
+            return error
 
     def first_size(self) -> Size:
         """Width and height of the first pair of images that can be read.

@@ -98,6 +98,18 @@ def date_time(text: str) -> int:
         raise ValueError(f"{shorten(text)} is not a date and time") from None
 
 
+def numbers(text: str, count: int, what: str, separator: str | None = None, exactly: bool = False) -> list[float]:
+    """The first finite numbers of a row, so many; `what` it should be is said where it is not, or not `exactly`."""
+    words = text.split(separator)
+    try:
+        row = [float(word) for word in words[:count]]
+    except ValueError:
+        raise ValueError(f"{shorten(text)} is not a row of numbers") from None
+    if len(row) < count or not np.isfinite(row).all() or (exactly and len(words) > count):
+        raise ValueError(f"{shorten(text)} is not {what}")
+    return row
+
+
 def stamp_and_name(text: str) -> tuple[int, str]:
     """A row of EuRoC's ``data.csv``: nanoseconds and file name; the name defaults to the stamp."""
     first, _, rest = text.partition(",")

@@ -104,7 +104,7 @@ def open_video(path: Path) -> Iterator[Any]:
     require_content(path)  # a pipe would be waited for
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # faults are reported by us, once
     with quiet_libraries():
-        capture = cv2.VideoCapture(str(path))
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)  # others take a name for a pattern
     try:
         if not capture.isOpened():
             raise SequenceError(f"{path}: not a readable video")

@@ -1,4 +1,4 @@
-"""YAML that may be hostile: bounded in depth, in the number of values, and in what aliases make of them."""
+"""YAML that may be hostile: bounded in size, depth and length of values, and without aliases."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from slam.files import read_text
 CALIBRATION_LIMIT = 4 * 2**20
 
 _DEEPEST = 32
-_VALUES = 100_000  # most values, aliases written out
 _LONGEST = 4096  # characters of a value
 
 #: What constructing a value of an odd tag (``!!bool maybe``, ``!!int ''``, ``!!timestamp x``) raises.
@@ -47,13 +46,9 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     if text.startswith("%YAML:"):
         text = "\n" + text.partition("\n")[2]  # rows keep their numbers
     text = re.sub(r"\.(Nan|Inf)\b", lambda match: match[0].lower(), text)
-    loader = _loader()
     try:
         _require_small(path, text)
-        root = yaml.compose(text, loader)
-        if root is not None and _written_out(root, {}) > _VALUES:
-            raise CalibrationError(f"{path}: its aliases stand for more than {_VALUES} values")
-        node = None if root is None else yaml.load(text, loader)
+        node = yaml.load(text, _loader())
     except (yaml.YAMLError, *_REFUSALS) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", row {mark.line + 1}" if mark else ""
@@ -64,45 +59,17 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
 
 
 def _require_small(path: Path, text: str) -> None:
-    """Raise where a file nests too deeply or holds too many values, before any is kept."""
+    """Raise where a file nests too deeply, holds too long a value or an alias, which may stand for gigabytes."""
     import yaml
 
-    depth = values = 0
+    depth = 0
     for event in yaml.parse(text, _loader()):
-        if isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-            continue
-        values += 1
-        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         long = isinstance(event, yaml.ScalarEvent) and len(event.value) > _LONGEST
-        if depth > _DEEPEST or values > _VALUES or long:
-            what = "nested too deeply" if depth > _DEEPEST else "a value too long" if long else "too many values"
+        if depth > _DEEPEST or long or isinstance(event, yaml.AliasEvent):
+            what = "nested too deeply" if depth > _DEEPEST else "a value too long" if long else "no aliases are read"
             row = event.start_mark.line + 1  # type: ignore[union-attr]
             raise CalibrationError(f"{path}, row {row}: {what} for a calibration")
-
-
-def _written_out(node: Any, known: dict[int, int]) -> int:
-    """Number of values of a node with its aliases written out, stopped a little above the limit.
-
-    Raises:
-        RecursionError: it holds itself.
-    """
-    import yaml
-
-    if isinstance(node, yaml.ScalarNode):
-        return 1
-    key = id(node)
-    if key in known:
-        if known[key] < 0:
-            raise RecursionError("a value holds itself")
-        return known[key]
-    known[key] = -1
-    children = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
-    total = 1
-    for child in children:
-        total = min(total + _written_out(child, known), _VALUES + 1)
-    known[key] = total
-    return total
 
 
 @lru_cache(maxsize=1)

@@ -20,40 +20,6 @@ _DIRECTIONS = 6.0  # each further direction of descriptors that drift varies les
 _DRIFTING = 0.6  # share of the variance of descriptors that changes with the direction of view
 
 
-@dataclass(frozen=True)
-class ObservationModel:
-    """How landmarks become features; the attributes are the options of the same names.
-
-    Attributes:
-        sigma: standard deviation of uL, vL and uR [px].
-        detect: chance that a visible landmark is detected.
-        stereo: chance that it is matched in the right image.
-        outliers: share of false features; half as many true ones are given a false match in the right image.
-        descriptor: length of descriptors.
-        descriptor_noise: typical length of the error of a unit descriptor.
-        descriptor_drift: how far a unit descriptor moves as the direction of view turns [1/rad].
-        change: share of landmarks that look different when the camera comes back after a minute.
-        clutter: share of features that are points of the world, but never detected again.
-        confusion: share of landmarks that look nearly like another one.
-    """
-
-    sigma: float
-    detect: float
-    stereo: float
-    outliers: float
-    descriptor: int
-    descriptor_noise: float
-    descriptor_drift: float
-    change: float
-    clutter: float
-    confusion: float
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> ObservationModel:
-        """From the values of the options."""
-        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
-
-
 @dataclass(frozen=True, eq=False)
 class Appearance:
     """What tells landmarks apart.
@@ -125,16 +91,16 @@ class Appearance:
         return (self.common + own * self.spread).astype(np.float32) if self.drifting else own
 
 
-def appearance(world: World, model: ObservationModel, layout: int) -> Appearance:
-    """Descriptors of all landmarks.
+def appearance(world: World, values: Mapping[str, Any]) -> Appearance:
+    """Descriptors of all landmarks, by the values of the options.
 
     Unit descriptors about 0.9 apart on average, as SURF's are; a share `confusion` of the landmarks is but 0.15 away
     from another one. Those that drift are as far apart as SURF's on a drive through a town: also the nearest of some
     hundred ones, for which they vary less in some directions than in others.
     """
-    rng = np.random.default_rng([layout, 11])
-    count, size = len(world.landmarks), model.descriptor
-    drifts = model.descriptor_drift > 0
+    rng = np.random.default_rng([values["layout"], 11])
+    count, size = len(world.landmarks), values["descriptor"]
+    drifts = values["descriptor_drift"] > 0
     common = rng.standard_normal(size)
     common *= _COMMON / np.linalg.norm(common)
     spread = np.exp(-np.arange(size) / _DIRECTIONS) if drifts else np.ones(size)
@@ -142,23 +108,23 @@ def appearance(world: World, model: ObservationModel, layout: int) -> Appearance
     own = rng.standard_normal((count, size))
     descriptors = common + np.sqrt(1 - _DRIFTING) * spread * own if drifts else unit(common + unit(own))
     phase = np.arange(count)
-    twins = np.flatnonzero(rng.random(count) < model.confusion)
+    twins = np.flatnonzero(rng.random(count) < values["confusion"])
     if count > 1:
         originals = (twins + rng.integers(1, count, len(twins))) % count
         near = descriptors[originals] + 0.15 * unit(rng.standard_normal((len(twins), size)))
         descriptors[twins] = near if drifts else unit(near)
         phase[twins] = originals
     laplacian = np.where(rng.random(count) < 0.5, 1, -1).astype(np.int8)
-    errors = rng.standard_normal((_POOL, size)) * (model.descriptor_noise / np.sqrt(size))
+    errors = rng.standard_normal((_POOL, size)) * (values["descriptor_noise"] / np.sqrt(size))
     response = np.exp(rng.normal(6.5, 1.0, count))
     waves, directions = np.zeros((0, 3, size)), np.zeros((0, 3, 3))
     if drifts:
-        directions = _pace(model.descriptor_drift) * rng.standard_normal((_POOL, 3, 3))
+        directions = _pace(values["descriptor_drift"]) * rng.standard_normal((_POOL, 3, 3))
         waves = rng.standard_normal((_POOL, 3, size)) * (spread * np.sqrt(_DRIFTING * 2 / 3))
     looks = world.landmarks.looks
     return Appearance(
         descriptors[looks].astype(np.float32), laplacian[looks], response[looks], phase[looks],
-        errors.astype(np.float32), common, spread, waves.astype(np.float32), directions, model.change,
+        errors.astype(np.float32), common, spread, waves.astype(np.float32), directions, values["change"],
     )  # fmt: skip
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
@@ -15,52 +14,32 @@ import numpy as np
 from slam.worlds.faults import Faults, in_hand
 
 
-@dataclass(frozen=True)
-class ImagingModel:
-    """How images come out; the attributes are the options of the same names.
-
-    Attributes:
-        noise: standard deviation of the sensor noise [grey levels].
-        vignetting: loss of light in the corners.
-        shutter: time that the shutter is open, as a share of a frame.
-        lens: standard deviation of the lens's blur [px].
-        colour: whether images are BGR.
-        supersample: samples per pixel along each axis.
-    """
-
-    noise: float
-    vignetting: float
-    shutter: float
-    lens: float
-    colour: int
-    supersample: int
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> ImagingModel:
-        """From the values of the options."""
-        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
-
-    def shading(self, width: int, height: int) -> np.ndarray:
-        """Share of the light that reaches each pixel (H, W) float32."""
-        y, x = np.mgrid[:height, :width].astype(np.float32)
-        x, y = x / (width - 1) * 2 - 1, y / (height - 1) * 2 - 1
-        return (1 - self.vignetting * (x * x + y * y) / 2).astype(np.float32)
+def shading(vignetting: float, width: int, height: int) -> np.ndarray:
+    """Share of the light that reaches each pixel (H, W) float32; `vignetting` is lost in the corners."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    x, y = x / (width - 1) * 2 - 1, y / (height - 1) * 2 - 1
+    return (1 - vignetting * (x * x + y * y) / 2).astype(np.float32)
 
 
 def sense(
-    image: np.ndarray, model: ImagingModel, shading: np.ndarray, faults: Faults, frame: int, rng: np.random.Generator
+    image: np.ndarray,
+    values: Mapping[str, Any],
+    light: np.ndarray,
+    faults: Faults,
+    frame: int,
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """The image that the camera gives, uint8."""
+    """The image that the camera gives, uint8, by the values of the options; `light` is the `shading`."""
     if faults.hand[frame]:
         image = _cover(image)
     if faults.blur[frame]:
         image = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80)
-    elif model.lens > 0.05:
-        image = cv2.GaussianBlur(image, (0, 0), model.lens)
+    elif values["lens"] > 0.05:
+        image = cv2.GaussianBlur(image, (0, 0), values["lens"])
     gain = 0.0 if faults.black[frame] else 12.0 if faults.bright[frame] else 1.0
-    light = shading * np.float32(gain)
+    light = light * np.float32(gain)
     out = cv2.multiply(image, light if image.ndim == 2 else cv2.merge([light] * 3), dtype=cv2.CV_32F)
-    noise = model.noise * (8.0 if faults.burst[frame] else 1.0)
+    noise = values["noise"] * (8.0 if faults.burst[frame] else 1.0)
     if noise > 0:
         cv2.scaleAdd(normal_noise(image.shape, rng), noise, out, dst=out)
     return cv2.convertScaleAbs(cv2.max(out, 0.0))  # to the nearest grey level

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.worlds.appearance import Appearance, ObservationModel, unit
+from slam.worlds.appearance import Appearance, unit
 from slam.worlds.geometry import hidden
 from slam.worlds.world import World
 
@@ -144,29 +146,31 @@ def _candidates(world: World, points: Array) -> IdArray:
 
 
 def simulate(
-    world: World, appearance: Appearance, model: ObservationModel, frame: int, stamp: float, rng: np.random.Generator
+    world: World, appearance: Appearance, values: Mapping[str, Any], frame: int, stamp: float, rng: np.random.Generator
 ) -> SimulatedFeatures:
-    """Features of one frame, in random order.
+    """Features of one frame, in random order, by the values of the options.
 
     The noise is isotropic on uL, vL and uR; vR follows from the epipolar geometry of the three, so that the noisy
     rays meet. A feature that noise takes out of the left image is not detected.
     """
     seen = seen_landmarks(world, frame)
     chance = rng.random((len(seen.ids), 3))
-    rows = np.flatnonzero(chance[:, 0] < model.detect)
-    matched = seen.in_right[rows] & (chance[rows, 1] < model.stereo)
-    noise = model.sigma * rng.standard_normal((len(rows), 3))
+    rows = np.flatnonzero(chance[:, 0] < values["detect"])
+    matched = seen.in_right[rows] & (chance[rows, 1] < values["stereo"])
+    noise = values["sigma"] * rng.standard_normal((len(rows), 3))
     uv_left = seen.uv_left[rows] + noise[:, :2]
     uv_right = np.full_like(uv_left, np.nan)
     uv_right[matched] = _on_epipolar_line(
         world.rig, seen.points[rows[matched]], uv_left[matched], seen.uv_right[rows[matched]], noise[matched]
     )
-    false_stereo = matched & (chance[rows, 2] < model.outliers / 2)
+    false_stereo = matched & (chance[rows, 2] < values["outliers"] / 2)
     if false_stereo.any():
         _falsify(uv_left, uv_right, np.flatnonzero(false_stereo), rng)
-    extra = round(len(rows) * model.outliers / (1 - model.outliers))
+    extra = round(len(rows) * values["outliers"] / (1 - values["outliers"]))
     false_left, false_right = _false_pixels(world.rig, extra, rng)
-    passing_left, passing_right = _clutter(world.rig, seen, round(len(rows) * model.clutter / (1 - model.clutter)), rng)
+    passing_left, passing_right = _clutter(
+        world.rig, seen, round(len(rows) * values["clutter"] / (1 - values["clutter"])), rng
+    )
     uv_left = np.concatenate([uv_left, false_left, passing_left])
     uv_right = np.concatenate([uv_right, false_right, passing_right])
     uv_right[~_inside(world.rig, uv_right)] = np.nan

@@ -12,7 +12,7 @@ import numpy as np
 from slam.data import StereoFrame
 from slam.geometry.se3 import Array, exp, inverse, log
 from slam.worlds.faults import Faults
-from slam.worlds.imaging import ImagingModel, sense
+from slam.worlds.imaging import sense, shading
 from slam.worlds.lens import Lens
 from slam.worlds.raster import draw
 from slam.worlds.textures.ripmap import Ripmap
@@ -33,7 +33,7 @@ class Recorder:
 
     def __init__(self, world: World, values: Mapping[str, Any], faults: Faults) -> None:
         self._world = world
-        self._model = ImagingModel.of(values)
+        self._values = values
         self._faults = faults
         self._seed: int = values["seed"]
 
@@ -48,20 +48,20 @@ class Recorder:
 
     def _shoot(self, frame: int, lens: Lens, T_left_camera: Array, stream: int) -> np.ndarray:
         """One camera's image."""
-        if self._model.shutter > 0:
-            shares = self._model.shutter * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
+        if self._values["shutter"] > 0:
+            shares = self._values["shutter"] * ((np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5)
             images = [self._picture(frame, lens, T_left_camera, x).astype(np.float32) for x in shares]
             image = np.rint(np.mean(images, axis=0)).astype(np.uint8)
         else:
             image = self._picture(frame, lens, T_left_camera, 0.0)
         rng = np.random.default_rng([self._seed, frame, stream])
-        return sense(image, self._model, self._shading, self._faults, frame, rng)
+        return sense(image, self._values, self._shading, self._faults, frame, rng)
 
     def _picture(self, frame: int, lens: Lens, T_left_camera: Array, ahead: float) -> np.ndarray:
         """One camera's light, `ahead` of the frame's time by a share of a frame."""
         T = _between(self._world.T_world_left, frame, ahead)
         bodies = np.array([np.eye(4), *(_between(Ts, frame, ahead) for Ts in self._world.T_world_object)])
-        channels = 3 if self._model.colour else 1
+        channels = 3 if self._values["colour"] else 1
         rows = self._world.drawn_there(frame)
         samples = draw(
             self._world.drawn_arrays.select(rows), lambda row: self._ripmap(int(rows[row])), bodies, T @ T_left_camera,
@@ -73,22 +73,22 @@ class Recorder:
     def _lenses(self) -> tuple[Lens, Lens]:
         """Left and right camera."""
         rig = self._world.rig
-        return Lens.of(rig.left, self._model.supersample), Lens.of(rig.right, self._model.supersample)
+        return Lens.of(rig.left, self._values["supersample"]), Lens.of(rig.right, self._values["supersample"])
 
     @cached_property
     def _shading(self) -> np.ndarray:
         """Share of the light that reaches each pixel."""
-        return self._model.shading(self._world.rig.width, self._world.rig.height)
+        return shading(self._values["vignetting"], self._world.rig.width, self._world.rig.height)
 
     def _ripmap(self, rectangle: int) -> Ripmap:
         """The texture of a rectangle drawn, painted when first seen; the last ones are kept with the world."""
         texture = self._world.drawn[rectangle].texture
-        key = (texture, self._model.colour)
+        key = (texture, self._values["colour"])
         painted = self._world.painted
         found: Ripmap | None = painted.pop(key, None)
         if found is None:
             picture = texture.paint(self._world.texels)
-            found = Ripmap(picture if self._model.colour else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+            found = Ripmap(picture if self._values["colour"] else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             if len(painted) >= _PAINTED:
                 del painted[next(iter(painted))]
         painted[key] = found  # at the end: what has not been seen for the longest time comes first

@@ -17,7 +17,7 @@ from slam.geometry.se3 import Array
 from slam.geometry.stamps import frame_range
 from slam.geometry.trajectory import Trajectory
 from slam.showing import sequence_html, sequence_line
-from slam.worlds.appearance import Appearance, ObservationModel, appearance
+from slam.worlds.appearance import Appearance, appearance
 from slam.worlds.faults import Faults
 from slam.worlds.geometry import Landmarks
 from slam.worlds.observe import SimulatedFeatures, simulate
@@ -69,7 +69,6 @@ class WorldSequence:
         self._stamps = (world.stamps + self.faults.delay)[self._kept]
         self._last_truth: tuple[int, TruthImages] | None = None
         self._images: list[StereoFrame] = []
-        self._model = ObservationModel.of(values)
 
     @property
     def kind(self) -> str:
@@ -145,13 +144,13 @@ class WorldSequence:
         """Features of frame k with their truth, without images."""
         source = self._source(k)
         rng = np.random.default_rng([self.values["seed"], source, 1])
-        seen = simulate(self.world, self._looks, self._model, source, float(self._stamps[int(k)]), rng)
+        seen = simulate(self.world, self._looks, self.values, source, float(self._stamps[int(k)]), rng)
         return self.faults.spoil(source, seen, self.rig, rng)
 
     @cached_property
     def _looks(self) -> Appearance:
         """Descriptors of the landmarks."""
-        return appearance(self.world, self._model, self.values["layout"])
+        return appearance(self.world, self.values)
 
     @cached_property
     def _recorder(self) -> Recorder:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+
 import cv2
 import numpy as np
 import pytest
 
-import frontends
+import frontends.surf
 from frontends.surf import Keypoints, Surf
-from slam.errors import SequenceError
-from slam.geometry.rig import StereoRig
+from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.test_surf import IMAGE
 
 
@@ -54,13 +55,6 @@ def test_compute_describes_the_key_points_of_other_detectors():
         np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
 
 
-def test_descriptors_match_under_the_norm_that_surf_names():
-    surf = Surf(100)
-    _, descriptors = surf.detectAndCompute(IMAGE, None)
-    matches = cv2.BFMatcher(surf.defaultNorm()).match(descriptors, descriptors)
-    assert max(match.distance for match in matches) == 0
-
-
 def test_key_points_that_are_impossible():
     inside, outside, large = cv2.KeyPoint(50, 50, 12), cv2.KeyPoint(-9, 1e9, 12), cv2.KeyPoint(50, 50, 1e9)
     assert [k.pt for k in Surf().compute(IMAGE, [inside, outside, large])[0]] == [(50, 50)]
@@ -72,7 +66,40 @@ def test_key_points_that_are_impossible():
     assert repr(Keypoints.from_cv2([inside])) == "Keypoints(1 features)"
 
 
-def test_the_front_end_shows_its_detector():
-    rig = StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
-    frontend = frontends.create("surf", rig, descriptor=16)
-    assert frontend.surf.descriptorSize() == 16
+def test_the_arguments_and_defaults_are_opencv_s():
+    parameters = inspect.signature(frontends.surf.create).parameters
+    expected = {"hessianThreshold": 100.0, "nOctaves": 4, "nOctaveLayers": 3, "extended": False, "upright": False}
+    assert {name: p.default for name, p in parameters.items()} == expected
+    surf = frontends.surf.create(400, 3, 2, False, True)
+    got = surf.getHessianThreshold(), surf.getNOctaves(), surf.getNOctaveLayers(), surf.getExtended(), surf.getUpright()
+    assert got == (400.0, 3, 2, False, True)
+    assert isinstance(surf, Surf) and surf.descriptorSize() == 64
+
+
+def test_setters_change_what_is_found():
+    surf = frontends.surf.create()
+    many = len(surf.detect(IMAGE))
+    surf.setHessianThreshold(5000)
+    surf.setNOctaves(2)
+    surf.setNOctaveLayers(2)
+    surf.setUpright(True)
+    keypoints, descriptors = surf.detectAndCompute(IMAGE)
+    other, same = Surf(5000, 2, 2).detectAndCompute(IMAGE)
+    assert 0 < len(keypoints) < many
+    assert len(other) == len(keypoints) and np.array_equal(descriptors, same)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("HessianThreshold", -1, "threshold: must be"),
+        ("NOctaves", 5, "octaves: must be 1 to 4"),
+        ("NOctaveLayers", 4, "layers: must be 2 or 3"),
+        ("Extended", True, "no descriptors of 128 numbers"),
+    ],
+)
+def test_what_this_surf_does_not_have_is_refused(name, value, words):
+    surf = frontends.surf.create()
+    with pytest.raises(ConfigurationError, match=words):
+        getattr(surf, f"set{name}")(value)
+    assert getattr(surf, f"get{name}")() == getattr(frontends.surf.create(), f"get{name}")()

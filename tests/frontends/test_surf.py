@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
-from frontends.surf import Keypoints, Surf
+from frontends.surf import Surf
 from slam.errors import ConfigurationError, SequenceError
 from tests.frontends.scenes import photograph, texture, warped, zoom_about
 
@@ -73,19 +72,6 @@ def test_sums_beyond_32_bits_wrap_around_harmlessly():
         np.testing.assert_allclose(a[1], b[1], atol=5e-3)
 
 
-@pytest.mark.parametrize("upright", [True, False])
-@pytest.mark.parametrize("descriptor", [16, 64])
-def test_threads_do_not_change_a_byte(upright, descriptor):
-    one, *others = [
-        Surf(100, octaves=3, descriptor=descriptor, upright=upright, threads=n).detect_and_describe(IMAGE)
-        for n in (1, 2, 3, 7)
-    ]
-    assert len(one[0]) > 200
-    for other in others:
-        assert same_features(one[0], other[0])
-        assert one[1].tobytes() == other[1].tobytes()
-
-
 @pytest.mark.parametrize("octaves", [1, 2, 4])
 @pytest.mark.parametrize("layers", [2, 3])
 def test_smallest_images(octaves, layers):
@@ -116,14 +102,6 @@ def test_a_blob_is_found_where_it_is():
         assert keypoints.laplacian[0] == sign
         localised = Surf(500).localise(photograph(blob), keypoints)
         np.testing.assert_allclose(localised.uv[0], (80.3, 60.6), atol=0.03)
-
-
-def test_features_come_by_falling_response():
-    keypoints = Surf(50).detect(IMAGE)
-    assert (np.diff(keypoints.response) <= 0).all()
-    assert keypoints.response[-1] > 50
-    stronger = Surf(50).detect(IMAGE, threshold=2000)
-    assert len(stronger) == (keypoints.response > 2000).sum()
 
 
 def test_mask():
@@ -194,19 +172,6 @@ def test_16_dimensions_are_the_four_central_areas_of_64(upright):
     assert off.max() < 0.02
 
 
-def test_detect_and_compute_gives_opencv_keypoints():
-    keypoints, descriptors = Surf(300, upright=False).detectAndCompute(IMAGE, None)
-    ours, _ = Surf(300, upright=False).detect_and_describe(IMAGE)
-    assert isinstance(keypoints[0], cv2.KeyPoint)
-    np.testing.assert_allclose([k.pt for k in keypoints], ours.uv, atol=1e-4)
-    np.testing.assert_allclose([k.angle for k in keypoints], np.rad2deg(ours.angle), atol=1e-3)
-    assert [k.class_id for k in keypoints] == list(ours.laplacian)
-    assert descriptors.dtype == np.float32
-    nothing, empty = Surf(300).detectAndCompute(np.zeros((50, 50), np.uint8), None)
-    assert nothing == ()
-    assert empty.shape == (0, 64)
-
-
 @pytest.mark.parametrize(
     ("image", "says"),
     [
@@ -218,9 +183,6 @@ def test_detect_and_compute_gives_opencv_keypoints():
 def test_unusable_images(image, says):
     with pytest.raises(SequenceError, match=says):
         Surf().detect(image)
-
-
-def test_unusable_mask():
     with pytest.raises(SequenceError, match="mask: shape"):
         Surf().detect(IMAGE, np.ones((3, 3)))
 
@@ -239,10 +201,3 @@ def test_unusable_mask():
 def test_bad_settings_name_their_key(options, key):
     with pytest.raises(ConfigurationError, match=f"^{key}: "):
         Surf(**options)
-
-
-def test_select_takes_masks_and_indices():
-    keypoints = Surf(300).detect(IMAGE)
-    assert isinstance(keypoints, Keypoints)
-    mask = keypoints.octave == 1
-    assert same_features(keypoints.select(mask), keypoints.select(np.flatnonzero(mask)))

@@ -57,24 +57,6 @@ def test_no_error_leaves_the_rig_as_it_is():
     np.testing.assert_allclose(corrected.b, GENERAL_RIG.b, atol=1e-9)
 
 
-@pytest.mark.parametrize("write", [write_opencv, write_kalibr])
-def test_written_rigs_are_read_again(write, tmp_path):
-    rig = corrected_rig(RigModel(CAR), OFF).rig
-    write(tmp_path / "rig.yaml", rig)
-    again = slam.load_rig(tmp_path / "rig.yaml")
-    assert (again.left, again.right) == (rig.left, rig.right)
-    np.testing.assert_allclose(again.T_right_left, rig.T_right_left, atol=1e-12)
-
-
-def test_opencv_reads_the_file(tmp_path):
-    import cv2
-
-    write_opencv(tmp_path / "rig.yaml", corrected_rig(RigModel(CAR), OFF).rig)
-    storage = cv2.FileStorage(str(tmp_path / "rig.yaml"), cv2.FILE_STORAGE_READ)
-    assert storage.getNode("K1").mat().shape == (3, 3) and storage.getNode("T").mat()[0, 0] < -0.5
-    storage.release()
-
-
 def fisheye():
     camera = PinholeCamera(300, 300, 320, 240, 640, 480, "equidistant", (0.01, 0.002, 0.0, 0.0))
     return StereoRig(camera, camera, so3_exp(np.array([0.0, 0.01, 0.0])), np.array([-0.1, 0, 0]))

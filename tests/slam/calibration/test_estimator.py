@@ -9,9 +9,7 @@ from slam.calibration import RigCorrection, RigModel, SelfCalibration, SelfCalib
 from slam.calibration.prior import prior_information
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
-from slam.errors import ConfigurationError
 from slam.geometry import se3
-from slam.geometry.rig import StereoRig
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
 from tests.slam.calibration.drives import CAR, Street, disparity_error, drive, parameters, pose, residual_fields
@@ -126,13 +124,6 @@ def test_what_motion_has_hardly_shown_is_not_applied():
     assert disparity_error(calibration, TURNED) > 0.9 * disparity_error(drive(TURNED, frames=1), TURNED)
 
 
-def test_what_is_applied_asks_for_motion_alone(monkeypatch):
-    """What the rows leave, the residual fields, has no part in it."""
-    calibration = drive(TURNED)
-    monkeypatch.setattr("slam.calibration.estimator.residual_scale", None)
-    assert calibration._motion_agrees()
-
-
 def test_what_rows_alone_say_is_not_applied():
     """Rows with an error of their own, which is no error of the rig: motion does not show it."""
     theta = parameters(roll=1e-3, yaw=1e-3, pitch=1e-3, left_k1=0.005)
@@ -168,36 +159,12 @@ def test_the_poses_of_the_system_are_only_a_start():
     assert disparity_error(with_poses, without.posterior.mean) < 0.03
 
 
-def test_same_input_same_output():
-    one, two = (drive(TURNED, seed=5, frames=10).posterior for _ in range(2))
-    np.testing.assert_array_equal(one.mean, two.mean)
-    np.testing.assert_array_equal(one.covariance, two.covariance)
-
-
 def test_a_change_that_does_not_count_is_not_applied():
     calibration = drive(TURNED, seed=2, frames=10)
     assert calibration.apply(least=1e4) is None and not calibration.applied.parameters.any()
     revision = calibration.apply()
     np.testing.assert_array_equal(revision.after.parameters, calibration.posterior.mean)
     assert calibration.apply() is None
-
-
-def test_a_focal_length_that_counts_is_applied_though_far_points_do_not_show_it():
-    calibration = drive(seed=2, frames=10)
-    calibration._motion_agrees = lambda: True
-    calibration.apply()
-    assert calibration.apply(least=0.5) is None
-    known, zoom = calibration._solution, parameters(left_f=1.0, right_f=1.0)
-    sigma = np.sqrt(zoom @ known.inner @ zoom) / 2
-    for share, applied in ((0.4, False), (0.6, True)):
-        calibration._solution = replace(known, mean=known.mean + share * sigma * zoom)
-        assert (calibration.apply(least=0.5) is not None) == applied
-
-
-def test_disabled_means_untouched():
-    calibration = drive(TURNED, frames=6, settings={"enabled": False})
-    features = Street().features(0.0, np.eye(4))
-    assert calibration.apply() is None and calibration.correct(features) is features
 
 
 def test_nothing_seen_is_no_error():
@@ -257,17 +224,3 @@ def test_a_revision_does_not_move_the_camera(backend):
         if k == 8:
             step = np.linalg.norm((np.linalg.inv(before) @ result.estimate.T_world_left)[:3, 3])
             assert abs(step - 0.01) < 0.01
-
-
-@pytest.mark.parametrize(
-    "setting", ["systematic=0", "kept_share=1.5", "minimum_common=3", "inflation=-1", "pixel_sigma=nan", "colour=1"]
-)
-def test_settings_are_checked(setting):
-    with pytest.raises(ConfigurationError, match="self_calibration"):
-        SystemConfig().with_settings([f"self_calibration.{setting}"])
-
-
-def test_the_model_is_the_same_for_every_rig_size():
-    small, large = (StereoRig.rectified_pair(f, f, f / 4, 0.5, int(2 * f), int(f / 2)) for f in (300, 900))
-    far = [RigModel(rig).far() / rig.left.fu for rig in (small, large)]
-    np.testing.assert_allclose(*far, atol=0.01)

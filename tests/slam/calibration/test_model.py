@@ -80,14 +80,6 @@ def test_sums_of_residual_fields_need_not_build_them():
     np.testing.assert_allclose(MODEL.residual_products(factors, points), expected, rtol=1e-10, atol=1e-10)
 
 
-def test_the_residual_fields_have_a_mean_square_of_one():
-    far = MODEL.far(201, 151)
-    columns = residual_field(MODEL, far)[:, 0] / F
-    used = columns[:, (columns != 0).any(axis=0)]
-    np.testing.assert_allclose((used**2).mean(axis=0), 1, atol=0.15)
-    np.testing.assert_allclose(MODEL.residual_vertical(far)[:, : used.shape[1]], 0)
-
-
 @pytest.mark.parametrize("rig", [CAR, GENERAL_RIG], ids=["rectified", "general"])
 def test_features_are_corrected_and_revised(rig):
     model = RigModel(rig)
@@ -108,8 +100,3 @@ def test_features_are_corrected_and_revised(rig):
     np.testing.assert_allclose(before.rows(rows[0]), rows[1], atol=1e-6)
     np.testing.assert_allclose(before.undone(rows[1]), rows[0], atol=1e-4)
     np.testing.assert_allclose(Revision(before, after).rows(rows[1]), rows[2], atol=1e-4)
-
-
-def test_nothing_is_moved_by_nothing():
-    z = np.array([[600.0, 170.0, 580.0], [100.0, 20.0, np.nan]])
-    np.testing.assert_array_equal(RigCorrection(MODEL, parameters()).rows(z), z)

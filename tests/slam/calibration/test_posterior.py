@@ -38,13 +38,6 @@ def test_what_is_no_posterior_is_refused(tree):
         RigPosterior.from_json(tree)
 
 
-def test_shapes_and_values_are_checked():
-    with pytest.raises(CalibrationError, match="length"):
-        RigPosterior(("yaw",), ("rad",), np.zeros(2), np.eye(2))
-    with pytest.raises(CalibrationError, match="finite"):
-        RigPosterior(("yaw",), ("rad",), np.zeros(1), np.array([[np.nan]]))
-
-
 def test_a_calibration_that_nothing_speaks_against_is_left_alone():
     prior = Prior(NONE, np.array([[[0.02]], [[0.1]], [[0.3]], [[1.0]]]) ** 2)
     near = solve(prior, 0.0, [evidence(0.1, 0.1)])
@@ -113,33 +106,3 @@ def test_what_an_error_of_the_whole_recording_leaves():
     np.testing.assert_allclose(np.linalg.solve(left.S, left.e), mean)
     nothing = Evidence(np.zeros((2, 2)), np.zeros(2), np.zeros((2, 1))).with_error(np.ones(2))
     assert not nothing.S.any()
-
-
-def test_an_earlier_posterior_is_the_start():
-    prior = Prior(np.array([2.0]), np.ones((1, 1, 1)))
-    found = solve(prior, 0.0, [evidence(4.0, 1.0)])
-    assert found.mean[0] == pytest.approx(3.0) and found.inner[0, 0] == pytest.approx(0.5)
-
-
-def test_sums_of_blocks_have_the_bytes_of_a_sum_from_the_start():
-    """Also after blocks were joined, and after a block was added to."""
-    rng, sums = np.random.default_rng(0), Accumulator(1.3, 2)
-    for _ in range(150):
-        S, e = rng.standard_normal((2, 2)), rng.standard_normal(2)
-        sums.add(Evidence(S, e, np.zeros((2, 1))))
-        blocks = sums._blocks
-        whole = sum(blocks[1:], blocks[0]).scaled(1 / sums.inflation)
-        for _ in range(2):
-            assert all((a == b).all() for a, b in zip(sums.total()[0], whole))
-
-
-def test_earlier_blocks_are_summed_once(monkeypatch):
-    sums = Accumulator(1.0, 4)
-    for _ in range(41):
-        sums.add(evidence(1.0, 1.0))
-    sums.total()
-    added, add = [], Evidence.__add__
-    monkeypatch.setattr(Evidence, "__add__", lambda a, b: added.append(b) or add(a, b))
-    sums.add(evidence(1.0, 1.0))
-    sums.total()
-    assert len(added) == 2  # to the last block, and that to those before it

@@ -61,7 +61,7 @@ def test_ranges_are_those_that_are_checked(every):
     assert ranges["surf", "frontend.descriptor"] == "16, 64"
     assert ranges["surf", "frontend.octaves"] == "[1, 4]"
     assert ranges["", "association.ratio"] == "[1e-09, 1]"
-    assert ranges["surf", "frontend.min_correlation"] == "[0, 1]"
+    assert ranges["surf", "frontend.layers"] == "[2, 3]"
     assert ranges["", "objects.mode"] == "detect, procedure1, off"
     assert ranges["", "objects.database"] == "text"
     assert ranges["", "map.monocular"] == "true or false"
@@ -77,7 +77,7 @@ def test_the_listing_fits(read, width):
 def test_an_unknown_section(read):
     with pytest.raises(SlamError, match="did you mean 'map'"):
         listing("mapp", 80)
-    with pytest.raises(SlamError, match=r"there is map\.grid, frontend\.grid"):
+    with pytest.raises(SlamError, match=r"there is map\.grid"):
         listing("grid", 80)
 
 

@@ -102,13 +102,8 @@ def test_rectification_maps_agree_with_opencv():
     expected = cv2.initUndistortRectifyMap(
         LEFT.K, np.array(LEFT.distortion), rectified_rig.R_left, K, (rig.width, rig.height), cv2.CV_32FC1
     )
-    np.testing.assert_allclose(rectified_rig.maps[0].x, expected[0], atol=1e-3)  # float32 of values up to 752
-    np.testing.assert_allclose(rectified_rig.maps[0].y, expected[1], atol=1e-3)
-
-
-def test_a_rectified_rig_is_its_own_twin():
-    rig = StereoRig.rectified_pair(707.09, 601.89, 183.11, 0.537, 1226, 370)
-    assert rig.rectified.rig is rig
+    np.testing.assert_allclose(rectified_rig.maps[0][..., 0], expected[0], atol=1e-3)  # float32 of values up to 752
+    np.testing.assert_allclose(rectified_rig.maps[0][..., 1], expected[1], atol=1e-3)
 
 
 def test_fisheye_pair_keeps_a_useful_view():
@@ -134,11 +129,3 @@ def test_impossible_rigs(change, message):
     values = {"left": LEFT, "right": RIGHT, "R": np.eye(3), "b": [-0.11, 0, 0], **change}
     with pytest.raises(CalibrationError, match=message):
         StereoRig(**values)
-
-
-def test_points_without_depth_have_no_covariance():
-    from slam.geometry.rig import StereoRig
-
-    rig = StereoRig.rectified_pair(300, 160, 120, 0.12, 320, 240)
-    found = rig.triangulation_covariance(np.array([[0.0, 0.0, 1e300], [0.0, 0.0, 2.0], [np.nan, 0.0, 1.0]]), 0.5)
-    assert np.isnan(found[[0, 2]]).all() and np.isfinite(found[1]).all()

@@ -77,9 +77,3 @@ def test_nearest_rotation_of_a_disturbed_one():
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(found) > 0
     np.testing.assert_allclose(found, R, atol=5e-3)
-
-
-def test_transform_and_inverse():
-    rng = np.random.default_rng(2)
-    T, points = se3.exp(rng.normal(size=6)), rng.normal(size=(5, 3))
-    np.testing.assert_allclose(se3.transform(se3.inverse(T), se3.transform(T, points)), points, atol=1e-14)

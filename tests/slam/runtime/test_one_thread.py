@@ -10,7 +10,6 @@ import pytest
 
 import slam
 from slam.errors import SlamError
-from slam.runtime.one_thread import OneThread
 from slam.system import StereoSlam
 from tests.slam.digest import FIRST, WORLD, state
 
@@ -129,13 +128,3 @@ def test_a_free_for_all_breaks_nothing(backend):
     assert sorted(done) == list(range(len(done))) and done
     assert system.process_features(SEQUENCE.observations(FIRST + 13)).index == len(done)
     assert sorted(system.estimate().ids) == sorted(system.landmarks.ids)
-
-
-def test_after_an_error_inside_the_next_thread_may_enter():
-    guard = OneThread("it")
-    with pytest.raises(ZeroDivisionError), guard:
-        raise ZeroDivisionError
-    entered = in_threads(lambda: guard.__enter__())
-    assert entered == [None]
-    with pytest.raises(SlamError, match="it is in use"), guard:
-        pass

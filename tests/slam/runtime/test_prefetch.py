@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
@@ -48,22 +47,6 @@ def test_no_more_than_asked_for_is_made_beforehand():
     assert len(made) <= 5
     work.close()
     assert threads() == 0
-
-
-def test_with_a_depth_of_one_an_item_is_begun_when_the_one_before_is_taken():
-    made = []
-
-    def items():
-        for k in range(5):
-            made.append(k)
-            yield k
-
-    work = prefetch(items(), depth=1)
-    for k in range(3):
-        assert next(work) == k
-        time.sleep(0.05)
-        assert made == list(range(k + 2))
-    work.close()
 
 
 def test_an_exception_comes_where_its_item_would():

@@ -115,12 +115,6 @@ def test_a_camera_that_comes_back_with_another_size_ends_the_frames(rig_here, pl
         next(frames)
 
 
-def test_swapped_halves_and_a_part_of_the_frames(rig_here, played):
-    played({"0": [np.hstack([grey(10 * k), grey(10 * k + 5)]) for k in range(9)]})
-    frames = list(slam.open_sequence("camera:0?swap=yes&kind=driving").frames(2, 5))
-    assert [(f.index, int(f.left[0, 0]), int(f.right[0, 0])) for f in frames] == [(2, 35, 30), (3, 45, 40), (4, 55, 50)]
-
-
 def test_a_camera_that_nobody_read_for_a_while_is_opened_again(rig_here, played, monkeypatch):
     for old, opened in ((60.0, 1), (-1.0, 2)):
         monkeypatch.setattr(camera, "_OLD", old)
@@ -281,15 +275,3 @@ def test_a_recording_runs_live_and_says_what_it_left_out(slam_command, tmp_path)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["ended"] == "completed"
     assert summary["frames"] + summary["live"]["frames dropped"] == 12
-
-
-def test_cameras_cannot_be_compared(slam_command, tmp_path):
-    done = slam_command("compare", "camera:0", "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert "compare recordings" in done.stderr
-
-
-def test_a_missing_file_is_said_before_a_missing_calibration(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SequenceError, match=r"both\.mp4: cannot be opened: there is no such file"):
-        slam.open_sequence("camera:both.mp4")

@@ -113,28 +113,3 @@ def test_an_error_of_the_source_is_raised_and_the_source_is_closed():
     for _ in LiveFrames(frames(1000, 0.01)):
         break
     assert not threads()
-
-
-class Broken:
-    """Frames of a camera that fails as it is opened, or as it is released."""
-
-    def __init__(self, opens):
-        self.opens, self.given = opens, iter(frames(2))
-
-    def __iter__(self):
-        if not self.opens:
-            raise OSError("no such camera")
-        return self
-
-    def __next__(self):
-        return next(self.given)
-
-    def close(self):
-        raise OSError("the camera is gone")
-
-
-@pytest.mark.parametrize(("opens", "said"), [(False, "no such camera"), (True, "the camera is gone")])
-def test_a_camera_that_cannot_be_opened_or_released_says_so(opens, said):
-    with pytest.raises(OSError, match=said):
-        list(LiveFrames(Broken(opens), paced=False))
-    assert not threads()

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from backports import zstd
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -217,11 +216,6 @@ def test_rectified_images_have_the_rig_of_p(tmp_path: Path) -> None:
     assert not slam.open_sequence(f"{path}?rectified=no").rig.is_rectified
 
 
-def test_a_right_topic_recorded_long_after_the_left_one(tmp_path: Path) -> None:
-    path = write(tmp_path / "late.bag", stereo(STORES[1], late=4 * STEP))
-    assert seeds(slam.open_sequence(path).frames(1)) == [(k, k + 10) for k in range(1, 6)]
-
-
 def test_missing_partners_and_the_tolerance(tmp_path: Path) -> None:
     rows = [row for row in stereo(STORES[1]) if not (row[0] == RIGHT and T0 + STEP < row[2] < T0 + 2 * STEP)]
     path = write(tmp_path / "gap.bag", rows)
@@ -230,16 +224,6 @@ def test_missing_partners_and_the_tolerance(tmp_path: Path) -> None:
     assert any("/stereo/left/image_raw: 1 images have no partner" in line for line in sequence.warnings)
     with pytest.raises(SequenceError, match="nearest two are 1 ms apart"):
         slam.open_sequence(f"{path}?tolerance=0.0005")
-
-
-def test_images_without_stamps_take_the_times_of_recording(tmp_path: Path) -> None:
-    store = STORES[1]
-    rows = stereo(store)[:2]
-    for k in range(3):
-        rows += [(topic, RAW, T0 + k * STEP, image(store, 0, picture(k))) for topic in (LEFT, RIGHT)]
-    sequence = slam.open_sequence(write(tmp_path / "zero.bag", rows))
-    assert np.allclose(np.diff(sequence.stamps), 0.05)
-    assert any("have no stamps" in line for line in sequence.warnings)
 
 
 # ------------------------------------------------------------------------------------------------ images
@@ -273,11 +257,9 @@ def test_encodings(encoding: str, pixels: np.ndarray, grey: int, dtype: type) ->
     assert found.dtype == dtype
     assert found.shape == (4, 6)
     assert abs(int(found[2, 2]) - grey) <= 256 * (dtype == np.uint16) * (encoding != "mono16") + 1
-
-
-def test_big_endian_pixels() -> None:
-    pixels = (100 * np.arange(24)).reshape(4, 6).astype(">u2")
-    assert np.array_equal(grey_image(image(STORES[2], T0, pixels, "mono16", True), RAW, "/x"), pixels)
+    if dtype == np.uint16:
+        swapped = grey_image(image(STORES[2], T0, pixels.byteswap(), encoding, True), RAW, "/x")
+        assert np.array_equal(swapped, found)
 
 
 def test_compressed_images(tmp_path: Path) -> None:
@@ -398,12 +380,6 @@ def test_cameras_that_are_not_calibrated(change: dict, words: str, tmp_path: Pat
 # ------------------------------------------------------------------------------------------------ faults
 
 
-def test_a_folder_above_names_the_recordings_in_it(bag: Path) -> None:
-    (bag.parent / "notes.txt").write_text("x")
-    with pytest.raises(SequenceError, match=r"below it are walk\.bag"):
-        slam.open_sequence(bag.parent)
-
-
 def test_without_the_package_the_line_says_how_to_install_it(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(SequenceError, match=r"pip install 'surf-stereo-slam\[ros\]'"):
@@ -436,10 +412,3 @@ def test_damaged_recordings_end_in_one_line_or_are_read(version: int, tmp_path: 
             list(slam.open_sequence(hurt))
         except SlamError as error:
             assert "\n" not in str(error)
-
-
-def test_a_recording_as_this_test_writes_it_is_one_for_others(bag: Path) -> None:
-    with AnyReader([bag]) as reader:
-        assert sorted(reader.topics) == [
-            "/stereo/left/camera_info", LEFT, "/stereo/right/camera_info", RIGHT,
-        ]  # fmt: skip

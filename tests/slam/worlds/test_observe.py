@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from slam.worlds import open_world
-from slam.worlds.appearance import ObservationModel, appearance
 from slam.worlds.observe import visible_landmarks
 
 CLEAN = "detect=1&stereo=1&outliers=0&confusion=0"
@@ -91,16 +90,6 @@ def test_descriptors_find_their_landmark_in_the_next_frame():
     assert right / total > 0.99
 
 
-@pytest.mark.parametrize("confusion", [0.0, 0.4])
-def test_share_of_landmarks_that_look_like_another(confusion):
-    sequence = open_world(f"aisle?confusion={confusion}")
-    descriptors = appearance(sequence.world, ObservationModel.of(sequence.values), 0).descriptors
-    distance = np.sqrt(np.maximum(2 - 2 * descriptors @ descriptors.T, 0)) + 9 * np.eye(len(descriptors))
-    assert 0.75 < np.median(distance) < 1.05, "as far apart as SURF's of unlike features"
-    alike = (distance.min(axis=1) < 0.25).mean()
-    assert confusion <= alike + 0.03 and alike <= 2 * confusion + 0.01
-
-
 def test_only_what_the_camera_sees_is_visible():
     """Visibility from geometry against the rendered depth: a second way to the same truth."""
     sequence = open_world("boxes?camera=moving&density=200")
@@ -114,33 +103,6 @@ def test_only_what_the_camera_sees_is_visible():
         assert same.mean() > 0.97
         on_objects = sequence.landmarks.object[truth.ids] > 0
         assert 10 < on_objects.sum() < len(truth.ids)
-
-
-def test_a_hidden_landmark_is_not_seen():
-    """Landmarks of the wall behind the boxes are left out, and none of that wall that nothing hides."""
-    sequence = open_world("boxes?camera=still&density=200")
-    world, k = sequence.world, 200
-    seen = visible_landmarks(world, k)
-    positions = world.landmarks.world_positions(world.T_world_body(k))
-    T = world.T_world_left[k]
-    points = (positions - T[:3, 3]) @ T[:3, :3]
-    uv = world.rig.left.project(points)
-    facing = (world.landmarks.object == 0) & (world.landmarks.normals[:, 1] < -0.9)
-    hidden = np.setdiff1d(np.flatnonzero(world.rig.left.in_image(uv, 3.0) & facing & (points[:, 2] > 0.3)), seen.ids)
-    u, v = np.rint(uv[hidden]).astype(int).T
-    assert len(hidden) > 10
-    assert (sequence.depth(k)[v, u] < points[hidden, 2] - 0.1).mean() > 0.9
-
-
-def test_moving_landmarks_move_with_their_object():
-    sequence = open_world("box?camera=still")
-    landmarks = sequence.landmarks
-    rows = np.flatnonzero(landmarks.object == 1)
-    assert len(rows) > 5
-    world = landmarks.world_positions(sequence.world.T_world_body(250))
-    T = sequence.objects(250).T_world_object[0]
-    assert np.allclose(world[rows], landmarks.positions[rows] @ T[:3, :3].T + T[:3, 3])
-    assert np.array_equal(np.delete(world, rows, 0), np.delete(landmarks.positions, rows, 0))
 
 
 def test_faults_take_features_away():

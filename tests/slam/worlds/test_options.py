@@ -52,22 +52,6 @@ def test_impossible_values_are_refused_in_one_line(query, message):
     assert "\n" not in str(caught.value)
 
 
-def test_values_are_read_by_the_type_of_their_default():
-    values = worlds.open_world("synthetic:box?frames=20&sigma=0.25&camera=still&drop=3,5:7").values
-    assert values["frames"] == 20
-    assert values["sigma"] == 0.25
-    assert values["camera"] == "still"
-    assert values["density"] == worlds.options("box")["density"].default
-
-
-def test_descriptions_name_every_option_of_a_world():
-    for name in worlds.names():
-        text = worlds.describe(name)
-        assert text.startswith(f"{name}: ")
-        shown = text + worlds.describe_common()
-        assert all(f"  {key}=" in shown for key in worlds.options(name))
-
-
 def test_the_documentation_names_every_world_and_every_option():
     text = DOCS.read_text(encoding="utf-8")
     for name in worlds.names():

@@ -9,8 +9,6 @@ from slam.worlds.geometry import RectangleArrays, rectangle
 from slam.worlds.lens import Lens, View
 from slam.worlds.observe import visible_landmarks
 from slam.worlds.placing import place
-from slam.worlds.textures.layout import fill_shelves
-from slam.worlds.textures.ripmap import Ripmap
 from slam.worlds.textures.surfaces import Material
 from slam.worlds.visibility import by_depth, by_order, painting_order, shown
 
@@ -49,27 +47,6 @@ def corner_errors(sequence, frames) -> np.ndarray:
             places = uv[clear & camera.in_image(uv, 12)]
             errors += [saddle(smooth, place) - place for place in places]
     return np.array(errors)
-
-
-def test_the_corners_of_an_ideal_picture_are_found_without_bias():
-    """A chess board in perspective, 32x32 samples in each pixel: what `saddle` adds to the errors of the renderer."""
-    rng, n, half = np.random.default_rng(0), 32, 14
-    fine = (np.arange((2 * half + 1) * n) + 0.5) / n - 0.5 - half
-    x, y = np.meshgrid(fine, fine)
-    errors = []
-    for _ in range(12):
-        corner, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2)
-        tilt = rng.uniform(-0.004, 0.004, 2)  # distance changes by up to a tenth over a field
-        dx, dy = x - corner[0], y - corner[1]
-        w = 1 + tilt[0] * dx + tilt[1] * dy
-        s = (np.cos(angle) * dx + np.sin(angle) * dy) / w / rng.uniform(12, 25)
-        t = (np.cos(angle) * dy - np.sin(angle) * dx) / w / rng.uniform(22, 30)
-        board = 130 + 90 * (1 - 2 * (np.floor(s) % 2)) * (1 - 2 * (np.floor(t) % 2))
-        picture = board.reshape(2 * half + 1, n, 2 * half + 1, n).mean(axis=(1, 3))
-        image = cv2.GaussianBlur(np.rint(picture).astype(np.uint8), (0, 0), 0.5)  # the lens
-        errors.append(saddle(smoothed(image), corner + half) - corner - half)
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.005
-    assert np.linalg.norm(errors, axis=1).max() < 0.03
 
 
 @pytest.mark.parametrize("rig", ["rectified", "toedin"])
@@ -203,28 +180,6 @@ def test_options_of_the_camera():
     colour = open_world("box?frames=2&colour=1").frame(0).left
     assert colour.shape == (240, 320, 3)
     assert np.ptp(colour.astype(int), axis=2).mean() > 5
-
-
-def test_a_ripmap_keeps_the_mean_and_never_runs_out():
-    picture = np.random.default_rng(0).integers(0, 255, (60, 90), dtype=np.uint8)
-    ripmap = Ripmap(picture)
-    assert ripmap.level((1 / 200, 1 / 200)) is not None
-    assert ripmap.level((1 / 200, 1 / 200)).shape == (60, 90)
-    assert ripmap.level((2 / 90, 1 / 60)).shape == (60, 45)
-    assert ripmap.level((50.0, 50.0)).shape == (1, 1)
-    assert ripmap.level((4 / 90, 4 / 60)).mean() == pytest.approx(picture.mean(), abs=0.5)
-
-
-def test_books_stand_on_their_boards_and_beside_each_other():
-    books = fill_shelves(2.7, 2.14, 3)
-    assert len(books.left) > 200
-    foot = np.round(books.top + books.height, 6)
-    for board in np.unique(foot):
-        row = np.flatnonzero(foot == board)
-        row = row[np.argsort(books.left[row])]
-        gap = books.left[row][1:] - (books.left + books.width)[row][:-1]
-        assert gap.min() > 0
-    assert (books.left + books.width + books.lean).max() < 2.7
 
 
 @pytest.mark.parametrize("frame", [20, 150])

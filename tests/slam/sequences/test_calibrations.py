@@ -1,0 +1,409 @@
+"""Calibrations of every form, and rigs by camera matrices: what they say, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+import slam
+from slam.errors import CalibrationError, ConfigurationError, SequenceError
+from slam.sequences import open_sequence
+from slam.sequences.calibration_files import write_kalibr, write_opencv
+from slam.sequences.rigs import read_rig
+
+SIZE = (64, 48)
+K = np.array([[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]])
+
+
+def same(a: slam.StereoRig, b: slam.StereoRig) -> bool:
+    return a.left == b.left and a.right == b.right and np.allclose(a.R, b.R, atol=1e-12) and np.allclose(a.b, b.b)
+
+
+@pytest.mark.parametrize("fixture", ["euroc", "kitti", "raw", "two_folders"])
+def test_a_folder_s_calibration_is_that_of_its_sequence(fixture: str, request) -> None:
+    folder: Path = request.getfixturevalue(fixture)
+    where = folder.parent if fixture == "raw" else folder  # the day's folder has it
+    size = None if fixture in ("euroc", "raw") else SIZE
+    assert same(slam.load_rig(where, size=size), open_sequence(folder).rig)
+
+
+def test_the_rig_projects_as_opencv_does(two_folders: Path, build: SimpleNamespace) -> None:
+    rig = open_sequence(two_folders).rig
+    entries = build.stereo_entries()
+    points = np.array([[0.1, -0.2, 2.0], [-0.5, 0.3, 3.0], [0.7, 0.1, 1.5]])
+    left, right = rig.project(points)
+    zero = np.zeros(3)
+    expected_left = cv2.projectPoints(points, zero, zero, entries["K1"], entries["D1"])[0][:, 0]
+    turn = cv2.Rodrigues(entries["R"])[0]
+    expected_right = cv2.projectPoints(points, turn, entries["T"], entries["K2"], entries["D2"])[0][:, 0]
+    assert np.allclose(left, expected_left, atol=1e-9)
+    assert np.allclose(right, expected_right, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ OpenCV's
+
+
+def test_opencv_s_entries_by_all_their_names(tmp_path: Path, build: SimpleNamespace) -> None:
+    """OpenCV's sample writes M1, D1, M2, D2 to intrinsics.yml and R, T to extrinsics.yml."""
+    e = build.stereo_entries()
+    build.write_storage(tmp_path / "all.xml", e)
+    build.write_storage(tmp_path / "intrinsics.yml", {"M1": e["K1"], "D1": e["D1"], "M2": e["K2"], "D2": e["D2"]})
+    build.write_storage(tmp_path / "extrinsics.yml", {"R": e["R"], "T": e["T"], "Q": np.eye(4)})
+    words = {"camera_matrix_left": e["K1"], "dist_coeffs_left": e["D1"], "camera_matrix_right": e["K2"]}
+    words |= {"dist_coeffs_right": e["D2"], "R": cv2.Rodrigues(e["R"])[0], "T": e["T"] * 1000}
+    build.write_storage(tmp_path / "words.json", words)
+    rig = slam.StereoRig.from_pinhole(e["K1"], e["K2"], D_left=e["D1"], D_right=e["D2"], R=e["R"], T=e["T"], size=SIZE)
+    assert same(slam.load_rig(tmp_path / "all.xml", size=SIZE), rig)
+    assert same(slam.load_rig(tmp_path / "intrinsics.yml", tmp_path / "extrinsics.yml", size=SIZE), rig)
+    assert same(slam.load_rig(tmp_path / "words.json", size=SIZE, unit="mm"), rig)
+
+
+def test_rectified_images_take_the_projection_matrices(tmp_path: Path, build: SimpleNamespace) -> None:
+    e = build.stereo_entries()
+    T = np.array(e["T"])
+    R1, R2, P1, P2 = cv2.stereoRectify(np.array(e["K1"]), e["D1"], e["K2"], e["D2"], SIZE, e["R"], T)[:4]
+    build.write_storage(tmp_path / "a.yml", {**e, "R1": R1, "R2": R2, "P1": P1, "P2": P2})
+    build.write_storage(tmp_path / "p.yml", {"P1": P1, "P2": P2})
+    rig = slam.load_rig(tmp_path / "a.yml", size=SIZE, rectified=True)
+    assert rig.is_rectified and rig.baseline == pytest.approx(np.linalg.norm(T), rel=1e-9)
+    assert same(slam.load_rig(tmp_path / "p.yml", size=SIZE), rig)
+    assert not slam.load_rig(tmp_path / "a.yml", size=SIZE).is_rectified
+
+
+def test_distortions_of_every_kind_and_length(tmp_path: Path, build: SimpleNamespace) -> None:
+    file, e = tmp_path / "a.yml", build.stereo_entries()
+    e["D1"] = e["D2"] = np.array([[0.01, 0.002, -0.001, 0.0003]])
+    build.write_storage(file, e)
+    points = np.array([[[0.1, -0.2, 2.0], [0.5, 0.3, 1.0]]])
+    expected = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), e["K1"], e["D1"])[0][0]
+    assert np.allclose(slam.load_rig(file, size=SIZE, fisheye=True).left.project(points[0]), expected, atol=1e-9)
+    assert slam.load_rig(file, size=SIZE).left.model == "radtan"
+    for count, kept in ((0, 0), (4, 4), (5, 5), (8, 8), (12, 8), (14, 8)):
+        D = np.zeros((1, max(count, 1)))
+        D[0, : min(count, 8)] = 0.01
+        build.write_storage(file, e | {"D1": D, "D2": D} if count else {k: v for k, v in e.items() if k[0] != "D"})
+        assert len(slam.load_rig(file, size=SIZE).left.distortion) == kept
+    D[0, 9] = 0.1
+    build.write_storage(file, {**e, "D1": D})
+    with pytest.raises(CalibrationError, match="thin prisms"):
+        slam.load_rig(file, size=SIZE)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"K2": None, "T": None}, "K2, T are missing"),
+        ({"R": None}, "R is missing"),
+        ({"R": 2 * np.eye(3)}, "R is not a rotation matrix"),
+        ({"R": np.eye(2)}, "R is no matrix of shape"),
+        ({"T": np.zeros((3, 1))}, "baseline is zero"),
+        ({"T": np.array([[np.nan], [0], [0]])}, "T is not finite"),
+        ({"K1": np.eye(4)}, "K1 is no matrix of shape"),
+    ],
+)
+def test_faulty_entries(tmp_path: Path, build: SimpleNamespace, change: dict, text: str) -> None:
+    entries = {k: v for k, v in {**build.stereo_entries(), **change}.items() if v is not None}
+    build.write_storage(tmp_path / "a.yml", entries)
+    with pytest.raises(CalibrationError) as error:
+        slam.load_rig(tmp_path / "a.yml", size=SIZE)
+    assert text in str(error.value)
+    assert str(tmp_path / "a.yml") in str(error.value)
+
+
+def test_a_rectified_pair_by_five_numbers(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("fx: 500\nfy: 501\ncx: 31.5\ncy: 23.5\nbaseline: 120.0\n")
+    rig = slam.load_rig(file, size=SIZE, unit="mm")
+    assert (rig.left.fu, rig.left.fv, rig.left.u0, rig.left.v0) == (500, 501, 31.5, 23.5)
+    assert rig.left == rig.right
+    assert np.allclose(rig.b, [-0.12, 0, 0])
+
+
+def test_all_that_is_wrong_with_five_numbers_is_said_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text("fx: 500\ncx: wide\ncy: .inf\nbaseline: -0.12\n")
+    with pytest.raises(CalibrationError) as error:
+        slam.load_rig(file, size=SIZE)
+    for part in ("fy is missing", "cx is no number", "cy is not finite", "baseline is -0.12, which must be positive"):
+        assert part in str(error.value)
+    file.write_text("fx: 500\nfy: 500\ncx: true\ncy: 24\nbaseline: 0.12\n")
+    with pytest.raises(CalibrationError, match="cx is no number"):
+        slam.load_rig(file, size=SIZE)
+
+
+CAMCHAIN = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 2e-4, 1e-5]
+  distortion_model: radtan
+  intrinsics: [50.0, 51.0, 31.5, 23.5]
+  resolution: [64, 48]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.9999, -0.0141418, 0.0, -0.11]
+  - [0.0141418, 0.9999, 0.0, 0.001]
+  - [0.0, 0.0, 1.0, 0.002]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 2e-4, 1e-5]
+  distortion_model: radtan
+  intrinsics: [50.0, 51.0, 31.5, 23.5]
+  resolution: [64, 48]
+"""
+
+
+def test_kalibr(two_folders: Path) -> None:
+    (two_folders / "calibration.yaml").unlink()
+    chain = two_folders / "camchain.yaml"
+    chain.write_text(CAMCHAIN)
+    rig = open_sequence(two_folders).rig
+    assert rig.left.distortion == (-0.28, 0.07, 2e-4, 1e-5)
+    T = rig.T_right_left
+    assert np.allclose(T[:3, 3], [-0.11, 0.001, 0.002], atol=1e-6)
+    assert T[0, 1] == pytest.approx(-0.0141418, abs=1e-6)
+    with pytest.raises(
+        ConfigurationError, match=r"option 'unit' does nothing with .*camchain\.yaml, which is Kalibr's"
+    ):
+        open_sequence(f"{two_folders}?unit=mm")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
+        ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
+        ("cam1:", "cam7:", "cam1/intrinsics, cam1/T_cn_cnm1 are missing (it looks like Kalibr's)"),
+        ("T_cn_cnm1:", "T_cm_cnm1:", "T_cn_cnm1 is missing"),
+        ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 2.0, 0.002]", "T_cn_cnm1 is not a rigid motion"),
+        ("[0.0, 0.0, 1.0, 0.002]", "[0.0, 0.0, 1.0]", "cam1/T_cn_cnm1 is no matrix of shape (4, 4)"),
+        ("intrinsics: [50.0, 51.0", "intrinsics: [50.0", "intrinsics has 3 numbers, 4 expected"),
+        ("intrinsics: [50.0", "intrinsics: [.nan", "intrinsics is not finite"),
+        ("intrinsics: [50.0", "intrinsics: [-50.0", "focal lengths must be positive"),
+        ("2e-4, 1e-5]", "2e-4]", "takes 4 coefficients or more, got 3"),
+        ("resolution: [64, 48]", "resolution: [64]", "resolution is no matrix of shape (2,)"),
+        ("cam0:", "cam0: [", "no valid YAML"),
+        (CAMCHAIN, "cam0:\ncam1:\n", "K1, K2, R, T are missing; in it: cam0, cam1"),
+    ],
+)
+def test_faulty_kalibr_files(two_folders: Path, old: str, new: str, text: str) -> None:
+    (two_folders / "calibration.yaml").unlink()
+    chain = two_folders / "camchain.yaml"
+    chain.write_text(CAMCHAIN.replace(old, new, 1))
+    with pytest.raises(CalibrationError) as error:
+        open_sequence(two_folders)
+    assert text in str(error.value)
+    assert str(chain) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------------ other programs'
+
+
+def camera_yaml(tx: float, D: str = "0.1, 0, 0, 0, 0") -> str:
+    def matrix(name: str, rows: int, columns: int, data: str) -> str:
+        return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{data}]\n"
+
+    return (
+        "image_width: 64\nimage_height: 48\ncamera_name: stereo/left\ndistortion_model: plumb_bob\n"
+        + matrix("camera_matrix", 3, 3, "50, 0, 31, 0, 51, 23, 0, 0, 1")
+        + matrix("distortion_coefficients", 1, 5, D)
+        + matrix("rectification_matrix", 3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1")
+        + matrix("projection_matrix", 3, 4, f"40, 0, 32, {tx}, 0, 40, 24, 0, 0, 0, 1, 0")
+    )
+
+
+def test_ros_s_two_camera_files(tmp_path: Path) -> None:
+    left, right = tmp_path / "left.yaml", tmp_path / "right.yaml"
+    left.write_text(camera_yaml(0))
+    right.write_text(camera_yaml(-8))
+    rig = slam.load_rig(left, right)
+    assert (rig.left.fu, rig.left.distortion[0], rig.baseline) == (50, 0.1, pytest.approx(0.2))
+    assert slam.load_rig(left, right, rectified=True).left.fu == 40
+    assert slam.load_rig(tmp_path).baseline == pytest.approx(0.2)
+    with pytest.raises(ConfigurationError, match=r"'unit' does nothing with .*, which is ROS's"):
+        slam.load_rig(left, right, unit="mm")
+    with pytest.raises(CalibrationError, match="one camera's: name both files"):
+        slam.load_rig(left)
+    right.write_text(camera_yaml(0))
+    with pytest.raises(CalibrationError, match="P of the right one holds no baseline"):
+        slam.load_rig(left, right)
+
+
+ORB = "%YAML:1.0\n---\n" + "".join(f"Camera.{k}: {v}\n" for k, v in (("fx", 50), ("fy", 50), ("cx", 31), ("cy", 23)))
+MATRIX = "{}: !!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: [{}]\n"
+LEFT_RIGHT = "".join(
+    MATRIX.format(f"{side}.{name}", rows, columns, data)
+    for side, tx in (("LEFT", 0), ("RIGHT", -8))
+    for name, rows, columns, data in (
+        ("D", 1, 5, "0.1, 0, 0, 0, 0"),
+        ("K", 3, 3, "45, 0, 30, 0, 45, 22, 0, 0, 1"),
+        ("R", 3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1"),
+        ("P", 3, 4, f"40, 0, 32, {tx}, 0, 40, 24, 0, 0, 0, 1, 0"),
+    )
+)
+ORB3 = (
+    "%YAML:1.0\n---\nCamera.type: 'PinHole'\nCamera.width: 64\nCamera.height: 48\n"
+    + "".join(
+        f"Camera{i}.{k}: {v}\n"
+        for i in (1, 2)
+        for k, v in (("fx", 45), ("fy", 46), ("cx", 31), ("cy", 23), ("k1", 0.1), ("k2", 0), ("p1", 0), ("p2", 0))
+    )
+    + MATRIX.format("Stereo.T_c1_c2", 4, 4, "1, 0, 0, 0.2, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1")
+)
+STELLA = (
+    "Camera:\n  setup: stereo\n  model: perspective\n  fx: 50\n  fy: 50\n  cx: 31\n  cy: 23\n  cols: 64\n  rows: 48\n"
+    "  focal_x_baseline: 10\n"
+)
+STELLA_RAW = STELLA + (
+    "StereoRectifier:\n  model: perspective\n"
+    + "".join(
+        f"  K_{side}: [45, 0, 31, 0, 45, 23, 0, 0, 1]\n  D_{side}: [0.1, 0, 0, 0, 0]\n"
+        f"  R_{side}: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
+        for side in ("left", "right")
+    )
+)
+ZED = (
+    "".join(
+        f"[{side}_CAM_{name}]\nfx={f}\nfy={f}\ncx={f}\ncy={f // 2}\nk1=0.1\nk2=0\n"
+        for side in ("LEFT", "RIGHT")
+        for name, f in (("HD", 600), ("VGA", 300))
+    )
+    + "[STEREO]\nBaseline=120\nTY=0.1\nTZ=0.2\nRX_HD=0.01\nCV_HD=0.02\nRZ_HD=0.0\n"
+)
+OAK_CAMERA = (
+    '[{socket}, {{"cameraType": 0, "width": 64, "height": 48, "distortionCoeff": [0.1, 0, 0, 0, 0, 0, 0, 0, 0, 0, '
+    '0, 0, 0, 0], "intrinsicMatrix": [[45, 0, 31], [0, 45, 23], [0, 0, 1]], '
+    '"extrinsics": {{"rotationMatrix": [[1, 0, 0], '
+    '[0, 1, 0], [0, 0, 1]], "toCameraSocket": {to}, "translation": {{"x": {x}, "y": 0, "z": 0}}}}}}]'
+)
+OAK = '{"cameraData": [' + OAK_CAMERA.format(socket=1, to=2, x=-20) + ", " + OAK_CAMERA.format(socket=2, to=0, x=3)
+OAK += '], "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2}}'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "size", "focal", "baseline", "rectified"),
+    [
+        ("orb.yaml", ORB + "Camera.bf: 10\nCamera.width: 64\nCamera.height: 48\n", None, 50, 0.2, True),
+        ("orb_raw.yaml", ORB + "Camera.bf: 10\n" + LEFT_RIGHT, (64, 48), 45, 0.2, False),
+        ("orb3.yaml", ORB3, None, 45, 0.2, False),
+        ("stella.yaml", STELLA, None, 50, 0.2, True),
+        ("stella_raw.yaml", STELLA_RAW, None, 45, 0.2, False),
+        ("SN123.conf", ZED, (1280, 720), 600, 0.12, False),
+        ("SN123.conf", ZED, (672, 376), 300, 0.12, False),
+        ("oak.json", OAK, None, 45, 0.2, False),
+    ],
+)
+def test_calibrations_of_other_programs(
+    tmp_path: Path, name: str, text: str, size: tuple[int, int] | None, focal: float, baseline: float, rectified: bool
+) -> None:
+    file = tmp_path / name
+    file.write_text(text)
+    rig = slam.load_rig(file, size=size)
+    assert rig.left.fu == focal and rig.is_rectified == rectified
+    assert rig.baseline == pytest.approx(baseline, rel=1e-5)
+    assert rectified or rig.left.distortion[0] == 0.1
+    with pytest.raises(ConfigurationError, match="'unit' does nothing with"):
+        slam.load_rig(file, size=size, unit="mm")
+
+
+def test_what_is_recognised_but_cannot_be_read_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.conf"
+    file.write_text(ZED)
+    with pytest.raises(CalibrationError, match="it is a ZED's, for images of another size than 64x48; it has 1280x720"):
+        slam.load_rig(file, size=(64, 48))
+    file.write_text(ORB + "Camera.k1: 0.1\nCamera.bf: 10\n")
+    with pytest.raises(CalibrationError, match="names distortion, but only one camera"):
+        slam.load_rig(file, size=(64, 48))
+    file.write_text(OAK.replace('"toCameraSocket": 2', '"toCameraSocket": 0'))
+    with pytest.raises(CalibrationError, match="depthai's, but says nothing of how the pair stands"):
+        slam.load_rig(file)
+    for number, text in enumerate(("Image_Size: [64, 48]\nfoo_Bar: 1\n", "K1: [1]\n")):
+        (tmp_path / f"{number}.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match=r"in it: Image_Size, K1, foo_Bar"):
+        slam.load_rig(tmp_path / "0.yaml", tmp_path / "1.yaml")
+
+
+def test_a_calibration_for_other_images_is_said_before_what_fails(two_folders: Path, build: SimpleNamespace) -> None:
+    K, D = np.array([[12.0, 0, 7], [0, 12, 5], [0, 0, 1]]), np.array([[-0.35, 0.15, 0, 0]])
+    entries = {"K1": K, "K2": K, "D1": D, "D2": D, "R": np.eye(3), "T": np.array([[-0.12], [0], [0]])}
+    build.write_storage(two_folders / "calibration.yaml", entries)
+    with pytest.raises(CalibrationError, match=r"\(7, 5\) px, .*is the calibration for images of another size\?"):
+        slam.StereoSlam(open_sequence(f"{two_folders}?fps=10").rig)
+
+
+def test_the_errors_of_a_rig_are_no_rig(tmp_path: Path) -> None:
+    (tmp_path / "calibration.json").write_text('{"rig": {}, "residual_scale": 1, "parameters": []}')
+    with pytest.raises(CalibrationError, match=r"errors of a rig, .* not a rig: see --calibration"):
+        slam.load_rig(tmp_path)
+
+
+def test_a_written_calibration_is_of_the_images_as_recorded(tmp_path: Path) -> None:
+    camera = slam.StereoRig.from_pinhole([[50.0, 0, 20], [0, 50, 30], [0, 0, 1]], baseline=0.2, size=(48, 64)).left
+    camera = replace(camera, model="radtan", distortion=(0.1, 0.0, 0.01, 0.02))
+    rig = slam.StereoRig.side_by_side(camera, camera, np.eye(3), np.array([0.0, -0.2, 0.0]))
+    for write in (write_opencv, write_kalibr):
+        write(tmp_path / "c.yaml", rig)
+        again = read_rig([tmp_path / "c.yaml"], (48, 64), {})
+        assert again.turns == rig.turns == 1
+        assert again.left == rig.left and np.allclose(again.b, rig.b)
+
+
+def test_what_is_no_calibration_is_one_line(tmp_path: Path, two_folders: Path, kitti: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"nowhere\.yaml: the calibration is missing"):
+        slam.load_rig(tmp_path / "nowhere.yaml")
+    with pytest.raises(CalibrationError, match="no calibration under one of the usual names"):
+        slam.load_rig(tmp_path / "mine" / "left")
+    for file in (two_folders / "calibration.yaml", kitti / "calib.txt"):
+        with pytest.raises(CalibrationError, match=rf"{file.name}: names no image size: give size=\(width, height\)"):
+            slam.load_rig(file)
+    with pytest.raises(SequenceError, match=r"images are 32x24, but .* is for 64x48"):
+        load_euroc_as(tmp_path, (32, 24))
+    with pytest.raises(ConfigurationError, match="unit must be one of m, cm, mm"):
+        slam.load_rig(two_folders, size=(64, 48), unit="inch")
+    with pytest.raises(CalibrationError, match="no calibration is named"):
+        slam.load_rig()
+
+
+def test_two_equal_cameras_side_by_side() -> None:
+    rig = slam.StereoRig.from_pinhole(K.tolist(), baseline=0.12, size=(64, 48), D_left=[0.1, 0, 0, 0])
+    assert rig.left == rig.right
+    assert rig.left.model == "radtan"
+    assert np.array_equal(rig.b, [-0.12, 0, 0])
+    fisheye = slam.StereoRig.from_pinhole(K, baseline=0.12, size=(64, 48), D_left=[0.1, 0, 0, 0], fisheye=True)
+    points = np.array([[0.3, -0.2, 1.0]])
+    pixel = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), K, np.array([0.1, 0, 0, 0]))[0][0]
+    assert np.allclose(fisheye.left.project(points), pixel)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"baseline": None}, "give either T or baseline"),
+        ({"T": [-0.1, 0, 0]}, "give either T or baseline"),
+        ({"baseline": -0.1}, "swapped"),
+        ({"baseline": "wide"}, "must be numbers"),
+        ({"R": np.eye(4)}, r"\(3, 3\) rotation"),
+        ({"R": np.full((3, 3), np.nan)}, "finite"),
+        ({"D_left": np.ones(14)}, "thin prisms"),
+        ({"D_left": "none"}, "no numbers"),
+        ({"K_right": np.eye(2)}, r"\(3, 3\)"),
+        ({"size": (64, 0)}, "size must be positive"),
+    ],
+)
+def test_impossible_rigs_are_refused(change: dict, words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        slam.StereoRig.from_pinhole(**{"K_left": K, "baseline": 0.1, "size": (64, 48), **change})
+
+
+def load_euroc_as(folder: Path, size: tuple[int, int]) -> None:
+    camera = "T_BS: [1,0,0,{x}, 0,1,0,0, 0,0,1,0, 0,0,0,1]\nresolution: [64, 48]\nintrinsics: [50, 50, 31, 23]\n"
+    files = [folder / name for name in ("a.yaml", "b.yaml")]
+    for file, x in zip(files, (0.0, 0.1)):
+        file.write_text(camera.format(x=x))
+    slam.load_rig(*files, size=size)

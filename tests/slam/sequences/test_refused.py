@@ -1,0 +1,373 @@
+"""Whole sequences that cannot be read, also ones made on purpose: one clear line each, and no more cost than size."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.errors import CalibrationError, ConfigurationError, SequenceError, SlamError, UnknownNameError
+from slam.sequences import open_sequence
+from slam.sequences.yaml_files import read_yaml
+
+RIGHT = {"euroc": "mav0/cam1", "kitti": "image_1", "raw": "image_01", "two_folders": "right"}
+CALIBRATION = {
+    "euroc": "mav0/cam1/sensor.yaml", "kitti": "calib.txt", "raw": "../calib_cam_to_cam.txt",
+    "two_folders": "calibration.yaml",
+}  # fmt: skip
+FORMATS = tuple(RIGHT)
+
+
+def refused(path, error=SlamError, words=None, seconds=1.0):
+    """Opening and reading it ends in one line, within a second of processor time."""
+    started = time.process_time()
+    with pytest.raises(error, match=words) as caught:
+        list(open_sequence(path))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
+    assert time.process_time() - started < seconds
+    return str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------ paths and options
+
+
+@pytest.mark.parametrize(
+    "path", ["~nobody_of_this_name", "a\0b", "x" * 300, "/".join(["y" * 200] * 30), "/proc", "/proc/self", "new\nline",
+             "?" * 300, ""],
+)  # fmt: skip
+def test_paths_that_are_none(path):
+    refused(path, SequenceError)
+
+
+def test_folders_that_are_no_sequence_and_what_may_be_meant(tmp_path, kitti, euroc, raw):
+    here = tmp_path / "here"
+    for name in ("empty", "corridor", "text", "pair/cam_l", "pair/cam_r", "pair/run"):
+        (here / name).mkdir(parents=True)
+    for name in (
+        "text/a.txt",
+        "both.mp4",
+        "pair/run/summary.png",
+        *(f"pair/cam_{s}/{k}.png" for s in "lr" for k in "01"),
+    ):
+        (here / name).write_text("x")
+    for path, words in {
+        "nowhere": "nowhere: there is no such folder",
+        "nowhere.bag": r"nowhere\.bag: there is no such file or folder",
+        "empty": "the folder is empty",
+        "text": "no sequence of a known format",
+        "text/a.txt": r"a\.txt: a file where the sequence's folder should be$",
+        "both.mp4": r"folder should be; a video .* is .*both\.mp4\?layout=sbs",
+        "coridor/left": f"did you mean '{here / 'corridor'}'",
+        "garden/left": f"{here} has no 'garden'",
+        "pair": r"say which is which: 'pair\?left=cam_l&right=cam_r'$",
+        kitti / "image_0": rf"give {kitti} .format kitti",
+        euroc / "mav0/cam0/data": rf"give {euroc}(/mav0)? .format euroc",
+        kitti.parent.parent: r"no sequence of a known format .*; below it are sequences.03$",
+        raw.parent: r"below it are 2011_09_26_drive_0013_sync$",
+    }.items():
+        refused(here / path, SequenceError, words)
+
+
+@pytest.mark.parametrize(
+    ("query", "error", "words"),
+    [
+        ("left=nowhere", SequenceError, "there is no such folder or video"),
+        ("left=x*.png", SequenceError, "no images"),
+        ("left=a%00b&right=c", ConfigurationError, "NUL"),
+        ("left=" + "x" * 300, SequenceError, "too long"),
+        ("left=/proc&right=/proc", SequenceError, None),
+        ("calibration=nowhere.yaml", CalibrationError, "the calibration is missing"),
+        ("calibration=~nobody_of_this_name", CalibrationError, None),
+        ("calibration=/dev/zero", CalibrationError, None),
+        ("times=nowhere.txt", SequenceError, "nowhere.txt: No such file"),
+        ("times=/dev/zero", SequenceError, None),
+        ("times=t.txt&fps=3", ConfigurationError, "'fps' does nothing here"),
+        ("tolerance=0.1", ConfigurationError, "'tolerance' does nothing here"),
+        ("fps=0", ConfigurationError, "fps must be a number from 0.001"),
+        ("fps=fast", ConfigurationError, "got 'fast'"),
+        ("fps=1e308", ConfigurationError, None),
+        ("unit=feet", ConfigurationError, "unit must be one of m, cm, mm"),
+        ("rectified=maybe", ConfigurationError, "rectified must be yes or no"),
+        ("rectified=yes", CalibrationError, "P1, P2 are missing"),
+        ("kind=flying", ConfigurationError, "'flying'.*driving, handheld"),
+        ("layout=stacked", ConfigurationError, "layout must be sbs"),
+        ("speed=3", ConfigurationError, "unknown option 'speed' of format folders; known: calibration, fi"),
+        ("&".join(f"a{i}=1" for i in range(1000)), ConfigurationError, "more than 100 options"),
+        ("mask=black.png", ConfigurationError, "black all over"),
+        ("mask=small.png", ConfigurationError, "another size"),
+        ("mask=nowhere.png", SequenceError, "mask: .*nowhere"),
+    ],
+)  # fmt: skip
+def test_options_that_are_none(two_folders, query, error, words):
+    (two_folders / "t.txt").write_text("".join(f"{i}\n" for i in range(6)))
+    cv2.imwrite(str(two_folders / "black.png"), np.zeros((48, 64), np.uint8))
+    cv2.imwrite(str(two_folders / "small.png"), np.ones((4, 4), np.uint8))
+    refused(f"{two_folders}?{query}", error, words)
+
+
+def test_options_of_other_formats(kitti, euroc):
+    refused(f"{kitti}?tolerance=0.1", ConfigurationError, r"option 'tolerance' does nothing here: .* is read as kitti")
+    refused(f"{kitti}?rectified=yes", ConfigurationError, "does nothing here")
+    refused(f"{euroc}?tolerance=-1", ConfigurationError, "tolerance must be a number from 0 to 10")
+    with pytest.raises(UnknownNameError, match="unknown format 'movie'; known: euroc, kitti-raw, kitti"):
+        open_sequence(kitti, format="movie")
+
+
+# ------------------------------------------------------------------------------------------------ parts missing
+
+
+@pytest.mark.parametrize("fixture", FORMATS)
+def test_a_right_camera_that_is_none(fixture, request, build):
+    folder: Path = request.getfixturevalue(fixture)
+    right, images = folder / RIGHT[fixture], sorted((folder / RIGHT[fixture]).rglob("*.png"))
+    for path in images:
+        build.write_image(path, 0, width=60)
+    refused(folder, SequenceError, r"differ in size: .* is 64x48, .* is 60x48")
+    for path in images:
+        path.unlink()
+    refused(folder, SequenceError, r"no images|none of the 6 images")
+    shutil.rmtree(right)
+    assert str(folder) in refused(folder, SequenceError, "two cameras are needed")
+    right.write_text("hello")
+    refused(folder, SequenceError, r"a file where a folder|two cameras are needed")
+
+
+@pytest.mark.parametrize("fixture", FORMATS)
+def test_a_calibration_that_is_none(fixture, request):
+    folder: Path = request.getfixturevalue(fixture)
+    path = folder / CALIBRATION[fixture]
+    text = path.read_text()
+    for content in (b"", b"hello", b"\x00\xff\xfe" * 50, b"K1: [1, 2", b"%YAML:1.0\n---\nK1: 3\n"):
+        path.write_bytes(content)
+        assert path.name in refused(folder, CalibrationError)
+    number = next(n for n in ("50.0,", "5.000000e+01", "50.") if n in text)
+    yaml, comma = path.suffix == ".yaml", "," * number.endswith(",")
+    for word in (".nan", ".inf") if yaml else ("nan", "inf"):
+        path.write_text(text.replace(number, word + comma, 1))
+        assert path.name in refused(folder, CalibrationError, "not finite")
+    for word in ("9" * 400, "9" * 5000, "1e400", "1e300"):
+        path.write_text(text.replace(number, word + comma, 1))
+        assert path.name in refused(folder, CalibrationError)
+    path.unlink()
+    assert str(folder.parent) in refused(folder, CalibrationError, "calibration is missing")
+
+
+def test_calibrations_of_other_cameras(euroc, kitti, raw, two_folders, build):
+    build.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", -0.11)
+    for path in (kitti / "calib.txt", raw.parent / "calib_cam_to_cam.txt"):
+        path.write_text(path.read_text().replace("-2.500000e+01", "2.500000e+01"))
+    build.write_storage(two_folders / "calibration.yaml", build.stereo_entries(-0.2))
+    for folder, name in ((euroc, "sensor.yaml"), (kitti, "calib.txt"), (raw, "calib_cam"), (two_folders, "calib")):
+        assert name in refused(folder, CalibrationError, "are the cameras swapped")
+    build.write_sensor(euroc / "mav0" / "cam1" / "sensor.yaml", 0.11)
+    path = raw.parent / "calib_cam_to_cam.txt"
+    path.write_text(path.read_text().replace(" 2.500000e+01", " -2.500000e+01"))
+    entries = {**build.stereo_entries(), "image_width": 640, "image_height": 480}
+    build.write_storage(two_folders / "calibration.yaml", entries)
+    refused(two_folders, SequenceError, r"images are 64x48, but .*calibration\.yaml is for 640x480")
+    for folder in (euroc, raw):
+        for path in folder.rglob("*.png"):
+            build.write_image(path, 0, width=74, height=58)
+    refused(euroc, SequenceError, r"images are 74x58, but .*sensor\.yaml is for 64x48")
+    refused(raw, CalibrationError, r"cam_to_cam.*images are 74x58.*64x48.*unrectified \(extract\) drive")
+    lines = (kitti / "calib.txt").read_text().splitlines()
+    for row in ("P1: 0 0 0 0 0 0 0 0 0 0 0 0", "P1: 50 1 31.5 -25 0 50 23.5 0 0 0 1 0", "P1: 1 2 3"):
+        (kitti / "calib.txt").write_text("\n".join([lines[0], row]))
+        refused(kitti, CalibrationError, r"calib\.txt: (not a rectified projection|P1 has 3 numbers)")
+
+
+def test_lists_that_are_none_are_named_with_the_row(euroc, kitti, raw, two_folders):
+    table, times = euroc / "mav0/cam0/data.csv", raw / "image_00/timestamps.txt"
+    lines = table.read_text().splitlines()
+    for path, text, words in (
+        (table, "#t,f\nfirst row,a.png\nsecond,b.png\n", r"cam0/data\.csv, row 2: 'first row' is not a time in whole"),
+        (table, "\n".join([lines[0], *lines[:0:-1]]), "5 of 6 stamps stand twice or run backwards"),
+        (kitti / "times.txt", "0.0\nnan\nnan\nnan\n", r"times\.txt, row 2: 'nan' is not a finite time"),
+        (kitti / "times.txt", "6\n5\n4\n3\n2\n1\n", "of 6 images 0 have no time and 5 one that does not increase"),
+        (times, "half past one\n" * 6, r"timestamps\.txt, row 1: 'half past one' is not a date and time"),
+        (times, "\n\n", r"timestamps\.txt: the file has no rows"),
+        *(
+            (two_folders / "times.txt", "".join(f"{(1.7e9 + k) * size:.0f}\n" for k in range(6)), f"is it in {unit}")
+            for size, unit in ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"))
+        ),
+    ):  # fmt: skip
+        path.write_text(text)
+        folder = next(f for f in (euroc, kitti, raw, two_folders) if f in path.parents)
+        refused(folder, SequenceError, words)
+
+
+def test_images_that_never_pair(euroc, kitti, two_folders, build):
+    table = euroc / "mav0" / "cam1" / "data.csv"
+    table.write_text(
+        "".join(f"{s + 20_000_000},{s}.png\n" for s in range(build.T0, build.T0 + 6 * build.STEP, build.STEP))
+    )
+    refused(euroc, SequenceError, "the nearest two are 20 ms apart, 5 ms are allowed; see tolerance=")
+    for path in (kitti / "image_1").iterdir():
+        build.cut(path)
+    refused(kitti, SequenceError, r"no pair of images can be read: .*PNG is cut off")
+    for side in ("left", "right"):
+        for path, name in zip(sorted((two_folders / side).iterdir()), "abcdef"):
+            path.rename(path.with_name(f"{name}.png"))
+    (two_folders / "left" / "c.png").unlink()
+    refused(two_folders, SequenceError, r"left has 5 images and .*right has 6")
+
+
+# ------------------------------------------------------------------------------------------------ made on purpose
+
+
+@pytest.mark.parametrize("stem", ["9" * 19, "9" * 200, str(2**63), "١٢"])
+def test_numbers_in_names_beyond_64_bits_are_left_out(kitti, euroc, two_folders, stem):
+    (kitti / "image_0" / "000003.png").rename(kitti / "image_0" / f"{stem}.png")
+    assert [round(f.stamp, 1) for f in open_sequence(kitti)] == [0.0, 0.1, 0.2, 0.4, 0.5]
+    for cam in ("cam0", "cam1"):
+        (euroc / "mav0" / cam / "data.csv").unlink()
+        first = min((euroc / "mav0" / cam / "data").iterdir())
+        first.rename(first.with_name(f"{stem}.png"))
+    assert len(list(open_sequence(euroc))) == 5
+    for side in ("left", "right"):
+        for k, image in enumerate(sorted((two_folders / side).iterdir())):
+            image.rename(image.with_name(f"{stem[:16]}.png" if k == 5 else f"{10**18 + k}.png"))
+    stamps = [f.stamp for f in open_sequence(two_folders)]
+    assert stamps and (np.diff(stamps) > 0).all()
+
+
+@pytest.mark.parametrize("fixture", ["kitti", "raw"])
+def test_a_huge_frame_number_without_times_asks_for_no_memory(fixture, request):
+    folder = request.getfixturevalue(fixture)
+    for camera in ("image_0", "image_1") if fixture == "kitti" else ("image_00/data", "image_01/data"):
+        last = max((folder / camera).iterdir())
+        last.rename(last.with_name("000009999999999.png"))
+    for times in folder.rglob("times*.txt"):
+        times.unlink()
+    stamps = [f.stamp for f in open_sequence(folder)]
+    assert len(stamps) == 6 and stamps[-1] == 999999999.9
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "times.txt", "image_0/000002.png", "../../poses/03.txt"])
+@pytest.mark.parametrize("what", ["pipe", "/dev/zero", "folder", "loop"])
+def test_what_is_no_regular_file_is_never_waited_for(kitti, name, what):
+    path = kitti / name
+    path.unlink()
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(path if what == "loop" else what)
+    started = time.monotonic()
+    try:
+        sequence = open_sequence(kitti)
+        frames = len(list(sequence))
+    except SlamError as error:
+        assert str(path.name) in str(error)
+    else:
+        assert frames == (5 if name.endswith(".png") else 6)
+        assert name == "../../poses/03.txt" or sequence.warnings
+    assert time.monotonic() - started < 20
+
+
+@pytest.mark.parametrize("what", ["pipe", "/dev/zero", "/proc/self/status", "no UTF-8"])
+def test_what_is_no_video(two_folders, what):
+    """OpenCV ends the process where a name is not in UTF-8."""
+    left, right = ("left\udc80.avi", "right\udc80.avi") if what == "no UTF-8" else ("left.avi", "right.avi")
+    for name in (left, right):
+        if what == "pipe":
+            os.mkfifo(two_folders / name)
+        elif what == "no UTF-8":
+            (two_folders / name).write_bytes(b"RIFF")
+        else:
+            (two_folders / name).symlink_to(what)
+    refused(f"{two_folders}?left={left}&right={right}", SlamError, "not in UTF-8" if what == "no UTF-8" else None)
+
+
+LAUGHS = "a: &a [1,1,1,1,1,1,1,1]\n" + "".join(
+    f"a{k}: &a{k} [{','.join([f'*a{k - 1}' if k else '*a'] * 8)}]\n" for k in range(12)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [LAUGHS, "a: &a {x: 1}\nb: {<<: [*a, *a]}", "x: &x [*x]", "x: " + "[" * 10_000, "x: !!bool maybe", "x: !!int ''",
+     "x: !!timestamp x", "x: !!float z", "? {a: 1}\n: 2", "x: " + "9" * 5000, "x: " + ":".join(["59"] * 3000), "- 1"],
+)  # fmt: skip
+def test_hostile_yaml(tmp_path, text):
+    (tmp_path / "a.yaml").write_text(text)
+    started = time.process_time()
+    with pytest.raises(CalibrationError, match=r"a\.yaml") as caught:
+        read_yaml(tmp_path / "a.yaml")
+    assert "\n" not in str(caught.value)
+    assert time.process_time() - started < 2.0
+
+
+def test_yaml_names_the_row_that_an_editor_shows_and_nothing_is_executed(tmp_path):
+    for first in ("%YAML:1.0\n---", "%YAML 1.1\n---", "---\n# a comment"):
+        (tmp_path / "a.yaml").write_text(f"{first}\nx: 1\ny: }}\nz: 3\n")
+        with pytest.raises(CalibrationError, match=r"a\.yaml, row 4: no valid YAML"):
+            read_yaml(tmp_path / "a.yaml")
+    (tmp_path / "a.yaml").write_text(f"x: !!python/object/apply:os.mkdir [{tmp_path / 'made'}]\n")
+    assert read_yaml(tmp_path / "a.yaml") == {"x": None}
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ['<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "<a>" * 10_000, '<?xml version="1.0" encoding="x"?><a/>']
+)
+def test_hostile_xml(two_folders, text):
+    (two_folders / "calibration.yaml").unlink()
+    (two_folders / "calibration.xml").write_text(text)
+    refused(two_folders, CalibrationError, "calibration.xml")
+
+
+def damage(data: bytes, rng: np.random.Generator) -> bytes:
+    """Bytes replaced, lines shuffled, a line or a word lost, a word replaced, or the end cut off."""
+    lines, words = data.split(b"\n"), data.split(b" ")
+    at, word = int(rng.integers(len(lines))), int(rng.integers(len(words)))
+    junk = [b"nan", b"-1", b"1e400", b"", b"\0", b"0", b"99999999999999999999", b"[", b"{a: b}"][rng.integers(9)]
+    flipped = bytearray(data)
+    for i in rng.integers(0, len(data), 3):
+        flipped[i] = rng.integers(256)
+    return [
+        bytes(flipped),
+        b"\n".join(lines[i] for i in rng.permutation(len(lines))),
+        b"\n".join(lines[:at] + lines[at + 1 :]),
+        b" ".join(words[:word] + words[word + 1 :]),
+        b" ".join([*words[:word], junk, *words[word + 1 :]]),
+        data[: rng.integers(len(data))],
+    ][rng.integers(6)]
+
+
+@pytest.mark.parametrize("fixture", [*FORMATS, "xml", "json", "video"])
+def test_damaged_files_are_errors_or_warnings_never_anything_else(fixture, request, tmp_path, build):
+    """OpenCV's own reader of calibrations ends the process on some of these, so another one reads them."""
+    folder: Path = request.getfixturevalue(fixture if fixture in FORMATS else "two_folders")
+    if fixture == "two_folders":
+        (folder / "times.txt").write_text("0\n1\n2\n3\n4\n5\n")
+    if fixture in ("xml", "json"):
+        (folder / "calibration.yaml").unlink()
+        build.write_storage(folder / f"calibration.{fixture}", build.stereo_entries())
+    if fixture == "video":
+        for side in ("left", "right"):
+            writer = cv2.VideoWriter(str(folder / f"{side}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 20, (64, 48))
+            for k in range(6):
+                writer.write(np.random.default_rng(k).integers(0, 256, (48, 64, 3), dtype=np.uint8))
+            writer.release()
+    text = f"{folder}?left=left.avi&right=right.avi" if fixture == "video" else folder
+    suffixes = {"video": (".avi",)}.get(fixture, (".txt", ".csv", ".yaml", ".xml", ".json"))
+    files = sorted(p for p in tmp_path.rglob("*") if p.suffix in suffixes)
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        path = files[rng.integers(len(files))]
+        data = path.read_bytes()
+        path.write_bytes(damage(data, rng))
+        try:
+            stamps = [f.stamp for f in open_sequence(text)]
+            assert (np.diff(stamps) > 0).all()
+        except SlamError as error:
+            assert "\n" not in str(error)
+        path.write_bytes(data)
+    assert len(open_sequence(text)) == 6
