@@ -4,7 +4,7 @@
         [--out DIR]
 
 Parts: table1 (paper B, Table 1: a box at four places), moving (the box under a moving camera, with and without it),
-paired (both back ends on identical measurements), boxes, occlusion (the box's id after it was hidden), still (no false
+boxes, occlusion (the box's id after it was hidden), still (no false
 movers), street, people (cyclists, walkers), kitti (two overtaking cars), cyclists (KITTI raw 0001, several starts).
 Prints Markdown tables, leaves them in DIR as JSON. Worlds are rendered and SURF runs on them; with `--observations`
 they give noisy observations without images.
@@ -36,24 +36,19 @@ from experiments.object_runs import (
     system_for,
 )
 from experiments.tables import markdown
-from experiments.twins import Twins
-from slam import registry
-from slam.compare.measure import Metric
-from slam.compare.statistics import difference
-from slam.config import SystemConfig
 from slam.data import FrameResult, StereoFeatures
 from slam.evaluation.summary import evaluate
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, rotation_angle
 from slam.object_data import MovingObject
-from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment, score_for
+from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
-BACKENDS = ("ekf", "smoother")  # those that estimate bodies
-PARTS = ("table1", "moving", "paired", "boxes", "occlusion", "still", "street", "people", "kitti", "cyclists")
+BACKENDS = ("ekf", "smoother", "window")
+PARTS = ("table1", "moving", "boxes", "occlusion", "still", "street", "people", "kitti", "cyclists")
 TITLES = {
     "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
-    "paired": "Both back ends on the same measurements", "boxes": "Four boxes", "occlusion": "The box is hidden",
+    "boxes": "Four boxes", "occlusion": "The box is hidden",
     "still": "Nothing moves", "street": "A street", "people": "People", "kitti": "Cars of KITTI raw 0013",
     "cyclists": "Cyclists of KITTI raw 0001",
 }  # fmt: skip
@@ -146,7 +141,7 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
-    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange")):
+    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
         found = score.poses_of(1)
         if found is not None:
             frames, own, true = found
@@ -159,38 +154,6 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
         axes[0].legend(fontsize=8)
     figure.savefig(path, dpi=120)
     plt.close(figure)
-
-
-def paired(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
-    """Both back ends on identical measurements, bodies included: the filter drives, the smoother is given the same."""
-    seeds, frames = (1, 90) if quick else (6, 200)
-    values: dict[str, list[list[float]]] = {}
-    for seed in range(seeds):
-        name = f"box?density=300&camera=moving&seed={seed}"
-        sequence = slam.open_sequence(f"synthetic:{name}")
-        config = SystemConfig.for_kind(sequence.kind, "surf" if images else None, "ekf")
-        pair = [registry.create("backends", name, sequence.rig, models=config.models) for name in BACKENDS]
-        twins = Twins(*pair)
-        system = slam.StereoSlam(sequence.rig, "surf" if images else None, twins, config=config)
-        scores = [score_for(sequence) for _ in BACKENDS]
-        for k, result, labels in steps(name, system, images, frames):
-            scores[0].add(k, result, labels)
-            scores[1].add(k, twins.seen_by_follower(result), labels)
-        bodies = [score.body(1) for score in scores]
-        for key in ("ME", "relative, 10 frames"):
-            for part, scale in (("rotation median [deg]", 1.0), ("translation median [m]", 1e3)):
-                both = [scale * body.get(key, {}).get(part, np.nan) for body in bodies]
-                values.setdefault(f"{key}, {part.replace('[m]', '[mm]')}", []).append(both)
-    rows = []
-    for name, pairs in values.items():
-        first, second = np.array(pairs).T
-        found = difference(Metric(name, name, "lower"), first, second)
-        rows.append({
-            "figure": name, "pairs": found.pairs, "ekf": found.reference, "smoother": found.other,
-            "smoother less ekf": f"{found.mean:.3g} ({found.low:.3g} to {found.high:.3g})", "p": found.p,
-            "verdict": found.verdict.value,
-        })  # fmt: skip
-    return rows
 
 
 def boxes(images: bool, quick: bool, out: Path) -> list[dict[str, Any]]:
@@ -435,7 +398,6 @@ def main() -> int:
     parts = {
         "table1": table1,
         "moving": moving,
-        "paired": paired,
         "boxes": boxes,
         "occlusion": occlusion,
         "still": still,

@@ -24,7 +24,7 @@ from tests.fuzz.runs import FRAMES, Scripted, _Frontend, require_whole
 from tests.fuzz.settings import scene
 
 _CALLS = ("predict", "update", "add", "remove", "estimate", "positions", "trajectory")
-_MORE = ("insert", "place", "revise", "update_objects", "remove_objects")
+_MORE = ("insert", "place", "revise")
 _ERRORS: tuple[BaseException, ...] = (
     ZeroDivisionError("no way"), ValueError(), KeyError("x"), StopIteration(), RuntimeError("two\nlines"),
     SystemExit(3),
