@@ -43,7 +43,7 @@ from slam.object_data import MovingObject
 from slam.objects.metrics import ObjectScore, absolute_pose_errors, body_alignment
 from slam.objects.procedure1 import ObjectDatabase, Procedure1Detector
 
-BACKENDS = ("ekf", "smoother")  # those that estimate bodies
+BACKENDS = ("ekf", "smoother", "window")
 PARTS = ("table1", "moving", "boxes", "occlusion", "still", "people", "kitti", "cyclists")
 TITLES = {
     "table1": "The box at four places (paper B, Table 1)", "moving": "The box under a moving camera",
@@ -140,7 +140,7 @@ def draw_errors(scores: dict[str, ObjectScore], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")
-    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange")):
+    for (backend, score), colour in zip(scores.items(), ("tab:blue", "tab:orange", "tab:green")):
         found = score.poses_of(1)
         if found is not None:
             frames, own, true = found

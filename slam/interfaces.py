@@ -12,13 +12,13 @@ from slam.data import (
     Observations,
     Patches,
     Prediction,
+    RecentPoses,
     StereoFeatures,
     StereoFrame,
     UpdateReport,
 )
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.object_data import ObjectEstimate, ObjectObservations
 
 
 @runtime_checkable
@@ -91,8 +91,7 @@ class Backend(Protocol):
 
         Raises:
             MeasurementError: before the first `predict`; an id is not in the map; or the time of the last `predict` has
-                had its update, or landmarks were added, bodies updated or measurements revised at it: these rest on the
-                pose as it was.
+                had its update, or landmarks were added or measurements revised at it: these rest on the pose as it was.
         """
         ...
 
@@ -145,32 +144,20 @@ class RestingBackend(Protocol):
 
 
 @runtime_checkable
-class ObjectBackend(Protocol):
-    """Additional methods of a back end that estimates moving objects; back ends without them are given none.
+class RecentBackend(Protocol):
+    """Additional method of a back end that knows how the errors of the camera's last poses hang together.
 
-    Called in every step after `Backend.update`, at the same stamp. A further call at that stamp starts new bodies;
-    those that are known stay as they are, and count as not observed.
+    Moving bodies need it: a velocity is the difference of two poses. Of a back end without it the joint covariance is
+    derived from the poses' own ones.
     """
 
-    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
-        """Advance all bodies to the current stamp, correct those that are observed, and start those with a new id.
+    def recent(self, n: int) -> RecentPoses:
+        """The camera's last n poses, or all if they are fewer, as they are believed now, with their joint covariance.
 
-        The motion model is constant velocity with random impulses between frames, as for the camera; frames in which a
-        body is not observed are predicted. New points of a known body join it.
-
-        Returns:
-            estimates of all bodies, observed or not, by ascending id.
+        The last is that of `Backend.estimate`. Asking changes nothing.
 
         Raises:
-            MeasurementError: a new body has fewer than three points with a right pixel.
-        """
-        ...
-
-    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
-        """Forget bodies.
-
-        Raises:
-            MeasurementError: an id is unknown.
+            MeasurementError: before the first `predict`.
         """
         ...
 

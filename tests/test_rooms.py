@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "tracking": {"data", "geometry", "kernels", "runtime"},
     "calibration": {"data", "geometry", "kernels", "runtime"},
     "mapping": {"tracking", "data", "geometry", "runtime"},
-    "objects": {"tracking", "data", "geometry", "kernels", "runtime"},
+    "objects": {"window", "tracking", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},

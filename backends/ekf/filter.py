@@ -26,7 +26,6 @@ from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
-from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window.agreement import INFLATION, landmarks_pose
@@ -63,7 +62,7 @@ class EkfBackend:
         self._stamps: list[float] = []
         self._poses: list[Array] = []
         self._measured = True  # whether the newest pose may not be updated any more
-        self._state = FilterState(rig, models, self.config)
+        self._state = FilterState(models, self.config)
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
 
     def saved(self) -> Callable[[], None]:
@@ -233,21 +232,6 @@ class EkfBackend:
         change[rows] = marks.coordinates.of(marks.anchors[rows], points) - marks.state[rows]
         if np.isfinite(change).all():
             marks.move(change)
-
-    # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
-
-    @one_blas_thread
-    @all_or_nothing
-    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
-        """See `slam.interfaces.ObjectBackend.update_objects`."""
-        self._require_started("update_objects")
-        self._measured = True
-        return self._state.objects.update(observations, self._stamps[-1], self._state.camera_belief)
-
-    @all_or_nothing
-    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
-        """See `slam.interfaces.ObjectBackend.remove_objects`."""
-        self._state.objects.remove(ids)
 
     # --- the filter's parts ---
 

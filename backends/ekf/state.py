@@ -12,14 +12,11 @@ from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import CAMERA, POSE, Covariance
 from backends.ekf.landmarks import COORDINATES, Landmarks
 from backends.ekf.motion import attitude_deviation, covariance_after_gap, initial_covariance, motion_noise
-from backends.ekf.objects import ObjectFilter
-from backends.ekf.objects_body import CameraBelief
 from backends.ekf.recovery import Agreement
-from backends.ekf.solve import Solution, UnsolvableError
+from backends.ekf.solve import UnsolvableError
 from slam.data import IdArray, IndexArray
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix, rotation
-from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
@@ -29,12 +26,11 @@ _SMALL_TURN = 0.2  # numerics: of a step whose error may be carried as a turn ab
 
 
 class FilterState:
-    """``[r, φ, v, ω]`` and three coordinates per landmark, with their joint covariance, and the moving bodies.
+    """``[r, φ, v, ω]`` and three coordinates per landmark, with their joint covariance.
 
     The covariance refers to a state that an update moves: see `_transport` for what that takes.
 
     Args:
-        rig: the cameras.
         models: priors and motion.
         config: options of the filter.
 
@@ -43,22 +39,20 @@ class FilterState:
         R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
         landmarks: their coordinates and names.
         covariance: of everything.
-        objects: the bodies, with their covariances with everything.
         consistent: whether the covariance is transported to the corrected state.
     """
 
-    def __init__(self, rig: StereoRig, models: EstimatorModels, config: EkfConfig) -> None:
+    def __init__(self, models: EstimatorModels, config: EkfConfig) -> None:
         self.models = models
         self.landmarks = Landmarks(COORDINATES[config.landmarks])
         self.R_world_angles, phi = anchor(models.initial_pose[:3, :3])
         self.camera = np.concatenate([models.initial_pose[:3, 3], phi, np.zeros(6)])
         self.covariance = Covariance(initial_covariance(models, phi))
-        self.objects = ObjectFilter(rig, models, config.iterations)
         self.consistent = config.consistent and config.measurement == "stereo"
 
     def saved(self) -> Callable[[], None]:
         """A function that puts everything back as it is now."""
-        parts = (self.covariance.saved(), self.landmarks.saved(), self.objects.saved())
+        parts = (self.covariance.saved(), self.landmarks.saved())
         before = (self.camera, self.R_world_angles)
 
         def restore() -> None:
@@ -126,7 +120,6 @@ class FilterState:
         if self.consistent and np.abs(self.camera[3:6] - before[3:6]).max() < _SMALL_TURN:
             self._turn_with(before)
         self.covariance.move_camera(dt, motion_noise(self.models, dt))
-        self.objects.camera_moved(dt)
 
     def _forget_motion(self, dt: float) -> None:
         """A step after which the camera may be turned anyhow: it stays where it was, independent of the map."""
@@ -147,7 +140,6 @@ class FilterState:
     def _transform_camera(self, J: Array) -> None:
         """The camera's error (12,) becomes J times what it was."""
         self.covariance.transform_camera(J)
-        self.objects.camera_transformed(J)
 
     # --- landmarks join and leave ---
 
@@ -171,13 +163,11 @@ class FilterState:
         """
         D = self.landmarks.append(ids, anchors, points)
         self.covariance.append(D @ J, D @ covariances @ D.transpose(0, 2, 1))
-        self.objects.landmarks_appended(D @ J)
 
     def remove(self, ids: IdArray) -> None:
         """Remove landmarks (M,), which are all in the state."""
         holes, movers = self.covariance.drop(self.landmarks.slots(ids))
         self.landmarks.remove(ids, holes, movers)
-        self.objects.landmarks_dropped(holes, movers, len(self.landmarks))
 
     # --- updates ---
 
@@ -201,8 +191,6 @@ class FilterState:
             raise UnsolvableError("the corrected state is not finite")
         if found.noise is not None:
             covariance.move_camera(0.0, found.noise)
-        if self.objects.count:
-            self._correct_objects(slots, solution)
         covariance.subtract(slots, solution.whitened)
         before = self.camera
         self.camera = self.camera + change[:CAMERA]
@@ -210,17 +198,6 @@ class FilterState:
         if self.consistent:
             self._transport(before)
         self._reanchor_if_needed()
-
-    def _correct_objects(self, slots: IndexArray, solution: Solution) -> None:
-        """The bodies' part of a correction, before that of the filter's own state."""
-        columns = self.covariance.columns(slots)
-        W = solution.whitened(columns.T).T
-        camera = CameraBelief(self.pose(), self.pose_jacobian(), columns[:, :POSE] - W @ W[:POSE].T)
-        self.objects.camera_corrected(slots, solution, W, camera)
-
-    def camera_belief(self) -> CameraBelief:
-        """What the bodies need to know of the camera."""
-        return CameraBelief(self.pose(), self.pose_jacobian(), self.covariance.columns(np.zeros(0, np.intp)))
 
     # --- displacements of the whole world, which are unobservable ---
 
@@ -271,4 +248,3 @@ class FilterState:
         K = self.landmarks.transport(slots) @ world
         if K.any():
             self.covariance.transform_landmarks(K)
-            self.objects.landmarks_transformed(slots, K)

@@ -15,7 +15,6 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.factor_graph import FactorGraph
 from backends.smoother.factors import FactorMaker
 from backends.smoother.measurement_log import MeasurementLog
-from backends.smoother.objects import ObjectSmoother
 from backends.smoother.pose_set import PredictedPose
 from backends.smoother.prediction import normalised_innovation
 from backends.smoother.rollback import snapshot
@@ -29,7 +28,6 @@ from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
 from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
-from slam.object_data import ObjectEstimate, ObjectObservations
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 from slam.window import pose_only
@@ -63,7 +61,6 @@ class SmootherBackend:
         self._make = FactorMaker(self._stereo, models)
         self._graph = FactorGraph(self._make, self.config)
         self._belief = Belief(self._graph, models)
-        self._objects = ObjectSmoother(self._stereo, self._make.sigma, models)
         self._answer: tuple[MeasurementLog, Belief] | None = None  # what `estimate` and `trajectory` last gave
         self._measured = False  # whether the predicted pose has had its update
         self._contradicted = 0  # updates in succession that disagreed with the path
@@ -251,19 +248,6 @@ class SmootherBackend:
         if self.measurement_log.measurements.count:
             with self._whole():
                 self._graph.revise(correct)
-
-    # --- moving bodies (documented in slam.interfaces.ObjectBackend) ---
-
-    @one_blas_thread
-    def update_objects(self, observations: Sequence[ObjectObservations]) -> list[ObjectEstimate]:
-        """See `slam.interfaces.ObjectBackend.update_objects`."""
-        self._require_started("update_objects")
-        self._commit()
-        return self._objects.update(observations, self.measurement_log.path, self._belief.last_poses)
-
-    def remove_objects(self, ids: IdArray | Sequence[int]) -> None:
-        """See `slam.interfaces.ObjectBackend.remove_objects`."""
-        self._objects.remove(ids)
 
     # --- copies ---
 

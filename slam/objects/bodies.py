@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray
-from slam.geometry.se3 import Array, adjoint, inverse, so3_exp, so3_log
-from slam.object_data import ObjectEstimate
+from slam.geometry.se3 import Array, adjoint, inverse, so3_exp
 from slam.object_models import ObjectModels
+from slam.objects.belief import BodyBelief
 from slam.objects.existence import EVEN, when_measured, when_missed
 from slam.objects.track_kernels import windows_in_body
 from slam.objects.tracks import Tracks
 
-_CONVERGED = 4  # frames after which the back end's velocity is better than that with which the body was found
+_CONVERGED = 4  # frames after which the estimated velocity is better than that with which the body was found
 CUT = 0.05  #: share of a body's points that lie outside its extent, to each side
 _REACH = 1.8  # farthest point of a body from its origin, in what it measured across when it was found
 _SPREAD = 0.05  # deviation of a fresh body's pose, per axis [m] and [rad]
@@ -36,14 +36,13 @@ class Body:
         history: poses at the window's slots (W, 4, 4).
         known: at which slots there is a measured one (W,).
         T_before: pose at the previous frame.
-        found_at: when the back end began to estimate it [s].
-        T_found, T_reported: the back end's poses when it was found, and at the previous frame.
-        T_body_estimate: takes coordinates of the back end's body frame to those of this one (4, 4).
+        T_found, T_reported: its estimated poses when the estimate began, and at the previous frame.
+        T_body_estimate: takes coordinates of the estimate's body frame to those of this one (4, 4).
         lower, upper: extent of its points (3,), body coordinates.
         size: what it measures across at least [m].
         reach: its points lie no farther from its origin [m].
         seen_at: when its points were last found together [s].
-        measured_at: when the back end last used them [s].
+        measured_at: when the estimate last used them [s].
         seen: number of frames in which it was measured.
         missed: number of frames since it was measured.
         measured: whether it was in this frame.
@@ -53,12 +52,12 @@ class Body:
         alike: number of frames in which it moved as an older body did, as a part of that would.
         age: number of frames since it was found.
         existence: probability that it exists, see `slam.objects.existence`.
-        refused: number of successive frames in which the back end rejected all its measurements.
+        refused: number of successive frames in which the estimate rejected all its measurements.
         reported: number of frames in which it was reported as measured.
         reported_unmeasured: number of frames in which it was reported though it was not measured.
         apart_from: id of the body of which it is a part with a motion of its own; None for none.
         distinct: ids of bodies that it is known not to be a part of.
-        estimate: of the back end; None where there is none yet.
+        belief: its estimate; None where there is none yet.
     """
 
     id: int
@@ -68,7 +67,6 @@ class Body:
     history: Array
     known: BoolArray
     T_before: Array
-    found_at: float
     T_found: Array
     T_reported: Array
     T_body_estimate: Array
@@ -93,7 +91,7 @@ class Body:
     reported_unmeasured: int = 0
     apart_from: int | None = None
     distinct: frozenset[int] = frozenset()
-    estimate: ObjectEstimate | None = field(default=None, repr=False)
+    belief: BodyBelief | None = field(default=None, repr=False)
 
     @property
     def across(self) -> float:
@@ -133,7 +131,7 @@ def new_body(
     T[:3, 3] = centre
     none = np.zeros(3)
     return Body(
-        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, stamp, T, T, np.eye(4), none, none,
+        id, T, twist, _SPREAD**2 * np.eye(6), history, np.ones(len(times), bool), T, T, T, np.eye(4), none, none,
         size, np.inf, stamp, velocity_covariance=np.zeros((6, 6)) if uncertainty is None else uncertainty,
     )  # fmt: skip
 
@@ -156,14 +154,14 @@ def advanced(body: Body, dt: float, slot: int, models: ObjectModels) -> Body:
     )  # fmt: skip
 
 
-def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Body:
-    """The body with the back end's estimate.
+def from_estimate(body: Body, belief: BodyBelief, min_speed: float) -> Body:
+    """The body with its estimate.
 
-    A measured body keeps the pose that was fitted to its points here, as the back end has a body frame and points of
-    its own. A body that was not measured moves as the back end predicts, once its velocity is well known there.
+    A measured body keeps the pose that was fitted to its points here, as the estimate has a body frame and points of
+    its own. A body that was not measured moves as is predicted, once its velocity is well known.
     """
-    before = estimate if body.estimate is None else body.estimate
-    found = estimate.T_world_object if body.estimate is None else body.T_found
+    estimate, new = belief.estimate, belief.since == belief.estimate.stamp
+    before = estimate if new or body.belief is None else body.belief.estimate
     size = 0.5 * float(np.linalg.norm(body.upper - body.lower))
     speed = float(np.linalg.norm(estimate.velocity[3:]) + size * np.linalg.norm(estimate.velocity[:3]))
     v, P = estimate.velocity, estimate.velocity_covariance
@@ -183,27 +181,18 @@ def from_estimate(body: Body, estimate: ObjectEstimate, min_speed: float) -> Bod
         velocity_covariance=estimate.velocity_covariance if converged else body.velocity_covariance,
         covariance=change @ estimate.covariance @ change.T,
         moving=not converged or (certain and speed > min_speed),
-        estimate=estimate,
+        belief=belief,
         measured_at=estimate.stamp if estimate.measured else body.measured_at,
         refused=body.refused + 1 if body.measured and not estimate.measured else 0,
-        found_at=estimate.stamp if body.estimate is None else body.found_at,
-        T_found=found,
+        T_found=estimate.T_world_object if new else body.T_found,
         T_reported=before.T_world_object,
     )
-
-
-def from_fit(body: Body, T: Array, dt: float, slot: int) -> Body:
-    """The body placed by the rigid fit of its points alone, where no back end estimates it."""
-    turn = so3_log(T[:3, :3] @ body.T_before[:3, :3].T) / dt
-    shift = (T[:3, 3] - body.T_before[:3, 3]) / dt
-    velocity = 0.5 * body.velocity + 0.5 * np.concatenate([turn, shift])
-    return body.placed(T, slot, True, velocity=velocity, covariance=_SPREAD**2 * np.eye(6))
 
 
 def continued(body: Body, known: Body) -> Body:
     """A new body that turns out to be a known one: it takes over that one's id and probability of existence.
 
-    The back end's estimate of it starts again. Its body frame stays as predicted, but for a shift from the part seen
+    The estimate of it begins anew. Its body frame stays as predicted, but for a shift from the part seen
     before to the part seen now.
     """
     shift = np.eye(4)
@@ -213,7 +202,7 @@ def continued(body: Body, known: Body) -> Body:
         body, id=known.id, T_body_estimate=T_body_estimate, evidence=known.evidence,
         proven=known.proven, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
-        measured_at=known.measured_at, estimate=None, refused=0,
+        measured_at=known.measured_at, belief=None, refused=0,
     )  # fmt: skip
 
 
@@ -224,9 +213,9 @@ def with_evidence(body: Body, gain: float) -> Body:
     return replace(body, existence=when_missed(body.existence, body.seen, body.age))
 
 
-def counted(body: Body) -> Body:
+def counted(body: Body, measured: bool) -> Body:
     """The body after it was reported."""
-    if body.estimate is not None and body.estimate.measured:
+    if measured:
         return replace(body, reported=body.reported + 1)
     return replace(body, reported_unmeasured=body.reported_unmeasured + 1)
 

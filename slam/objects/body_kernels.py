@@ -1,4 +1,4 @@
-"""Compiled loops over a body's points: on which correction of its pose they agree, and how little is known of them."""
+"""Compiled loops over a body's points: on which correction of its pose they agree."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import numpy as np
 from slam.kernels.linear import factorise, invert, invert_symmetric, row_times, solve_factorised, square
 from slam.kernels.se3 import point_by_motion
 from slam.runtime.compilation import helper, kernel
-
-_NEAREST = 1e-9  # numerics: no distance below this [m] is divided by
 
 
 @kernel
@@ -81,31 +79,6 @@ def agreed_correction(y, information, seen, J, axes, shift, P, known, sigma, lea
             return change, agrees, True
         agrees[worst] = False
     return change, agrees, False
-
-
-@kernel
-def drift_roots(points, first, now, turned, density):
-    """The angles (p,) and roots (p, 3, 3) of `slam.objects.points.drift`, which has the arguments, too.
-
-    A point that is nowhere (NaN) keeps its angle, and its root is zero.
-    """
-    angles, roots = turned.copy(), np.zeros((len(points), 3, 3))
-    sight, before = np.empty(3), np.empty(3)
-    for p in range(len(points)):
-        for i in range(3):
-            sight[i], before[i] = now[i] - points[p, i], first[p, i] - points[p, i]
-        (a, b, c), (x, y, z) = before, sight
-        u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
-        angle = np.arctan2(np.sqrt(u * u + v * v + w * w), a * x + b * y + c * z)
-        if not angle > turned[p]:
-            continue
-        distance = max(np.sqrt(x * x + y * y + z * z), _NEAREST)
-        scale = density * np.sqrt(angle - turned[p]) * distance
-        angles[p] = angle
-        for i in range(3):
-            for j in range(3):
-                roots[p, i, j] = scale * ((1.0 if i == j else 0.0) - sight[i] * sight[j] / (distance * distance))
-    return angles, roots
 
 
 @helper

@@ -1,7 +1,7 @@
 """The detector of moving objects: tracks all features, classifies which move, and keeps the bodies that they form.
 
 A step has two parts, called after the back end's update: `classify` says which features move, before any of them
-becomes a landmark; `update` gives the bodies' observations to the back end and reports the bodies.
+becomes a landmark; `update` estimates the bodies and reports them.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.data import Estimate, IdArray, StereoFeatures
+from slam.data import Estimate, IdArray, RecentPoses, StereoFeatures
 from slam.geometry.arrays import IndexArray, among, median
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose, transform
-from slam.interfaces import Backend, ObjectBackend
+from slam.interfaces import Backend
 from slam.models import EstimatorModels
 from slam.object_data import MotionLabels, MovingObject
 from slam.objects import membership
@@ -24,14 +24,15 @@ from slam.objects.bodies import (
     Body,
     advanced,
     continued,
-    from_fit,
     with_evidence,
     with_extent,
 )
+from slam.objects.camera import recent_poses, with_estimate
 from slam.objects.candidates import Candidate, MovingTracks, follow_candidates
 from slam.objects.config import ObjectsConfig
 from slam.objects.displacements import LAG, displacements, known_well
-from slam.objects.estimates import BodyEstimates
+from slam.objects.estimates import estimated
+from slam.objects.estimator import FRAMES, BodyEstimator
 from slam.objects.first_frames import FirstSights, Places, moving_landmarks
 from slam.objects.following import follow
 from slam.objects.initialization import BodyInitializer, MovingGroup
@@ -72,8 +73,10 @@ class MovingObjectDetector:
         self._first = FirstSights.none()
         self._next_track = 0
         self._next_body = 1
-        self._forgotten: list[int] = []
-        self._estimates = BodyEstimates(config, self.models)
+        self._estimator = BodyEstimator(rig, models)
+        self._path: RecentPoses | None = None
+        self._estimate: Estimate | None = None
+        self._measuring: Array = np.zeros((0, 3))  # what measured the pose, in camera coordinates
         self._candidates: list[Candidate] = []
         self._pose_covariance: Array = np.zeros((6, 6))
         self.suspects = np.zeros(0, np.int64)
@@ -82,8 +85,7 @@ class MovingObjectDetector:
         """See `slam.objects.modes.ObjectDetector`."""
         self.bodies, self.tracks, self.suspects = {}, None, np.zeros(0, np.int64)
         self._stamps[:], self._frame = np.nan, -1
-        self._forgotten, self._candidates, self._first = [], [], FirstSights.none()
-        self._estimates = BodyEstimates(self.config, self.models)
+        self._candidates, self._first, self._path = [], FirstSights.none(), None
 
     def revise(self, correct: CorrectRows) -> None:
         """See `slam.objects.modes.ObjectDetector`."""
@@ -111,6 +113,7 @@ class MovingObjectDetector:
         local = self.rig.triangulate(features.uv_left, features.uv_right)
         T_world_left = estimate.T_world_left
         self._poses[self.slot], self._pose_covariance = T_world_left, estimate.covariance
+        self._estimate, self._measuring = estimate, local[(landmark >= 0) & np.isfinite(local[:, 0])]
         self._advance_bodies(times)
         tracks = self.tracks
         assert tracks is not None
@@ -167,7 +170,6 @@ class MovingObjectDetector:
     def _forget(self, id: int) -> None:
         assert self.tracks is not None
         del self.bodies[id]
-        self._forgotten.append(id)
         self.tracks.give_up(np.flatnonzero(self.tracks.body == id))
 
     # ------------------------------------------------------------------------------------------- measuring
@@ -220,7 +222,6 @@ class MovingObjectDetector:
         assert self.tracks is not None
         membership.remove_members(self.tracks, np.flatnonzero(self.tracks.body == body.id), body)
         del self.bodies[body.id]
-        self._forgotten.append(body.id)
 
     def _find_bodies(self, initializer: BodyInitializer, T_world_left: Array) -> Scene:
         """Test free tracks in windows of every size against the rest; a group that moves for long becomes a body.
@@ -299,7 +300,6 @@ class MovingObjectDetector:
         if known is None:
             return body
         tracks.give_up(np.flatnonzero(tracks.body == known.id))
-        self._forgotten.append(known.id)
         return continued(body, known)
 
     def _grown(self, body: Body, members: NDArray[np.intp]) -> Body:
@@ -318,7 +318,6 @@ class MovingObjectDetector:
         tracks = self.tracks
         assert tracks is not None
         tracks.give_up(np.flatnonzero((tracks.body == known.id) & ~tracks.seen))
-        self._forgotten.append(known.id)
         grown = continued(body, known)
         membership.add_members(grown, tracks, mine, sure=True)
         return grown
@@ -410,7 +409,6 @@ class MovingObjectDetector:
                 self.bodies[known.id] = self._in_place_of(known, body, theirs)
                 tracks.body[tracks.body == body.id] = known.id
                 del self.bodies[body.id]
-                self._forgotten.append(body.id)
                 return
 
     def _begin_tracks(self, features: StereoFeatures, local: Array, T_world_left: Array, landmark: IdArray) -> None:
@@ -445,14 +443,8 @@ class MovingObjectDetector:
     # ------------------------------------------------------------------------------------------- a step, second part
 
     def update(self, backend: Backend, features: StereoFeatures) -> tuple[MovingObject, ...]:
-        """Give the bodies' observations to the back end, and report what it makes of them; nothing where it cannot."""
-        dt = self._dt(self._times(features))
-        if not isinstance(backend, ObjectBackend):
-            for body in list(self.bodies.values()):
-                if body.measured and body.seen > 1 and dt > 0:
-                    self.bodies[body.id] = from_fit(body, body.T, dt, self.slot)
-            self._forgotten.clear()
-            return ()
-        assert self.tracks is not None
-        forgotten, self._forgotten = self._forgotten, []
-        return self._estimates.update(self.bodies, self.tracks, backend, features, forgotten)
+        """Estimate the bodies, and report them."""
+        assert self.tracks is not None and self._estimate is not None
+        self._path = with_estimate(self._path, self._estimate, self.rig, self.sigma, self._measuring, FRAMES + 1)
+        cameras = recent_poses(backend, FRAMES + 1, self._path, self._estimate.covariance)
+        return estimated(self.bodies, self.tracks, self._estimator, features, cameras, self.config)

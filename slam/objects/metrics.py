@@ -74,14 +74,13 @@ def absolute_pose_errors(estimated: Array, true: Array) -> PoseErrors:
 
 
 def object_nees(estimated: Array, covariances: Array, true: Array) -> Array:
-    """NEES of a body's motion since the first row, which must be that of its first sight.
+    """NEES of a body's poses since the first row, which must be that of its first sight.
 
-    A body's frame is put there at its first sight: its pose has no error then, and from then on its covariance is that
-    of the motion since (docs/objects_estimation.md). With the true motion ``H = T_k T_0⁻¹`` the error is
-    ``log(T_est,k⁻¹ H T_est,0)``.
+    A body's frame is put somewhere before the camera at its first sight, by definition. With the true motion
+    ``H = T_k T_0⁻¹`` and where the frame truly was then, from the true camera, the error is ``log(T_est,k⁻¹ H T_0)``.
 
     Args:
-        estimated: poses T_world_object (N, 4, 4).
+        estimated: poses T_world_object (N, 4, 4); the first is that of the frame as seen from the true camera.
         covariances: theirs (N, 6, 6), right perturbations.
         true: the true ones in the same world frame; the body frames may differ.
 
@@ -139,6 +138,7 @@ class ObjectScore:
         self.covered: dict[int, list[bool]] = {}
         self.frames = 0
         self._world: Array | None = None
+        self._seen_from: dict[int, Array] = {}  # the camera's pose by frame, as it was estimated
 
     def add(self, frame: int, result: FrameResult, labels: NDArray) -> None:
         """Take in one frame.
@@ -150,6 +150,7 @@ class ObjectScore:
         """
         if self._world is None:
             self._world = result.estimate.T_world_left @ inverse(self.cameras[frame])
+        self._seen_from[frame] = result.estimate.T_world_left
         self.frames += 1
         flagged = np.zeros(len(labels), bool)
         flagged[result.moving_features] = True
@@ -259,6 +260,8 @@ class ObjectScore:
             first = life.found[mine[0]][1] if np.isfinite(at) else life.poses[0]
             found = int(np.searchsorted(self.stamps, at - 1e-6)) if np.isfinite(at) else life.frames[0]
             frames = np.array([found, *np.array(life.frames)[mine]])
+            if found in self._seen_from:
+                first = self._world @ self.cameras[found] @ inverse(self._seen_from[found]) @ first
             own = np.stack([first, *np.array(life.poses)[mine]])
             covariances = np.concatenate([np.zeros((1, 6, 6)), np.array(life.covariances)[mine]])
             later = np.concatenate([[True], frames[1:] > found])

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from slam.data import BoolArray
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.se3 import Array, transform
-from slam.objects.body_kernels import drift_roots
 
 Projection = Callable[[Array], tuple[Array, Array]]
 
@@ -102,25 +101,6 @@ def with_shape(project: Projection, z: Array, h: Array, sigma: float, shape: Sha
         gradient = (weight @ (z - predicted)[:, :, None])[:, :, 0] + (shape.mean - h) @ prior
         h = h + (covariance @ gradient[:, :, None])[:, :, 0]
     return h, covariance
-
-
-def drift(points: Array, first: Array, now: Array, turned: Array, density: float) -> tuple[Array, Array]:
-    """How much less is known of points that are seen from farther round than ever before.
-
-    A feature is found where the image looks like it; seen from elsewhere, that is elsewhere on the body.
-
-    Args:
-        points: of the body (p, 3), in body coordinates.
-        first: where the camera was that saw each first (p, 3).
-        now: where it is (3,).
-        turned: largest angles (p,) between the two directions so far [rad].
-        density: of the random walk of a point's direction with that angle [rad / √rad].
-
-    Returns:
-        the angles with this sight (p,), and symmetric roots (p, 3, 3) of the covariances to be added [m].
-    """
-    angles, roots = drift_roots(points, np.ascontiguousarray(first), now, turned, density)
-    return angles, roots
 
 
 def points_to_replace(unseen: NDArray[np.int64], sights: NDArray[np.int64], wanted: int, most: int) -> BoolArray:

@@ -16,8 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from slam.kernels.linear import invert_symmetric, row_times
-from slam.kernels.se3 import adjoint, between, log, move, rotation_vector, transform_back
+from slam.kernels.se3 import adjoint, between, log, move, transform_back
 from slam.kernels.stereo import by_pose, residual
+from slam.kernels.velocities import velocity_change
 from slam.runtime.compilation import helper, kernel
 
 #: What a point is to the solver: known exactly, or eliminated. Others (0, 1, ...) are its place among the prior's.
@@ -334,35 +335,10 @@ def motion_rows(poses, column, triple, interval, weight, H, b):
     """
     cost = 0.0
     J, r = np.empty((6, 18)), np.empty(6)
-    a, c, Ja, Jc = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    R = np.empty((3, 4))
     for m in range(len(triple)):
         i0, i1, i2 = triple[m]
         d0, d1 = interval[m]
-        for i in range(6):
-            for j in range(18):
-                J[i, j] = 0.0
-        between(poses[i1], poses[i2], R)
-        rotation_vector(R, c, Jc)  # J⁻¹; by the later pose its transpose counts, by the earlier one −J⁻¹
-        for i in range(3):
-            r[i] = c[i] / d1
-            r[3 + i] = (poses[i2, i, 3] - poses[i1, i, 3]) / d1
-            for j in range(3):
-                J[i, 12 + j] = Jc[j, i] / d1
-                J[i, 6 + j] = -Jc[i, j] / d1
-                J[3 + i, 15 + j] = poses[i2, i, j] / d1
-                J[3 + i, 9 + j] = -poses[i1, i, j] / d1
-        if i0 >= 0:
-            between(poses[i0], poses[i1], R)
-            rotation_vector(R, a, Ja)
-            for i in range(3):
-                r[i] -= a[i] / d0
-                r[3 + i] -= (poses[i1, i, 3] - poses[i0, i, 3]) / d0
-                for j in range(3):
-                    J[i, 6 + j] -= Ja[j, i] / d0
-                    J[i, j] = Ja[i, j] / d0
-                    J[3 + i, 9 + j] -= poses[i1, i, j] / d0
-                    J[3 + i, 3 + j] = poses[i0, i, j] / d0
+        velocity_change(poses, i0, i1, i2, d0, d1, r, J)
         for i in range(6):
             r[i] *= weight[m, i]
             cost += r[i] * r[i]

@@ -105,6 +105,37 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
+class Carried:
+    """Constant velocity, disturbed, of a body past which a known camera moves: see `slam.window.carried`.
+
+    Attributes:
+        cameras: T_world_left (K, 4, 4) of the window's poses, which are T_body_left.
+        covariance: of the cameras together (6 K, 6 K).
+        poses, interval: as of `Motion` (V, 3), (V, 2).
+        mean: of the velocity [ω, v] (V, 6) where the first pose is −1, ω in body axes, v in world axes; else zero.
+        variance: of its change (V, 6).
+    """
+
+    cameras: Array
+    covariance: Array
+    poses: IndexArray
+    interval: Array
+    mean: Array
+    variance: Array
+
+    @classmethod
+    def none(cls) -> Carried:
+        """No motion model."""
+        none, six = np.zeros((0, 3), np.intp), np.zeros((0, 6))
+        return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), none, np.zeros((0, 2)), six, six)
+
+    def select(self, keep: np.ndarray) -> Carried:
+        """Some of the rows (a mask or indices)."""
+        rows = (column[keep] for column in (self.poses, self.interval, self.mean, self.variance))
+        return Carried(self.cameras, self.covariance, *rows)
+
+
+@dataclass(frozen=True, eq=False)
 class RelativePrior:
     """A Gaussian on the first poses and some points relative to the first pose, and on that pose in the world.
 
@@ -162,6 +193,7 @@ class Window:
             None for no point.
         places: points that are known relative to a pose.
         motion: constant velocity between successive poses.
+        carried: constant velocity of what the points belong to.
         prior: what is known of the first poses and of some points together.
         joining: points that are unknowns beside those of the prior (J,), instead of being eliminated.
     """
@@ -176,6 +208,7 @@ class Window:
     information: Array | None = None
     places: Places = field(default_factory=Places.none)
     motion: Motion = field(default_factory=Motion.none)
+    carried: Carried = field(default_factory=Carried.none)
     prior: RelativePrior = field(default_factory=RelativePrior.none)
     joining: IndexArray = field(default_factory=lambda: np.zeros(0, np.intp))
 

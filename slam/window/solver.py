@@ -10,6 +10,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from slam.geometry.arrays import Array
 from slam.window import kernels
+from slam.window.carried import carried_rows
 from slam.window.problem import Window
 
 _STEPS = 12  # numerics: of Gauss-Newton at most; it converges quadratically
@@ -114,6 +115,11 @@ def linearised(w: Window, centre: int = 0, whole: bool = True) -> NormalEquation
     if len(w.motion.poses):
         m = w.motion
         cost += kernels.motion_rows(w.poses, w.column, m.poses, m.interval, m.weight, H, b)
+    if len(w.carried.poses):
+        c = w.carried
+        cost += carried_rows(
+            w.poses, w.column, c.cameras, c.covariance, c.poses, c.interval, c.mean, c.variance, H, b
+        )  # fmt: skip
     inverse = kernels.eliminate(w.column, w.place, w.pose_of_row, cross, *w.by_point, information, gradient, H, b)
     return NormalEquations(w, H, b, cost, squares, E, inverse, gradient, cross)
 

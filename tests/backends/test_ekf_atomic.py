@@ -10,7 +10,6 @@ import pytest
 from backends.ekf import EkfBackend
 from slam.data import Observations
 from slam.models import EstimatorModels, MotionModel
-from slam.object_data import ObjectObservations
 from tests.backends.scenes import RIG, cloud, observe, path
 
 MODELS = EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5)
@@ -52,12 +51,11 @@ class Interrupted:
 
 
 def walk(call) -> EkfBackend:
-    """Landmarks come and go, the local part is stored, a body is seen; the camera turns through the singularity."""
+    """Landmarks come and go, the local part is stored; the camera turns through the singularity."""
     rng = np.random.default_rng(0)
     poses = path(16, 0.1, np.array([0, 0, 1.0]), np.array([0, 0.3, 1.5]))
     points = cloud(poses, 600, rng)
     backend, known = EkfBackend(RIG, MODELS), set()
-    shape = rng.uniform(-0.5, 0.5, (8, 3)) + np.array([0, 0, 5.0])
     for k, T in enumerate(poses):
         call(backend.predict, 0.1 * k)
         seen = observe(T, points, 0.5, rng, 60)
@@ -67,12 +65,6 @@ def walk(call) -> EkfBackend:
             seen = Observations(seen.ids, seen.uv_left + np.array([80.0, 0]), seen.uv_right + np.array([80.0, 0]))
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         call(backend.update, seen.select(old))
-        if 3 <= k < 9:
-            left, right = RIG.project(shape)
-            noise = 0.5 * rng.standard_normal((2, 8, 2))
-            call(backend.update_objects, [ObjectObservations(1, np.arange(8), left + noise[0], right + noise[1])])
-        elif k == 9:
-            call(backend.remove_objects, [1])
         new = seen.select(~old & np.isfinite(RIG.triangulate(seen.uv_left, seen.uv_right)).all(axis=1))
         call(backend.add, new)
         known.update(new.ids.tolist())

@@ -6,21 +6,18 @@ import numpy as np
 import pytest
 
 import slam
-from slam import registry
 from slam.config import SystemConfig
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry.se3 import inverse, transform
 from slam.objects.config import ObjectsConfig
 from slam.objects.metrics import score_for
-from tests.slam.objects.double import FitBackend
 
 
-def system_for(sequence, objects=True, mode="detect", **settings):
+def system_for(sequence, mode="detect", **settings):
     config = SystemConfig.for_kind(sequence.kind, None)
     config = replace(config, objects=replace(config.objects, mode=mode, **settings))
-    backend = registry.create("backends", "ekf", sequence.rig, models=config.models)
-    return slam.StereoSlam(sequence.rig, None, FitBackend(backend) if objects else backend, config=config)
+    return slam.StereoSlam(sequence.rig, None, "ekf", config=config)
 
 
 @pytest.fixture(scope="module")
@@ -68,25 +65,8 @@ def test_nothing_moves_in_a_still_world():
     assert flagged <= 0.002 * count
 
 
-def test_without_an_estimate_there_are_no_objects():
-    sequence = slam.open_sequence("synthetic:box?density=300")
-
-    class Plain:
-        """A back end that knows nothing of objects."""
-
-        def __init__(self, backend):
-            for name in ("predict", "update", "add", "remove", "estimate", "positions", "trajectory"):
-                setattr(self, name, getattr(backend, name))
-
-    system = system_for(sequence, objects=False)
-    system.backend = Plain(system.backend)
-    results = [system.process_features(sequence.observations(k)) for k in range(58, 90)]
-    assert all(result.objects == () for result in results)
-    assert len(results[-1].moving_features) > 5 and system.objects.bodies  # found, and followed, all the same
-
-
 def test_members_are_predicted_where_they_are_seen():
-    """The back end's frame of a body is its own; the detector's points are in the detector's."""
+    """The estimate's frame of a body is its own; the detector's points are in the detector's."""
     sequence = slam.open_sequence("synthetic:box?density=300")
     system = system_for(sequence)
     off = []

@@ -11,7 +11,6 @@ from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, transform
 from slam.models import EstimatorModels
-from slam.object_data import ObjectEstimate
 from slam.objects import membership
 from slam.objects.bodies import Body, continued, new_body, with_extent
 from slam.objects.config import ObjectsConfig
@@ -129,9 +128,7 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
         body_along(path(MOVING), np.arange(3, 12), tracks, id=2),
     )
     few = replace(few, alike=1, T=few.T @ exp(np.array([0, 0, 0, 0.1, 0, 0])))
-    none = np.zeros(0, np.int64)
-    believed = ObjectEstimate(2, 0.0, more.T, np.eye(6), MOVING, np.eye(6), True, none, none)
-    more = replace(more, seen=5, estimate=believed, refused=1)
+    more = replace(more, seen=5, refused=1)
     detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
     detector.tracks, detector.bodies = tracks, {1: few, 2: more}
     detector._merge()
@@ -140,7 +137,7 @@ def test_an_older_body_gives_its_place_to_a_young_one_that_shows_more_of_it() ->
     grown = detector.bodies[1]
     np.testing.assert_allclose(grown.T, more.T)
     np.testing.assert_allclose(grown.history, more.history)
-    assert grown.estimate is None and grown.refused == 0  # the back end begins again with it
+    assert grown.belief is None and grown.refused == 0  # its estimate begins anew
     np.testing.assert_allclose(transform(more.T, tracks.local[:12]), transform(more.T, local), atol=0.01)
 
 
@@ -155,10 +152,8 @@ def test_bodies_side_by_side_are_one_only_where_they_move_alike(share: float, on
     theirs, mine = np.arange(4), np.arange(4, 12)
     assert membership.moves_with(more, tracks, theirs)
     assert membership.is_part_of(more, mine, tracks, theirs, few) == one
-    none = np.zeros(0, np.int64)
-    believed = ObjectEstimate(2, 0.0, more.T, np.eye(6), MOVING, np.eye(6), True, none, none)
     detector = MovingObjectDetector(RIG, ObjectsConfig(), EstimatorModels())
-    detector.tracks, detector.bodies = tracks, {1: few, 2: replace(more, seen=5, estimate=believed)}
+    detector.tracks, detector.bodies = tracks, {1: few, 2: replace(more, seen=5)}
     detector._outgrow(detector.bodies[2], 8, {1: few})
     assert list(detector.bodies) == ([1] if one else [1, 2])
     if not one:  # known for good: in a later frame they may happen to move alike
@@ -180,7 +175,7 @@ def test_a_body_seen_again_is_known_by_its_place_and_velocity() -> None:
     again = continued(new_body(2, body.middle, MOVING, TIMES, 0.0, 0.1), body)
     assert again.id == 1
     frame = again.T @ again.T_body_estimate
-    assert np.allclose(frame, body.T @ body.T_body_estimate), "the back end's frame goes on"
+    assert np.allclose(frame, body.T @ body.T_body_estimate), "the estimate's frame goes on"
 
 
 def test_only_tracks_that_surely_went_with_the_body_tell_its_extent() -> None:

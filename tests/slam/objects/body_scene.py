@@ -1,4 +1,4 @@
-"""Simulated rigid bodies before a moving camera, for the tests of what back ends say of moving objects."""
+"""Simulated rigid bodies before a moving camera, for the tests of their estimator."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+import backends
 from slam.data import Observations
 from slam.evaluation.metrics import nees
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
-from slam.interfaces import Backend
 from slam.models import EstimatorModels, MotionModel, models_for
 from slam.object_data import ObjectEstimate, ObjectObservations
+from slam.objects.belief import BodyBelief
+from slam.objects.camera import recent_poses, with_estimate
+from slam.objects.estimator import FRAMES, BodyEstimator
 
 SIGMA = 0.7
 HANDHELD = StereoRig.rectified_pair(260.0, 159.5, 119.5, 0.12, 320, 240)
@@ -27,7 +30,7 @@ class BodyScene:
 
     Attributes:
         rig: the cameras.
-        models: assumed by the back ends.
+        models: assumed by the estimators.
         dt: time between frames [s].
         camera: poses T_world_left (F, 4, 4), the first the identity.
         body: motion of the body (F, 4, 4) since frame 0, in world coordinates, the first the identity.
@@ -156,25 +159,29 @@ Rule = Callable[[int, ObjectObservations], "ObjectObservations | None"]
 
 
 def follow(
-    backend: Backend, scene: BodyScene, seed: int = 0, rule: Rule | None = None, outliers: float = 0.0
-) -> Iterator[tuple[int, ObjectEstimate]]:
-    """Run a scene through a back end; yields frame and estimate of the body from its first sight on.
+    name: str, scene: BodyScene, seed: int = 0, rule: Rule | None = None, outliers: float = 0.0
+) -> Iterator[tuple[int, BodyBelief, Array]]:
+    """Run a scene through a back end, and the body's estimator beside it; frame, belief and camera's estimated pose.
 
     `rule` may change what is observed of the body in a frame, or take it away (None).
     """
-    rng, known = np.random.default_rng([seed, 7]), set()
+    backend, estimator = backends.create(name, scene.rig, models=scene.models), BodyEstimator(scene.rig, scene.models)
+    rng, known, belief, path = np.random.default_rng([seed, 7]), set(), None, None
     for k, stamp in enumerate(scene.stamps):
         backend.predict(float(stamp))
         seen = scene.background(k, rng)
         old = np.array([i in known for i in seen.ids.tolist()], bool)
         backend.update(seen.select(old))
-        new = ~old & np.isfinite(scene.rig.triangulate(seen.uv_left, seen.uv_right)).all(axis=1)
+        local = scene.rig.triangulate(seen.uv_left, seen.uv_right)
+        deep, e = np.isfinite(local).all(axis=1), backend.estimate(landmarks=False)
+        path = with_estimate(path, e, scene.rig, SIGMA, local[old & deep], FRAMES + 1)
         given = scene.observations(k, rng, outliers if k else 0.0)
-        used = given if rule is None else rule(k, given)
-        for estimate in backend.update_objects([] if used is None else [used]):
-            yield k, estimate
-        backend.add(seen.select(new))
-        known.update(seen.ids[new].tolist())
+        given = given if rule is None else rule(k, given)
+        belief = estimator.updated(belief, 7, given, recent_poses(backend, FRAMES + 1, path, e.covariance))
+        if belief is not None:
+            yield k, belief, e.T_world_left
+        backend.add(seen.select(~old & deep))
+        known.update(seen.ids[~old & deep].tolist())
 
 
 @dataclass(frozen=True)
@@ -182,7 +189,7 @@ class Outcome:
     """A body's estimates against the truth, a row a frame after the first.
 
     Attributes:
-        rotation, translation: error of the pose, that is of the motion since found [deg], [m].
+        rotation, translation: error of the pose [deg], [m]; its frame was put before the true camera at first sight.
         pose_nees, velocity_nees: (F,).
         motion_rotation, motion_translation: error of the motion since the frame before (ME) [deg], [m].
         estimates: all of them.
@@ -197,32 +204,25 @@ class Outcome:
     estimates: list[ObjectEstimate]
 
 
-def score(scene: BodyScene, found: list[tuple[int, ObjectEstimate]]) -> Outcome:
+def score(scene: BodyScene, found: list[tuple[int, BodyBelief, Array]]) -> Outcome:
     """Judge the estimates of one body, the first of which is that of its first sight."""
-    first, origin = found[0][0], found[0][1].T_world_object
-    errors, spreads, off, velocity_spreads, steps = [], [], [], [], []
-    before = None
-    for k, e in found:
-        H = scene.body[k] @ se3.inverse(scene.body[first])
-        truth = H @ origin
-        if k > first:
-            xi = se3.log(se3.inverse(e.T_world_object) @ truth)
-            errors.append(xi)
-            spreads.append(e.covariance)
-            dt = scene.stamps[k] - scene.stamps[k - 1]
-            true_before = scene.body[k - 1] @ se3.inverse(scene.body[first]) @ origin
-            v = (truth[:3, 3] - true_before[:3, 3]) / dt
-            w = se3.so3_log(truth[:3, :3] @ true_before[:3, :3].T) / dt
-            off.append(np.concatenate([w, v]) - e.velocity)
-            velocity_spreads.append(e.velocity_covariance)
-            # ME: error of the body's motion over the frame, in body axes
-            step = se3.inverse(before) @ e.T_world_object
-            true_step = se3.inverse(true_before) @ truth
-            steps.append(se3.log(se3.inverse(step) @ true_step))
+    first, belief, T_world_left = found[0]
+    before = belief.estimate.T_world_object
+    origin = scene.camera[first] @ se3.inverse(T_world_left) @ before  # where the frame truly is
+    true = scene.body @ se3.inverse(scene.body[first]) @ origin
+    errors, off, steps = [], [], []
+    for k, belief, _ in found[1:]:
+        e, dt = belief.estimate, scene.stamps[k] - scene.stamps[k - 1]
+        errors.append(se3.log(se3.inverse(e.T_world_object) @ true[k]))
+        w = se3.so3_log(true[k, :3, :3] @ true[k - 1, :3, :3].T) / dt
+        off.append(np.concatenate([w, (true[k, :3, 3] - true[k - 1, :3, 3]) / dt]) - e.velocity)
+        step = se3.inverse(before) @ e.T_world_object
+        steps.append(se3.log(se3.inverse(step) @ se3.inverse(true[k - 1]) @ true[k]))
         before = e.T_world_object
-    x, s = np.array(errors), np.array(steps)
+    x, s, estimates = np.array(errors), np.array(steps), [b.estimate for _, b, _ in found]
     return Outcome(
         np.degrees(np.linalg.norm(x[:, :3], axis=1)), np.linalg.norm(x[:, 3:], axis=1),
-        nees(x, np.array(spreads)), nees(np.array(off), np.array(velocity_spreads)),
-        np.degrees(np.linalg.norm(s[:, :3], axis=1)), np.linalg.norm(s[:, 3:], axis=1), [e for _, e in found],
+        nees(x, np.array([e.covariance for e in estimates[1:]])),
+        nees(np.array(off), np.array([e.velocity_covariance for e in estimates[1:]])),
+        np.degrees(np.linalg.norm(s[:, :3], axis=1)), np.linalg.norm(s[:, 3:], axis=1), estimates,
     )  # fmt: skip

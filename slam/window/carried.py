@@ -1,0 +1,101 @@
+"""The motion of what the points of a window belong to, where that is a body carried past a camera that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.kernels.se3 import adjoint, between
+from slam.kernels.velocities import velocity_change
+from slam.runtime.compilation import helper, kernel
+
+
+@kernel
+def carried_rows(poses, column, cameras, covariance, triple, interval, mean, variance, H, b):
+    """Add constant velocity of a body, disturbed, whose window's poses are those of a camera in the body.
+
+    With Y_k of `poses` (K, 4, 4) and X_k of `cameras` (K, 4, 4), T_world_left, the body is at ``B_k = X_k Y_k⁻¹``. The
+    change of its velocity is noise with `variance` (V, 6), besides the error of the cameras, whose joint `covariance`
+    (6 K, 6 K) counts in each row by itself: errors of successive rows hang together, but little of what they are is
+    the camera's. `triple` (V, 3), `interval` (V, 2): see `slam.window.kernels.motion_rows`; `mean` (V, 6) is of the
+    velocity where the first pose is −1. Returns the sum of squares.
+    """
+    count = len(poses)
+    bodies, Ad = np.zeros((count, 4, 4)), np.empty((count, 6, 6))
+    back = np.empty((3, 4))
+    for k in range(count):
+        adjoint(poses[k], Ad[k])
+        between(poses[k], np.eye(4), back)
+        for i in range(3):
+            for j in range(4):
+                total = cameras[k, i, 3] if j == 3 else 0.0
+                for h in range(3):
+                    total += cameras[k, i, h] * back[h, j]
+                bodies[k, i, j] = total
+    cost = 0.0
+    r, by_body, J, S = np.empty(6), np.empty((6, 18)), np.zeros((6, 18)), np.empty((6, 6))
+    for m in range(len(triple)):
+        i0, i1, i2 = triple[m]
+        velocity_change(bodies, i0, i1, i2, interval[m, 0], interval[m, 1], r, by_body)
+        for i in range(6):
+            r[i] -= mean[m, i]
+        for p in range(3):  # a perturbation ξ of Y is −Ad_Y ξ of B, one χ of X is Ad_Y χ
+            k = max(triple[m, p], 0)
+            for i in range(6):
+                for j in range(6):
+                    total = 0.0
+                    for h in range(6):
+                        total -= by_body[i, 6 * p + h] * Ad[k, h, j]
+                    J[i, 6 * p + j] = total
+        _whiten(J, covariance, triple[m], variance[m], S, r)
+        for i in range(6):
+            cost += r[i] * r[i]
+        _add(J, r, column, triple[m], H, b)
+    return cost
+
+
+@helper
+def _whiten(J, covariance, triple, variance, S, r):
+    """J (6, 18) and r (6,) times the inverse Cholesky factor of their noise ``diag(variance) + J P Jᵀ``, in place."""
+    P = np.zeros((18, 18))
+    for p in range(3):
+        for o in range(3):
+            if triple[p] >= 0 and triple[o] >= 0:
+                for i in range(6):
+                    for j in range(6):
+                        P[6 * p + i, 6 * o + j] = covariance[6 * triple[p] + i, 6 * triple[o] + j]
+    S[:, :] = np.dot(J, np.dot(P, J.T))
+    for i in range(6):
+        S[i, i] += variance[i]
+    for i in range(6):
+        for j in range(i + 1):
+            total = S[i, j]
+            for k in range(j):
+                total -= S[i, k] * S[j, k]
+            S[i, j] = np.sqrt(total) if i == j else total / S[j, j]
+        for k in range(i):
+            r[i] -= S[i, k] * r[k]
+            for j in range(18):
+                J[i, j] -= S[i, k] * J[k, j]
+        r[i] /= S[i, i]
+        for j in range(18):
+            J[i, j] /= S[i, i]
+
+
+@helper
+def _add(J, r, column, triple, H, b):
+    """Add whitened rows J (6, 18), r (6,) to the normal equations."""
+    for p in range(3):
+        at = -1 if triple[p] < 0 else column[triple[p]]
+        if at < 0:
+            continue
+        for i in range(6):
+            for k in range(6):
+                b[at + i] -= J[k, 6 * p + i] * r[k]
+        for o in range(3):
+            to = -1 if triple[o] < 0 else column[triple[o]]
+            if to < 0 or to > at:
+                continue
+            for i in range(6):
+                for j in range(6):
+                    for k in range(6):
+                        H[at + i, to + j] += J[k, 6 * p + i] * J[k, 6 * o + j]
