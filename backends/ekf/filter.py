@@ -221,9 +221,9 @@ class EkfBackend:
             after = s.corrected(self._coordinates, found, rows, self._consistent)
         except UnsolvableError as error:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
-        used, nis = found.solution.used, found.solution.nis
+        used, w = found.solution.used, found.solution.system.w
         dof = int(np.isfinite(problem.z[used]).sum())
-        return after, UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
+        return after, UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof)
 
     def _problem(self, s: State, observations: Observations, rows: IndexArray, guess: Array | None) -> Problem:
         """The update by landmarks of some rows (M,) of the table."""

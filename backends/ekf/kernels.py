@@ -68,13 +68,13 @@ def conditional_distances(inverse, y):
     ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
 
     Args:
-        inverse: the lower triangular ``L⁻¹`` (3M, 3M) with ``S = L Lᵀ``.
+        inverse: ``L⁻¹`` (3M, 3M) with ``S = L Lᵀ``.
         y: (3M,).
     """
     m = len(y) // 3
     out, Q = np.empty(m), np.zeros((m, 3, 3))
     for row in range(len(y)):
-        for i in range(row // 3 + 1):
+        for i in range(m):
             a, b, c = inverse[row, 3 * i], inverse[row, 3 * i + 1], inverse[row, 3 * i + 2]
             Q[i, 0, 0] += a * a
             Q[i, 1, 0] += b * a

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, dtrtrs
+from scipy.linalg.blas import dgemm, dtrmm
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from backends.ekf import kernels
 from backends.ekf.covariance import POSE
@@ -105,35 +105,6 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """The maximum of the posterior (or one step towards it).
-
-    Attributes:
-        used: which landmarks (M,) it is made of.
-        change: of the state (n,).
-        H: the Jacobian of the last linearisation.
-        HP: its product with the covariance (3M, n).
-        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
-        nis: ``νᵀ S⁻¹ ν`` with the innovation taken back to the prior through the last linearisation.
-        distances: of each landmark (M,): squared distance of its measurement from what all others predict.
-        variances: of [r, φ] (6,) after the update.
-    """
-
-    used: BoolArray
-    change: Array
-    H: Jacobian
-    HP: Array
-    inverse: Array
-    nis: float
-    distances: Array
-    variances: Array
-
-    def whitened(self, HX: Array) -> Array:
-        """``(L⁻¹ H X)ᵀ`` (N, 3M) in Fortran's order: the covariance shrinks by V Vᵀ, where V is this of P."""
-        return np.asarray(dtrmm(1.0, self.inverse.T, HX.T, side=1))
-
-
-@dataclass(frozen=True, eq=False)
 class Iterate:
     """A correction s of g, the change of the state that it makes, what is predicted there, and the cost.
 
@@ -148,40 +119,107 @@ class Iterate:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """The linear update at an iterate: mask of its rows (M, 3), H, H P, innovation ν taken back to the prior, its S."""
+    """The linear update at an iterate, in whitened innovations: ``w = L⁻¹ ν`` has covariance 1.
+
+    To take out measurements is to project w on what is orthogonal to the columns of L⁻¹ that belong to them: that gives
+    what a factorisation without them would.
+
+    Attributes:
+        rows: its rows, a mask (M, 3).
+        H, HP: the Jacobian, and its product with the covariance (3M, n).
+        nu: the innovation taken back to the prior through H (3M,).
+        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
+        taken: orthonormal directions (3M, K) of what has been taken out.
+    """
 
     rows: BoolArray
     H: Jacobian
     HP: Array
     nu: Array
-    S: Array
+    inverse: Array
+    taken: Array
 
-    @cached_property
-    def L(self) -> Array:
-        """The lower triangular L with ``L Lᵀ = S``."""
-        upper, info = dpotrf(self.S.T)  # of the transpose, which is in the order that LAPACK wants
+    @classmethod
+    def of(cls, rows: BoolArray, H: Jacobian, HP: Array, nu: Array, S: Array, gone: BoolArray) -> System:
+        """Without some rows (mask (M, 3)); of S only the lower triangle counts.
+
+        Raises:
+            UnsolvableError: S is not positive definite.
+        """
+        out = np.flatnonzero(gone)
+        if len(out):
+            nu, S = nu.copy(), S.copy()
+            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
+        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
         if info != 0:
             raise UnsolvableError("the innovation covariance is not positive definite")
-        return np.asarray(upper.T)
+        inverse = _inverse(upper).T
+        inverse[out, out] = 0.0
+        return cls(rows & ~gone, H, HP, nu, inverse, np.zeros((len(nu), 0)))
 
-    def solved(self, nu: Array) -> Array:
-        """``S⁻¹ ν``."""
-        return np.asarray(dpotrs(self.L.T, nu)[0])
+    def without(self, gone: BoolArray) -> System:
+        """Without some more rows (mask (M, 3))."""
+        columns = self.inverse[:, np.flatnonzero(gone & self.rows)]
+        more, _ = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))
+        return replace(self, rows=self.rows & ~gone, taken=np.concatenate([self.taken, more], axis=1))
+
+    def whiten(self, X: Array) -> Array:
+        """``L⁻¹ X``, as far as it is not taken out, for X (3M, ...)."""
+        W = self.inverse @ X
+        return np.asarray(W - self.taken @ (self.taken.T @ W))
+
+    def whitened(self, HX: Array) -> Array:
+        """`whiten` of H X, transposed (N, 3M), in Fortran's order: P shrinks by ``V Vᵀ``, where V is this of H P."""
+        V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
+        if self.taken.size:
+            V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
+        return np.asarray(V)
+
+    @cached_property
+    def w(self) -> Array:
+        """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
+        return self.whiten(self.nu)
+
+    @cached_property
+    def y(self) -> Array:
+        """``S⁻¹ ν`` (3M,)."""
+        return np.asarray(self.w @ self.inverse)
+
+    @cached_property
+    def by_pose(self) -> Array:
+        """The whitened innovation's covariance (3M, 6) with [r, φ]."""
+        return self.whiten(self.HP[:, :POSE])
 
     def variances(self, P: Array) -> Array:
         """Of [r, φ] (6,) after the update; rounding may leave one that is not positive."""
-        W = dtrtrs(self.L.T, self.HP[:, :POSE], trans=1)[0]
-        return np.asarray(P.diagonal()[:POSE] - (W * W).sum(axis=0))
+        return np.asarray(P.diagonal()[:POSE] - (self.by_pose**2).sum(axis=0))
 
-    def only(self, rows: BoolArray, sigma: float) -> System:
-        """With fewer rows (mask (M, 3))."""
-        if (rows == self.rows).all():
-            return self
-        gone = np.flatnonzero(~rows.reshape(-1))
-        HP, nu, S = self.HP.copy(), self.nu.copy(), self.S.copy()
-        HP[gone], nu[gone], S[gone], S[:, gone] = 0.0, 0.0, 0.0, 0.0
-        S[gone, gone] = sigma**2
-        return System(rows, self.H.only(rows), HP, nu, S)
+    def distances(self) -> Array:
+        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any."""
+        M = self.inverse
+        if self.taken.size:
+            M = M - self.taken @ (self.taken.T @ M)
+        found, used = kernels.conditional_distances(M, self.y), self.rows.any(axis=1)
+        if not np.isfinite(found[used]).all():
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return np.where(used, found, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The maximum of the posterior (or one step towards it).
+
+    Attributes:
+        used: which landmarks (M,) it is made of.
+        change: of the state (n,).
+        system: the last linear update, from which the covariance follows.
+        distances: of each landmark (M,): squared distance of its measurement from what all others predict.
+    """
+
+    used: BoolArray
+    change: Array
+    system: System
+    distances: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +233,7 @@ class Gated:
     limits: Array
     distances: Array
     start: Iterate
-    system: System
+    system: Callable[[], System]
 
 
 def gate(problem: Problem, at_guess: bool = False) -> Gated:
@@ -210,13 +248,14 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     line = problem.model.linearise(*problem.mean(change[problem.g]))
     start, measured = Iterate(s, change, line.z), np.isfinite(problem.z)
     visible = np.asarray(np.isfinite(line.z).all(axis=1))
-    system = _system(problem, measured & visible[:, None], start, line)
+    parts = rows, _, _, nu, S = _linear_update(problem, measured & visible[:, None], start, line)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
-    own = kernels.own_distances(system.nu, system.S)
+    own = kernels.own_distances(nu, S)
     if not np.isfinite(own).all():
         raise UnsolvableError("the predicted innovations are not finite or not positive definite")
     distances = np.where(visible, own, np.nan)
-    return Gated(distances <= limits, limits, distances, start, system)
+    used = np.asarray(distances <= limits)
+    return Gated(used, limits, distances, start, lambda: System.of(*parts, rows & ~used[:, None]))
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
@@ -231,32 +270,31 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
     """
-    used = gated.used
-    while used.any():
-        solution = _iterate(problem, used, gated.start, gated.system)
-        excess = solution.distances / gated.limits
+    used, first = gated.used, gated.system() if gated.used.any() else None
+    while first is not None and used.any():
+        change, system = _iterate(problem, gated.start, first)
+        distances = system.distances()
+        excess = distances / gated.limits
         worst = excess.max()
         if worst <= 1:
-            if not (solution.variances > 0).all():
+            if not (system.variances(problem.P) > 0).all():
                 raise UnsolvableError("the pose's variances would not stay positive")
-            return solution
+            return Solution(used, change, system, distances)
         used = used & (excess <= max(1.0, 0.5 * worst))
+        first = first.without(~used[:, None] & np.ones(3, bool))
     return None
 
 
-def _iterate(problem: Problem, used: BoolArray, start: Iterate, first: System) -> Solution:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
+def _iterate(problem: Problem, start: Iterate, system: System) -> tuple[Array, System]:
+    """The change of the state (n,) by an update whose first linearisation, at `start`, is `system`; and the last one.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
     """
-    rows, P = first.rows & used[:, None], problem.P
-    system = first.only(rows, problem.sigma)
-    now = replace(start, cost=_cost(problem, rows, start))
+    rows, now = system.rows, replace(start, cost=_cost(problem, system.rows, start))
     for iteration in range(1, problem.iterations + 1):
-        y = system.solved(system.nu)
-        s, change = system.H.transposed_times(y), y @ system.HP
+        s, change = system.H.transposed_times(system.y), system.y @ system.HP
         if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
         if problem.iterations == 1:
@@ -264,7 +302,7 @@ def _iterate(problem: Problem, used: BoolArray, start: Iterate, first: System) -
         following = _visit(problem, rows, s, change, whole=True)
         if following.cost <= now.cost and _linear(problem, system, now, following):
             break
-        following, complete = _descend(problem, rows, now, Iterate(s, change, system.nu))
+        following, complete = _descend(problem, rows, now, Iterate(s, change, following.z))
         if complete and _linear(problem, system, now, following):
             break
         if iteration == 1 and problem.guess is not None:
@@ -275,13 +313,8 @@ def _iterate(problem: Problem, used: BoolArray, start: Iterate, first: System) -
         change = following.change
         if iteration == problem.iterations or following is now:
             break
-        now, system = following, _system(problem, rows, following)
-    inverse = _inverse(system.L.T).T
-    distances = kernels.conditional_distances(inverse, y)
-    if not np.isfinite(distances).all():
-        raise UnsolvableError("the innovation covariance is not positive definite")
-    nis = float(system.nu @ y)
-    return Solution(used, change, system.H, system.HP, inverse, nis, distances, system.variances(P))
+        now, system = following, System.of(*_linear_update(problem, rows, following), np.zeros_like(rows))
+    return change, system
 
 
 def _inverse(U: Array) -> Array:
@@ -302,7 +335,7 @@ def _linear(problem: Problem, system: System, now: Iterate, following: Iterate) 
     errors = np.where(system.rows, following.z - now.z - expected, 0.0)
     if np.abs(errors).max() >= _LINEAR * problem.sigma:
         return False
-    moved = system.solved(errors.reshape(-1)) @ system.HP[:, :POSE]
+    moved = system.whiten(errors.reshape(-1)) @ system.by_pose
     return bool((moved**2 <= _POSE_SHARE**2 * system.variances(problem.P)).all())
 
 
@@ -345,15 +378,17 @@ def _descend(problem: Problem, rows: BoolArray, now: Iterate, target: Iterate) -
     return now, False
 
 
-def _system(problem: Problem, rows: BoolArray, now: Iterate, line: Linearisation | None = None) -> System:
-    """Linearised at an iterate."""
-    line = line or problem.model.linearise(*problem.mean(now.change[problem.g]))
-    H, moved = Jacobian(line.by_pose, line.own, problem.first), now.change.any()
+def _linear_update(
+    problem: Problem, rows: BoolArray, at: Iterate, line: Linearisation | None = None
+) -> tuple[BoolArray, Jacobian, Array, Array, Array]:
+    """Rows, H, H P, ν and S of the update linearised at an iterate."""
+    line = line or problem.model.linearise(*problem.mean(at.change[problem.g]))
+    H, moved = Jacobian(line.by_pose, line.own, problem.first), at.change.any()
     H = H if rows.all() else H.only(rows)
     if moved and problem.displacement is not None:
         H = H.without(problem.displacement)
     nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
     if moved:
-        nu += H.times(now.change[:, None])[:, 0]
+        nu += H.times(at.change[:, None])[:, 0]
     HP = H.times(problem.P)
-    return System(rows, H, HP, nu, H.covariance(HP, problem.sigma**2))
+    return rows, H, HP, nu, H.covariance(HP, problem.sigma**2)

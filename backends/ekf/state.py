@@ -19,7 +19,7 @@ from slam.geometry.euler import angles, body_rate_matrix
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-_MOST, _LEAST = 250, 200  # cost: landmarks of the state above which some leave it, and that are left in it then
+_MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +172,9 @@ class State:
             gauge = gauge_jacobian(coordinates, marks.anchors[dense], marks.c[dense], marks.points[dense])
             K = (gauge - marks.gauge[dense]) @ world
             marks = replace(marks, gauge=np.concatenate([gauge, marks.gauge[P.count :]]))
-        V_left = solution.whitened(solution.H.times(P.cross)) if P.cross.size else np.zeros((0, len(solution.HP)))
-        P = P.corrected(solution.whitened(solution.HP), V_left, J, K)
+        system = solution.system
+        V_left = system.whitened(system.H.times(P.cross)) if P.cross.size else np.zeros((0, len(system.HP)))
+        P = P.corrected(system.whitened(system.HP), V_left, J, K)
         motion = reanchored_if_needed(Motion(camera, self.R_world_angles))
         if motion.R_world_angles is not self.R_world_angles:
             P = P.camera_moved(motion.J, motion.noise)
