@@ -47,6 +47,9 @@ class EkfBackend:
         models: noise, priors, motion and gate.
         options: see `EkfConfig`.
 
+    Attributes:
+        state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
+
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
@@ -59,7 +62,7 @@ class EkfBackend:
         self._coordinates = COORDINATES[self._options.landmarks]
         self._consistent = self._options.consistent and self._options.measurement == "stereo"
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
-        self._state = State.first(models)
+        self.state = State.first(models)
         self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -82,7 +85,7 @@ class EkfBackend:
         require_guess("ekf", guess)
         s = replace(s.with_all_of(observations.ids), measured=True)
         s, report = self._updated(s, observations, guess)
-        self._state = s
+        self.state = s
         return report
 
     @one_blas_thread
@@ -96,11 +99,11 @@ class EkfBackend:
             raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
         h = h * np.minimum(1.0, self._farthest / h[:, 2:])
         covariances = self.rig.triangulation_covariance(h, self.models.pixel_sigma)
-        self._state = s.placed(self._coordinates, observations.ids, h, covariances)
+        self.state = s.placed(self._coordinates, observations.ids, h, covariances)
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
-        self._state = self._state.removed(np.unique(np.asarray(ids, np.int64)))
+        self.state = self.state.removed(np.unique(np.asarray(ids, np.int64)))
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
@@ -115,11 +118,11 @@ class EkfBackend:
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        return self._state.landmarks.points[self._state.landmarks.rows_of(ids)]
+        return self.state.landmarks.points[self.state.landmarks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
-        s = self._state
+        s = self.state
         path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
         return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
 
@@ -129,11 +132,11 @@ class EkfBackend:
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("ekf", ids, positions, covariances)
-        s, anchors = self._state, distant_anchors(positions, covariances)
+        s, anchors = self.state, distant_anchors(positions, covariances)
         s.landmarks.require_new(ids)
         new = Landmarks.at(self._coordinates, ids.astype(np.int64), anchors, positions.astype(float), s.frame)
         D = self._coordinates.inverse_jacobian(anchors, new.c)
-        self._state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
+        self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
@@ -142,7 +145,7 @@ class EkfBackend:
         require_known("ekf", ids, local, covariances)
         require_in_front("ekf", ids, local)
         s.landmarks.require_new(ids)
-        self._state = s.placed(self._coordinates, ids, local, covariances)
+        self.state = s.placed(self._coordinates, ids, local, covariances)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -154,7 +157,7 @@ class EkfBackend:
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
         """
-        s, rectified_rig = replace(self._state, measured=True), self.rig.rectified
+        s, rectified_rig = replace(self.state, measured=True), self.rig.rectified
         if s.frame >= 0 and len(s.landmarks):
             T = s.pose @ rectified_rig.T_left_rectified
             local = se3.transform(se3.inverse(T), s.landmarks.points)
@@ -169,17 +172,17 @@ class EkfBackend:
             change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
             if np.isfinite(change).all():
                 s = replace(s, landmarks=s.landmarks.moved(self._coordinates, rows, change))
-        self._state = s
+        self.state = s
 
     # --- the filter's parts ---
 
     def _advanced(self, start: Motion, dt: float) -> Motion:
         """The camera after a step by the motion model."""
-        return advanced(self.models, start, self._state.covariance.dense[:CAMERA, :CAMERA], dt, self._consistent)
+        return advanced(self.models, start, self.state.covariance.dense[:CAMERA, :CAMERA], dt, self._consistent)
 
     def _predicted(self, stamp: float, moved: Callable[[Motion, float], Motion]) -> Prediction:
         """Go to a time; `moved` says what the camera does meanwhile."""
-        s = self._state
+        s = self.state
         require_stamp("ekf", stamp, s.stamp if s.frame >= 0 else None)
         if s.frame < 0:
             after = replace(s, stamp=float(stamp), frame=0, measured=False)
@@ -187,7 +190,7 @@ class EkfBackend:
             after = s.advanced(float(stamp), moved(Motion(s.camera, s.R_world_angles), stamp - s.stamp))
         prediction = self._prediction(after)
         self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
-        self._state = after
+        self.state = after
         return prediction
 
     def _prediction(self, s: State) -> Prediction:
@@ -254,6 +257,6 @@ class EkfBackend:
         return None if found is None else s.change_to(found)
 
     def _started(self, what: str) -> State:
-        if self._state.frame < 0:
+        if self.state.frame < 0:
             raise MeasurementError(f"ekf: {what} before the first predict")
-        return self._state
+        return self.state

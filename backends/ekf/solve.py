@@ -242,6 +242,8 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
     """
+    if not (np.isfinite(problem.pose).all() and math.isfinite(problem.P.trace())):
+        raise UnsolvableError("the predicted state is not finite")
     s, change = np.zeros(len(problem.g)), np.zeros(len(problem.P))
     if at_guess:
         s, change = _towards_guess(problem)

@@ -100,7 +100,8 @@ class State:
         D = coordinates.inverse_jacobian(anchors, new.c)
         covariance = self.covariance.appended(D @ J, D @ (R @ covariances @ R.T) @ D.transpose(0, 2, 1))
         landmarks = self.landmarks.with_rows(self.covariance.count, new)
-        return replace(self, measured=True, landmarks=landmarks, covariance=covariance)._relieved()
+        placed = replace(self, measured=True, landmarks=landmarks, covariance=covariance)
+        return placed._relieved(np.zeros(0, np.intp), np.flatnonzero(landmarks.seen == self.frame))
 
     def inserted(self, new: Landmarks, covariances: Array) -> State:
         """With landmarks known from elsewhere, by covariances (M, 3, 3) of their coordinates."""
@@ -121,22 +122,24 @@ class State:
 
     def with_all_of(self, ids: IdArray) -> State:
         """With some landmarks (M,), which may have left it or be known from elsewhere, in the dense part."""
-        rows, a, b = self.landmarks.rows_of(ids), self.covariance.count, self.covariance.correlated
-        back = np.sort(rows[rows >= a])
-        if not len(back):
-            return self
-        left, known = (np.setdiff1d(part, back) for part in (np.arange(a, b), np.arange(b, len(self.landmarks))))
-        return self._rearranged(np.concatenate([np.arange(a), back]), left, known)
+        rows = self.landmarks.rows_of(ids)
+        back = np.sort(rows[rows >= self.covariance.count])
+        return self._relieved(back, rows) if len(back) else self
 
-    def _relieved(self) -> State:
-        """Without those not measured for longest in the dense part, where there are too many."""
-        a, b = self.covariance.count, self.covariance.correlated
-        leave = np.argsort(self.landmarks.seen[:a], kind="stable")[: a - _LEAST]
-        leave = np.sort(leave[self.landmarks.seen[leave] < self.frame])
-        if a <= _MOST or not len(leave):
+    def _relieved(self, back: IndexArray, kept: IndexArray) -> State:
+        """With rows `back` in the dense part; where it is too large, those not measured for longest leave it.
+
+        Those of the rows `kept` stay in any case.
+        """
+        a, b, n = self.covariance.count, self.covariance.correlated, len(self.landmarks)
+        others = np.setdiff1d(np.arange(a), kept)
+        too_many = max(a + len(back) - _LEAST, 0) if a + len(back) > _MOST else 0
+        leave = np.sort(others[np.argsort(self.landmarks.seen[others], kind="stable")][:too_many])
+        if not len(back) and not len(leave):
             return self
-        left = np.concatenate([np.arange(a, b), leave])
-        return self._rearranged(np.setdiff1d(np.arange(a), leave), left, np.arange(b, len(self.landmarks)))
+        left = np.concatenate([np.setdiff1d(np.arange(a, b), back), leave])
+        dense = np.concatenate([np.setdiff1d(np.arange(a), leave), back])
+        return self._rearranged(dense, left, np.setdiff1d(np.arange(b, n), back))
 
     def _rearranged(self, dense: IndexArray, left: IndexArray, known: IndexArray) -> State:
         """With the landmarks of these rows of the table in each part."""
