@@ -11,7 +11,7 @@ import numpy as np
 from backends.ekf.config import EkfConfig
 from backends.ekf.covariance import CAMERA, POSE
 from backends.ekf.landmarks import COORDINATES, Landmarks, distant_anchors
-from backends.ekf.measurement import Measurement, innovation_covariances
+from backends.ekf.measurement import Measurement
 from backends.ekf.motion import Motion, advanced, at_rest, motion_noise, turning
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
@@ -53,6 +53,9 @@ class EkfBackend:
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
+
+    #: Of a prior map: those that were measured keep their joint covariance (72 N² bytes).
+    most_landmarks = 2000
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.rig = rig
@@ -199,13 +202,12 @@ class EkfBackend:
         rows = np.flatnonzero(self.rig.left.in_view((marks.points - T[:3, 3]) @ T[:3, :3]))
         blocks, cross = (part[rows] for part in s.covariance.marginals())
         model, c = Measurement(self.rig, s.R_world_angles, self._coordinates, marks.anchors[rows]), marks.c[rows]
-        line = model.linearise(s.camera[:POSE], c)
-        left = replace(line, by_pose=line.by_pose[:, :2], own=line.own[:, :2])
-        right = line.z[:, [2, 1]]
+        z, H = model.linearise(s.camera[:POSE], c, rows)
+        right = z[:, [2, 1]]
         if not self.rig.is_rectified:
             right = self.rig.project((marks.points[rows] - T[:3, 3]) @ T[:3, :3])[1]
-        S = with_noise(innovation_covariances(left, s.covariance.pose, cross, blocks), self.models.pixel_sigma)
-        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids[rows], line.z[:, :2], right, S)
+        S = with_noise(H.own_covariances(s.covariance.pose, cross, blocks)[:, :2, :2], self.models.pixel_sigma)
+        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids[rows], z[:, :2], right, S)
 
     def _updated(self, s: State, observations: Observations, guess: Array | None) -> tuple[State, UpdateReport]:
         """The state after an update, and its report; all that was observed is in the state's dense part."""
@@ -226,7 +228,9 @@ class EkfBackend:
             return s, UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
         used, w = found.solution.used, found.solution.system.w
         dof = int(np.isfinite(problem.z[used]).sum())
-        return after, UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof)
+        return after, UpdateReport(
+            UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof
+        )
 
     def _problem(self, s: State, observations: Observations, rows: IndexArray, guess: Array | None) -> Problem:
         """The update by landmarks of some rows (M,) of the table."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -26,69 +26,23 @@ _NEARER = 0.1  # share of its inverse depth that a landmark keeps at least in an
 _STAND_OFF = 100.0  # standard deviations of a known point between it and its anchor
 
 
-class Coordinates(Protocol):
-    """What three numbers c of the state say of a landmark; its anchor is a pose ``[R | r]`` (3, 4) of its own."""
+class InverseDepth:
+    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the axes of its anchor ``[R | r]`` (3, 4); z is positive."""
 
     def points(self, anchors: Array, c: Array) -> Array:
         """Positions (M, 3) [m] in the world of landmarks with coordinates c (M, 3)."""
-        ...
-
-    def of(self, anchors: Array, points: Array) -> Array:
-        """Coordinates (M, 3) of positions (M, 3)."""
-        ...
-
-    def jacobian(self, anchors: Array, c: Array) -> Array:
-        """Derivatives (M, 3, 3) of the positions by the coordinates."""
-        ...
-
-    def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
-        """Derivatives (M, 3, 3) of the coordinates by the positions."""
-        ...
-
-    def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
-        """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left."""
-        ...
-
-
-class Euclidean:
-    """The papers': the position in the world. Anchors do not matter."""
-
-    def points(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.points`."""
-        return c
-
-    def of(self, anchors: Array, points: Array) -> Array:
-        """See `Coordinates.of`."""
-        return points
-
-    def jacobian(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.jacobian`."""
-        return np.tile(np.eye(3), (len(c), 1, 1))
-
-    inverse_jacobian = jacobian
-
-    def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
-        """See `Coordinates.moved`."""
-        return c + change
-
-
-class InverseDepth:
-    """``[x/z, y/z, 1/z]`` of the position (x, y, z) in the anchor's axes; z is positive."""
-
-    def points(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.points`."""
         rays = np.ones((len(c), 3))
         rays[:, :2] = c[:, :2]
         rays /= c[:, 2:]
         return np.asarray((anchors[:, :, :3] @ rays[:, :, None])[:, :, 0] + anchors[:, :, 3])
 
     def of(self, anchors: Array, points: Array) -> Array:
-        """See `Coordinates.of`."""
+        """Coordinates (M, 3) of positions (M, 3)."""
         local = ((points - anchors[:, :, 3])[:, None, :] @ anchors[:, :, :3])[:, 0]
         return np.concatenate([local[:, :2], np.ones((len(local), 1))], axis=1) / local[:, 2:]
 
     def jacobian(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.jacobian`."""
+        """Derivatives (M, 3, 3) of the positions by the coordinates."""
         depth = 1 / c[:, 2]
         D = np.zeros((len(c), 3, 3))
         D[:, 0, 0] = D[:, 1, 1] = depth
@@ -97,7 +51,7 @@ class InverseDepth:
         return np.asarray(anchors[:, :, :3] @ D)
 
     def inverse_jacobian(self, anchors: Array, c: Array) -> Array:
-        """See `Coordinates.inverse_jacobian`."""
+        """Derivatives (M, 3, 3) of the coordinates by the positions."""
         w = c[:, 2]
         D = np.zeros((len(c), 3, 3))
         D[:, 0, 0] = D[:, 1, 1] = w
@@ -106,7 +60,7 @@ class InverseDepth:
         return np.asarray(D @ np.swapaxes(anchors[:, :, :3], 1, 2))
 
     def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:
-        """See `Coordinates.moved`.
+        """Coordinates of points after a change of c (M, 3); of an inverse depth at least this share is left.
 
         The measurements of a far point may want its inverse depth negative: then it goes away, step by step.
         """
@@ -114,6 +68,27 @@ class InverseDepth:
         out[:, 2] = np.maximum(out[:, 2], np.maximum(least * c[:, 2], _FARTHEST))
         return np.asarray(out)
 
+
+class Euclidean:
+    """The papers': the position in the world. Anchors do not matter; methods as those of `InverseDepth`."""
+
+    def points(self, anchors: Array, c: Array) -> Array:  # noqa: D102
+        return c
+
+    def of(self, anchors: Array, points: Array) -> Array:  # noqa: D102
+        return points
+
+    def jacobian(self, anchors: Array, c: Array) -> Array:  # noqa: D102
+        return np.tile(np.eye(3), (len(c), 1, 1))
+
+    inverse_jacobian = jacobian
+
+    def moved(self, c: Array, change: Array, least: float = 0.0) -> Array:  # noqa: D102
+        return c + change
+
+
+#: What three numbers of the state say of a landmark.
+Coordinates = InverseDepth | Euclidean
 
 #: By the name of the option.
 COORDINATES: dict[str, Coordinates] = {"inverse_depth": InverseDepth(), "euclidean": Euclidean()}
@@ -173,7 +148,7 @@ class Landmarks:
                 raise MeasurementError(f"ekf: landmark {i} is in the map already")
 
     @property
-    def _columns(self) -> tuple[Array, ...]:
+    def _columns(self) -> tuple[Any, ...]:
         return self.ids, self.anchors, self.c, self.points, self.gauge, self.seen
 
     def take(self, rows: IndexArray | slice) -> Landmarks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -42,14 +42,14 @@ class Jacobian:
         own: derivatives (M, 3, 3) of each landmark's measurement by the landmark's own coordinates.
         first: where these begin in the state (M,).
         displacement: U and L, or None.
-        by_displacement: ``H U`` (3M, 6) with the plain H, or None.
+        by_displacement: ``H U`` (3M, 6) with the plain H, if there is one.
     """
 
     by_pose: Array
     own: Array
     first: IndexArray
     displacement: Displacement | None = None
-    by_displacement: Array | None = None
+    by_displacement: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     def without(self, displacement: Displacement) -> Jacobian:
         """Without a displacement of the world."""
@@ -60,7 +60,7 @@ class Jacobian:
     def only(self, rows: BoolArray) -> Jacobian:
         """With zero where a row is not measured (mask (M, 3))."""
         each, by_displacement = rows[:, :, None], self.by_displacement
-        if by_displacement is not None:
+        if self.displacement is not None:
             by_displacement = np.where(rows.reshape(-1, 1), by_displacement, 0.0)
         by_pose, own = np.where(each, self.by_pose, 0.0), np.where(each, self.own, 0.0)
         return replace(self, by_pose=by_pose, own=own, by_displacement=by_displacement)
@@ -81,6 +81,18 @@ class Jacobian:
             S -= (HP[:, self.displacement.g] @ self.displacement.share.T) @ self.by_displacement.T
         return S
 
+    def own_covariances(self, pose: Array, cross: Array, blocks: Array) -> Array:
+        """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
+
+        Args:
+            pose: covariance (6, 6) of [r, φ].
+            cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
+            blocks: covariances (M, 3, 3) of these coordinates.
+        """
+        A, B = self.by_pose, self.own
+        S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)
+        return np.asarray(0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1))
+
     def transposed_times(self, y: Array) -> Array:
         """``Hᵀ y`` (6 + 3M,) of g, for y (3M,); it is zero elsewhere."""
         m = len(self.own)
@@ -89,21 +101,6 @@ class Jacobian:
         if self.displacement is not None:
             out -= (y @ self.by_displacement) @ self.displacement.share
         return out
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """Predicted measurements and their derivatives.
-
-    Attributes:
-        z: predicted (uL, vL, uR) (M, 3) [px]; NaN behind a camera.
-        by_pose: derivatives (M, 3, 6) by the camera's [r, φ].
-        own: derivatives (M, 3, 3) by the landmark's own coordinates.
-    """
-
-    z: Array
-    by_pose: Array
-    own: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,31 +123,17 @@ class Measurement:
         """Predicted components (M, 3) [px] at [r, φ] (6,) and coordinates c (M, 3); NaN behind a camera."""
         return self.rig.project_stereo(self._local(pose, c)[0], jacobian=False)[0]
 
-    def linearise(self, pose: Array, c: Array) -> Linearisation:
-        """The same with derivatives."""
+    def linearise(self, pose: Array, c: Array, first: IndexArray) -> tuple[Array, Jacobian]:
+        """The same with derivatives by a state in which landmarks' coordinates begin at `first` (M,)."""
         h, R = self._local(pose, c)
         z, J = self.rig.project_stereo(h)
         by_point = J @ R.T
         # Turning the camera by δθ = E(φ) δφ about its own axes moves h by h × δθ.
         turned = h @ (_HAT @ body_rate_matrix(pose[3:])).reshape(3, 9)
         by_pose = np.concatenate([-by_point, J @ turned.reshape(-1, 3, 3)], axis=2)
-        return Linearisation(z, by_pose, by_point @ self.coordinates.jacobian(self.anchors, c))
+        return z, Jacobian(by_pose, by_point @ self.coordinates.jacobian(self.anchors, c), first)
 
     def _local(self, pose: Array, c: Array) -> tuple[Array, Array]:
         """Landmarks ``h = Rᵀ (Y − r)`` (M, 3) in camera coordinates (paper B, Eqs. 3-5), and R (3, 3)."""
         R = attitude(self.R_world_angles, pose[3:])
         return (self.coordinates.points(self.anchors, c) - pose[:3]) @ R, R
-
-
-def innovation_covariances(line: Linearisation, pose: Array, cross: Array, blocks: Array) -> Array:
-    """Covariances (M, 3, 3) [px²] of each landmark's innovation by itself, without the measurement's noise.
-
-    Args:
-        line: derivatives of the measurements.
-        pose: covariance (6, 6) of [r, φ].
-        cross: covariances (M, 3, 6) of the landmarks' own coordinates with it.
-        blocks: covariances (M, 3, 3) of these coordinates.
-    """
-    A, B = line.by_pose, line.own
-    S = (A @ pose + 2 * (B @ cross)) @ A.transpose(0, 2, 1)
-    return np.asarray(0.5 * (S + S.transpose(0, 2, 1)) + B @ blocks @ B.transpose(0, 2, 1))

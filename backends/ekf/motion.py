@@ -1,4 +1,4 @@
-"""How the camera moves, and what is known of it at first: means and covariances of [r, φ, v, ω] (paper B, section 2)."""
+"""How the camera moves and what is known of it at first, for [r, φ, v, ω] (paper B, section 2)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The measurement update, gated and iterated: what it makes of a prior. The filter's state is not changed here.
 
-In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain ``K = P Hᵀ S⁻¹``,
-the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is ``y = S⁻¹ ν``: the state
-changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [r, φ, measured landmarks] alone.
+In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
+``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
+``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [r, φ, measured landmarks] alone.
 
 A component that is not measured (or gated) keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
@@ -21,8 +21,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
 from backends.ekf import kernels
 from backends.ekf.covariance import POSE
-from backends.ekf.landmarks import Coordinates
-from backends.ekf.measurement import Displacement, Jacobian, Linearisation, Measurement
+from backends.ekf.measurement import Displacement, Jacobian, Measurement
 from slam.chi_square import chi_square_limits
 from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
@@ -38,6 +37,10 @@ _LINEAR = 1.0
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
 _SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
+
+
+#: Of a linear update: mask of its rows (M, 3), H, H P (3M, n), ν (3M,), S (3M, 3M), of which the lower triangle counts.
+Parts = tuple[BoolArray, Jacobian, Array, Array, Array]
 
 
 class UnsolvableError(ArithmeticError):
@@ -244,13 +247,12 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     """
     if not (np.isfinite(problem.pose).all() and math.isfinite(problem.P.trace())):
         raise UnsolvableError("the predicted state is not finite")
-    s, change = np.zeros(len(problem.g)), np.zeros(len(problem.P))
-    if at_guess:
-        s, change = _towards_guess(problem)
-    line = problem.model.linearise(*problem.mean(change[problem.g]))
-    start, measured = Iterate(s, change, line.z), np.isfinite(problem.z)
-    visible = np.asarray(np.isfinite(line.z).all(axis=1))
-    parts = rows, _, _, nu, S = _linear_update(problem, measured & visible[:, None], start, line)
+    nothing = np.zeros(len(problem.g)), np.zeros(len(problem.P))
+    s, change = _towards_guess(problem) if at_guess else nothing
+    z, H = problem.model.linearise(*problem.mean(change[problem.g]), problem.first)
+    start, measured = Iterate(s, change, z), np.isfinite(problem.z)
+    visible = np.asarray(np.isfinite(z).all(axis=1))
+    parts = rows, _, _, nu, S = _linear_update(problem, measured & visible[:, None], start, H)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
     own = kernels.own_distances(nu, S)
     if not np.isfinite(own).all():
@@ -312,10 +314,12 @@ def _iterate(problem: Problem, start: Iterate, system: System) -> tuple[Array, S
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
         if following is now and iteration == 1:
             raise UnsolvableError("no step towards the solution lowers the cost")
-        change = following.change
+        change = np.asarray(following.change)
         if iteration == problem.iterations or following is now:
             break
-        now, system = following, System.of(*_linear_update(problem, rows, following), np.zeros_like(rows))
+        z, H = problem.model.linearise(*problem.mean(following.change[problem.g]), problem.first)
+        now = replace(following, z=z)
+        system = System.of(*_linear_update(problem, rows, now, H), np.zeros_like(rows))
     return change, system
 
 
@@ -380,16 +384,13 @@ def _descend(problem: Problem, rows: BoolArray, now: Iterate, target: Iterate) -
     return now, False
 
 
-def _linear_update(
-    problem: Problem, rows: BoolArray, at: Iterate, line: Linearisation | None = None
-) -> tuple[BoolArray, Jacobian, Array, Array, Array]:
-    """Rows, H, H P, ν and S of the update linearised at an iterate."""
-    line = line or problem.model.linearise(*problem.mean(at.change[problem.g]))
-    H, moved = Jacobian(line.by_pose, line.own, problem.first), at.change.any()
+def _linear_update(problem: Problem, rows: BoolArray, at: Iterate, H: Jacobian) -> Parts:
+    """Rows, H, H P, ν and S of the update linearised at an iterate, where the plain Jacobian is H."""
+    moved = at.change.any()
     H = H if rows.all() else H.only(rows)
     if moved and problem.displacement is not None:
         H = H.without(problem.displacement)
-    nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
+    nu = np.where(rows, problem.z - at.z, 0.0).reshape(-1)
     if moved:
         nu += H.times(at.change[:, None])[:, 0]
     HP = H.times(problem.P)

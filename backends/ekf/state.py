@@ -169,7 +169,8 @@ class State:
         marks = self.landmarks.moved(coordinates, dense, solution.change[CAMERA:].reshape(-1, 3))
         if not (np.isfinite(camera).all() and np.isfinite(marks.points).all()):
             raise UnsolvableError("the corrected state is not finite")
-        J, K = np.eye(CAMERA), np.zeros((P.count, 3, POSE))
+        J: Array = np.eye(CAMERA)
+        K: Array = np.zeros((P.count, 3, POSE))
         if consistent:
             J, world = transport(self.R_world_angles, self.camera, camera)
             gauge = gauge_jacobian(coordinates, marks.anchors[dense], marks.c[dense], marks.points[dense])
