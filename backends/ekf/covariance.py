@@ -3,6 +3,7 @@
 A landmark that has left is corrected no more, but its error's covariance with the state goes on: this is the filter of
 Schmidt, whose covariance is exact for what it does. With the gain of such a landmark zero, ``P_AA`` changes as ever,
 ``P_Ab ← (1 − K H) P_Ab`` and ``P_bb`` not at all. When it is measured again it joins the state with its covariances.
+The camera's last poses, as they were believed in their time, are kept in the same way (stochastic clones).
 What is known of a landmark from elsewhere is independent of all else until it is measured: nothing need be carried.
 """
 
@@ -23,19 +24,21 @@ POSE = 6  #: fixed: its part [r, φ] that measurements depend on
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of ``[camera (12), landmark 0 (3), ...]``, the dense part, and of landmarks outside of it.
+    """Covariance of ``[camera (12), landmark 0 (3), ...]``, the dense part, and of what is outside of it.
 
     Attributes:
         dense: (12 + 3A, 12 + 3A), symmetric.
-        cross: of it with landmarks that have left (12 + 3A, 3B).
-        left: of these (3B, 3B).
+        cross: of it with what has left: K poses, by their right perturbations, and B landmarks (12 + 3A, 6K + 3B).
+        left: of these (6K + 3B, 6K + 3B).
         known: of each landmark that is independent of all else (C, 3, 3).
+        poses: K, the newest last.
     """
 
     dense: Array
     cross: Array
     left: Array
     known: Array
+    poses: int = 0
 
     @classmethod
     def of_camera(cls, P: Array) -> Covariance:
@@ -50,7 +53,7 @@ class Covariance:
     @property
     def correlated(self) -> int:
         """Number of landmarks that are in it or have left it: those after them are known from elsewhere."""
-        return self.count + len(self.left) // 3
+        return self.count + (len(self.left) - POSE * self.poses) // 3
 
     @property
     def pose(self) -> Array:
@@ -59,16 +62,30 @@ class Covariance:
 
     def marginals(self) -> tuple[Array, Array]:
         """Covariances (N, 3, 3) of all landmarks, and theirs (N, 3, 6) with the camera's [r, φ]."""
-        a, b, n = self.count, self.correlated, self.correlated + len(self.known)
+        a, b, n, k = self.count, self.correlated, self.correlated + len(self.known), POSE * self.poses
         blocks, cross = np.empty((n, 3, 3)), np.zeros((n, 3, POSE))
-        for part, P in ((slice(0, a), self.dense[CAMERA:, CAMERA:]), (slice(a, b), self.left)):
+        for part, P in ((slice(0, a), self.dense[CAMERA:, CAMERA:]), (slice(a, b), self.left[k:, k:])):
             each, three = np.arange(len(P) // 3), np.arange(3)
             rows = 3 * each[:, None] + three
             blocks[part] = P[rows[:, :, None], rows[:, None, :]]
         blocks[b:] = self.known
         cross[:a] = self.dense[CAMERA:, :POSE].reshape(-1, 3, POSE)
-        cross[a:b] = self.cross[:POSE].T.reshape(-1, 3, POSE)
+        cross[a:b] = self.cross[:POSE, k:].T.reshape(-1, 3, POSE)
         return blocks, cross
+
+    def with_pose(self, J: Array, most: int) -> Covariance:
+        """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
+        k = POSE * self.poses
+        drop = slice(POSE if self.poses == most else 0, None)
+        own, stay = self.dense[:, :POSE] @ J.T, np.r_[np.arange(k)[drop], k : len(self.left)]
+        n, kept = len(stay), k - (drop.start or 0)
+        left, by_new = self.left[stay][:, stay], J @ self.cross[:POSE, stay]
+        left = np.insert(np.insert(left, [kept] * POSE, 0.0, axis=0), [kept] * POSE, 0.0, axis=1)
+        new = slice(kept, kept + POSE)
+        others = np.r_[0:kept, kept + POSE : n + POSE]
+        left[new, others], left[others, new], left[new, new] = by_new, by_new.T, J @ own[:POSE]
+        cross = np.concatenate([self.cross[:, stay[:kept]], own, self.cross[:, stay[kept:]]], axis=1)
+        return replace(self, cross=cross, left=left, poses=kept // POSE + 1)
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""
@@ -99,16 +116,18 @@ class Covariance:
         """With other landmarks in each of its parts, or fewer; by their rows of the table of landmarks."""
         parts, first_known = (self.dense, self.cross, self.left), self.correlated
         state = np.concatenate([np.arange(CAMERA), self._numbers(dense)])
-        P, outside = kernels.gather(*parts, state, state), self._numbers(left)
+        poses = len(self.dense) + np.arange(POSE * self.poses)
+        P, outside = kernels.gather(*parts, state, state), np.concatenate([poses, self._numbers(left)])
         new = np.flatnonzero(dense >= first_known)
         rows = CAMERA + 3 * new[:, None] + np.arange(3)
         P[rows[:, :, None], rows[:, None, :]] = self.known[dense[new] - first_known]
         cross, own = kernels.gather(*parts, state, outside), kernels.gather(*parts, outside, outside)
-        return Covariance(P, cross, own, self.known[known - first_known])
+        return Covariance(P, cross, own, self.known[known - first_known], self.poses)
 
     def _numbers(self, rows: IndexArray) -> IndexArray:
         """Of landmarks' coordinates (3M,) in ``[dense, left]``; −1 for those of landmarks that are known."""
         numbers = CAMERA + 3 * rows[:, None] + np.arange(3)
+        numbers[rows >= self.count] += POSE * self.poses
         numbers[rows >= self.correlated] = -1
         return numbers.reshape(-1)
 
@@ -117,7 +136,7 @@ class Covariance:
 
         Args:
             V: ``P Hᵀ L⁻ᵀ`` (n, m), in Fortran's order.
-            V_left: the same of landmarks that have left (3B, m).
+            V_left: the same of what has left (6K + 3B, m).
             J: the camera's error becomes J (12, 12) times what it was,
             K: and then to those of the landmarks K (A, 3, 6) times that of [r, φ] is added.
         """

@@ -17,7 +17,7 @@ from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
 from backends.ekf.state import State
 from slam.checks import require_guess, require_not_measured, require_stamp
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -128,6 +128,14 @@ class EkfBackend:
         s = self.state
         path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
         return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
+
+    def recent(self, n: int) -> RecentPoses:
+        """The camera's last n poses, at most seven, as they were believed in their time; see `slam.data.RecentPoses`.
+
+        Raises:
+            MeasurementError: before the first `predict`.
+        """
+        return self._started("recent").recent_poses(n)
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 

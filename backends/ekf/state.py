@@ -13,12 +13,13 @@ from backends.ekf.landmarks import Coordinates, Landmarks, gauge_jacobian
 from backends.ekf.motion import Motion, initial_covariance, reanchored_if_needed, transport
 from backends.ekf.recovery import Agreement
 from backends.ekf.solve import UnsolvableError
-from slam.data import IdArray, IndexArray
+from slam.data import IdArray, IndexArray, RecentPoses
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
+RECENT = 6  #: cost: poses before the present one that are kept
 _MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
 
 
@@ -38,6 +39,7 @@ class State:
         R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
         landmarks: all of them.
         covariance: of everything.
+        recent: stamps [s] and poses (4, 4) of the last frames before this one, the newest last.
     """
 
     stamp: float
@@ -48,6 +50,7 @@ class State:
     R_world_angles: Array
     landmarks: Landmarks
     covariance: Covariance
+    recent: tuple[tuple[float, Array], ...] = ()
 
     @classmethod
     def first(cls, models: EstimatorModels) -> State:
@@ -64,9 +67,13 @@ class State:
         """``T_world_left`` (4, 4)."""
         return se3.pose(attitude(self.R_world_angles, self.camera[3:6]), self.camera[:3])
 
+    def pose_jacobian(self) -> Array:
+        """Derivative (6, 6) of the pose's right perturbation by [r, φ]."""
+        return pose_jacobian(self.pose[:3, :3], self.camera[3:6])
+
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) of the pose's right perturbation."""
-        J = pose_jacobian(self.pose[:3, :3], self.camera[3:6])
+        J = self.pose_jacobian()
         P = J @ self.covariance.pose @ J.T
         return np.asarray(0.5 * (P + P.T))
 
@@ -81,10 +88,22 @@ class State:
 
     def advanced(self, stamp: float, motion: Motion) -> State:
         """At a later time, after a motion of the camera."""
+        covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT).camera_moved(motion.J, motion.noise)
         return replace(
             self, stamp=stamp, frame=self.frame + 1, dt=stamp - self.stamp, measured=False, camera=motion.camera,
-            R_world_angles=motion.R_world_angles, covariance=self.covariance.camera_moved(motion.J, motion.noise),
+            R_world_angles=motion.R_world_angles, covariance=covariance,
+            recent=(*self.recent, (self.stamp, self.pose))[-RECENT:],
         )  # fmt: skip
+
+    def recent_poses(self, n: int) -> RecentPoses:
+        """The last poses, as they were believed in their time, with their joint covariance; at most n."""
+        path = [*self.recent, (self.stamp, self.pose)][-n:]
+        k, J = len(path) - 1, self.pose_jacobian()
+        kept = slice(POSE * (len(self.recent) - k), POSE * len(self.recent))
+        by_newest = J @ self.covariance.cross[:POSE, kept]
+        P = np.block([[self.covariance.left[kept, kept], by_newest.T], [by_newest, J @ self.covariance.pose @ J.T]])
+        stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
+        return RecentPoses(stamps, poses, 0.5 * (P + P.T))
 
     # --- landmarks join and leave ---
 

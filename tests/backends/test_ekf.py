@@ -108,9 +108,9 @@ def rounds(monkeypatch, most: int) -> EkfBackend:
 
 def test_landmarks_leave_the_state_and_come_back(monkeypatch):
     whole, some = rounds(monkeypatch, 1000), rounds(monkeypatch, 60)
-    assert whole.state.covariance.left.size == 0
+    assert whole.state.covariance.count == len(whole.state.landmarks)
     assert some.state.covariance.count <= 60
-    assert len(some.state.covariance.left) > 3 * 60
+    assert some.state.covariance.correlated - some.state.covariance.count > 60
     a, b = whole.estimate(), some.estimate()
     np.testing.assert_array_equal(a.ids, b.ids)
     # what is no longer corrected is known a little less well, but not much: nor does it spoil the camera
@@ -249,3 +249,27 @@ def test_removal_leaves_the_others_untouched(drive):
     np.testing.assert_array_equal(after.positions, before.positions[kept])
     np.testing.assert_array_equal(after.covariances, before.covariances[kept])
     np.testing.assert_array_equal(after.covariance, before.covariance)
+
+
+def test_the_last_poses_are_known_together():
+    """Their joint covariance fits the errors of 25 runs, above all the errors of how the camera has moved."""
+    runs, motion, whole, between = 25, MotionModel(0.3, 0.15), [], []
+    models = EstimatorModels(motion, pixel_sigma=0.5, initial_angular_velocity_sigma=0.2)
+    for seed in range(runs):
+        poses = random_path(12, 0.1, 0.5 * FORWARD, motion, np.random.default_rng(300 + seed))
+        backend = EkfBackend(RIG, models)
+        run(backend, scene(poses, points=150, seed=seed, limit=25))
+        found = backend.recent(5)
+        np.testing.assert_allclose(found.stamps, 0.1 * np.arange(7, 12))
+        np.testing.assert_array_equal(found.poses, backend.trajectory().poses[-5:])
+        np.testing.assert_allclose(found.covariance[-6:, -6:], backend.estimate(False).covariance, atol=1e-15)
+        x = se3.log(se3.inverse(found.poses) @ poses[-5:])
+        whole.append(x.reshape(-1) @ np.linalg.solve(found.covariance, x.reshape(-1)))
+        J = np.concatenate([-se3.adjoint(se3.inverse(found.poses[-1]) @ found.poses[0]), np.eye(6)], axis=1)
+        ends = np.r_[0:6, 24:30]
+        off = J @ x[[0, -1]].reshape(-1)
+        between.append(off @ np.linalg.solve(J @ found.covariance[np.ix_(ends, ends)] @ J.T, off))
+    for distances, dof in ((whole, 30), (between, 6)):
+        low, high = chi2.ppf([0.001, 0.999], dof * runs) / runs
+        assert low < np.mean(distances) < high
+    assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 7

@@ -220,6 +220,22 @@ def test_landmarks_move_between_the_parts():
     assert_equal_to_rounding(whole(covariance.rearranged(*map(np.array, parts))), P[np.ix_(g, g)])
 
 
+def test_the_last_poses_are_kept():
+    """Of three poses the last two, before the landmarks that have left; these come back from behind them."""
+    covariance, P = grown(np.random.default_rng(6))
+    M, poses = np.eye(len(P)), [np.random.default_rng(k).standard_normal((6, 6)) for k in range(3)]
+    for J in poses:
+        covariance = covariance.with_pose(J, 2)
+    kept = np.zeros((12, len(P)))
+    kept[:6, :6], kept[6:, :6] = poses[1:]
+    M = np.concatenate([M[:33], kept, M[33:]])
+    assert_equal_to_rounding(whole(covariance), M @ P @ M.T)
+    g = numbers([0, 1, 2, 3, 4, 5, 6, 8, 12])
+    back = covariance.rearranged(np.array([0, 1, 2, 3, 4, 5, 6, 8, 12]), np.array([7, 10]), np.array([11]))
+    assert_equal_to_rounding(back.dense, P[np.ix_(g, g)])
+    assert_equal_to_rounding(back.cross[:, :12], P[g][:, :6] @ np.concatenate(poses[1:]).T)
+
+
 def test_the_camera_moves():
     covariance, P = grown(np.random.default_rng(8))
     J, noise = np.eye(len(P)), positive(CAMERA, np.random.default_rng(7))
