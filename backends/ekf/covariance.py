@@ -31,7 +31,7 @@ class Covariance:
         cross: of it with what has left: K poses, by their right perturbations, and B landmarks (12 + 3A, 6K + 3B).
         left: of these (6K + 3B, 6K + 3B).
         known: of each landmark that is independent of all else (C, 3, 3).
-        poses: K, the newest last.
+        poses: K, the newest first.
     """
 
     dense: Array
@@ -75,17 +75,13 @@ class Covariance:
 
     def with_pose(self, J: Array, most: int) -> Covariance:
         """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
-        k = POSE * self.poses
-        drop = slice(POSE if self.poses == most else 0, None)
-        own, stay = self.dense[:, :POSE] @ J.T, np.r_[np.arange(k)[drop], k : len(self.left)]
-        n, kept = len(stay), k - (drop.start or 0)
-        left, by_new = self.left[stay][:, stay], J @ self.cross[:POSE, stay]
-        left = np.insert(np.insert(left, [kept] * POSE, 0.0, axis=0), [kept] * POSE, 0.0, axis=1)
-        new = slice(kept, kept + POSE)
-        others = np.r_[0:kept, kept + POSE : n + POSE]
-        left[new, others], left[others, new], left[new, new] = by_new, by_new.T, J @ own[:POSE]
-        cross = np.concatenate([self.cross[:, stay[:kept]], own, self.cross[:, stay[kept:]]], axis=1)
-        return replace(self, cross=cross, left=left, poses=kept // POSE + 1)
+        k = POSE * min(self.poses, most - 1)
+        stay = np.r_[:k, POSE * self.poses : len(self.left)]
+        own, left = self.dense[:, :POSE] @ J.T, np.empty((POSE + len(stay), POSE + len(stay)))
+        left[:POSE, :POSE], left[:POSE, POSE:] = J @ own[:POSE], J @ self.cross[:POSE, stay]
+        left[POSE:, :POSE], left[POSE:, POSE:] = left[:POSE, POSE:].T, self.left[stay][:, stay]
+        cross = np.concatenate([own, self.cross[:, stay]], axis=1)
+        return replace(self, cross=cross, left=left, poses=k // POSE + 1)
 
     def camera_moved(self, J: Array, noise: Array) -> Covariance:
         """The camera's error (12,) becomes J times what it was, plus noise (12, 12)."""

@@ -130,7 +130,7 @@ class EkfBackend:
         return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
 
     def recent(self, n: int) -> RecentPoses:
-        """The camera's last n poses, at most seven, as they were believed in their time; see `slam.data.RecentPoses`.
+        """The camera's last n poses, at most five, as they were believed in their time; see `slam.data.RecentPoses`.
 
         Raises:
             MeasurementError: before the first `predict`.

@@ -61,27 +61,22 @@ def own_distances(nu, S):
 
 
 @kernel
-def conditional_distances(inverse, y):
-    """Squared distance (M,) of each landmark's innovation from what all other measurements predict for it.
-
-    For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off by
-    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
+def conditional_distances(inverse, lost, y):
+    """``y_jᵀ Q_j⁻¹ y_j`` (M,) with the landmarks' blocks ``Q_j = (L⁻ᵀ L⁻¹ − lostᵀ lost)_jj``.
 
     Args:
-        inverse: ``L⁻¹`` (3M, 3M) with ``S = L Lᵀ``.
+        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
+        lost: (K, 3M).
         y: (3M,).
     """
     m = len(y) // 3
     out, Q = np.empty(m), np.zeros((m, 3, 3))
-    for row in range(len(y)):
-        for i in range(m):
-            a, b, c = inverse[row, 3 * i], inverse[row, 3 * i + 1], inverse[row, 3 * i + 2]
-            Q[i, 0, 0] += a * a
-            Q[i, 1, 0] += b * a
-            Q[i, 1, 1] += b * b
-            Q[i, 2, 0] += c * a
-            Q[i, 2, 1] += c * b
-            Q[i, 2, 2] += c * c
+    for rows, sign in ((inverse, 1.0), (lost, -1.0)):
+        for row in range(len(rows)):
+            for i in range(row // 3 + 1 if sign > 0 else m):
+                for a in range(3):
+                    for b in range(a + 1):
+                        Q[i, a, b] += sign * rows[row, 3 * i + a] * rows[row, 3 * i + b]
     for i in range(m):
         out[i] = squared_distance(y[3 * i : 3 * i + 3], Q[i])
     return out

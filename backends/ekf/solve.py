@@ -198,11 +198,13 @@ class System:
         return np.asarray(P.diagonal()[:POSE] - (self.by_pose**2).sum(axis=0))
 
     def distances(self) -> Array:
-        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any."""
-        M = self.inverse
-        if self.taken.size:
-            M = M - self.taken @ (self.taken.T @ M)
-        found, used = kernels.conditional_distances(M, self.y), self.rows.any(axis=1)
+        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
+
+        For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
+        by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
+        """
+        lost = self.taken.T @ self.inverse
+        found, used = kernels.conditional_distances(self.inverse, lost, self.y), self.rows.any(axis=1)
         if not np.isfinite(found[used]).all():
             raise UnsolvableError("the innovation covariance is not positive definite")
         return np.where(used, found, 0.0)

@@ -19,7 +19,7 @@ from slam.geometry.euler import angles, body_rate_matrix
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
 
-RECENT = 6  #: cost: poses before the present one that are kept
+RECENT = 4  #: cost: poses before the present one that are kept
 _MOST, _LEAST = 300, 250  # cost: landmarks of the state above which some leave it, and that are left in it then
 
 
@@ -39,7 +39,7 @@ class State:
         R_world_angles: the angles' world (3, 3), see `backends.ekf.angles`.
         landmarks: all of them.
         covariance: of everything.
-        recent: stamps [s] and poses (4, 4) of the last frames before this one, the newest last.
+        recent: stamps [s] and poses (4, 4) of the last frames before this one, the newest first.
     """
 
     stamp: float
@@ -92,16 +92,15 @@ class State:
         return replace(
             self, stamp=stamp, frame=self.frame + 1, dt=stamp - self.stamp, measured=False, camera=motion.camera,
             R_world_angles=motion.R_world_angles, covariance=covariance,
-            recent=(*self.recent, (self.stamp, self.pose))[-RECENT:],
+            recent=((self.stamp, self.pose), *self.recent)[:RECENT],
         )  # fmt: skip
 
     def recent_poses(self, n: int) -> RecentPoses:
         """The last poses, as they were believed in their time, with their joint covariance; at most n."""
-        path = [*self.recent, (self.stamp, self.pose)][-n:]
-        k, J = len(path) - 1, self.pose_jacobian()
-        kept = slice(POSE * (len(self.recent) - k), POSE * len(self.recent))
-        by_newest = J @ self.covariance.cross[:POSE, kept]
-        P = np.block([[self.covariance.left[kept, kept], by_newest.T], [by_newest, J @ self.covariance.pose @ J.T]])
+        covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT + 1)
+        path = [(self.stamp, self.pose), *self.recent][:n][::-1]
+        P = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
+        P = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
         stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
         return RecentPoses(stamps, poses, 0.5 * (P + P.T))
 

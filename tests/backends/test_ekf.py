@@ -272,4 +272,4 @@ def test_the_last_poses_are_known_together():
     for distances, dof in ((whole, 30), (between, 6)):
         low, high = chi2.ppf([0.001, 0.999], dof * runs) / runs
         assert low < np.mean(distances) < high
-    assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 7
+    assert len(backend.recent(1)) == 1 and len(backend.recent(100)) == 5
