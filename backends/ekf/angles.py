@@ -68,7 +68,7 @@ def reanchor(R_world_angles: Array, camera: Array) -> tuple[Array, Array, Array]
         camera: the camera's state [r, φ, v, ω] (12,).
 
     Returns:
-        the new ``R_world_angles``, the same state in it, and the Jacobian (12, 12) of the new state by the old.
+        the same state in it, the new ``R_world_angles``, and the Jacobian (12, 12) of the new state by the old.
     """
     phi, omega = camera[3:6], camera[9:12]
     R_new, phi_new = anchor(attitude(R_world_angles, phi))
@@ -80,4 +80,4 @@ def reanchor(R_world_angles: Array, camera: Array) -> tuple[Array, Array, Array]
     J[9:12, 3:6] = inverse @ (body_rate_derivative(phi, omega) - body_rate_derivative(phi_new, omega_new) @ G)
     state = camera.copy()
     state[3:6], state[9:12] = phi_new, omega_new
-    return R_new, state, J
+    return state, R_new, J

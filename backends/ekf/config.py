@@ -16,6 +16,8 @@ class EkfConfig:
     """Options of `EkfBackend`.
 
     Attributes:
+        papers: the papers' own filter, printed as it is there: the left pixel alone, one linearisation, landmarks in
+            the world, a covariance that is not transported. The other options do not count then.
         measurement: ``"stereo"`` measures (uL, vL, uR), ``"left"`` the left pixel alone, as the papers do (paper A, V).
         iterations: most linearisations in an update; 1 is the papers' filter (paper A, Eq. 11). More are made only in
             updates where the first is not linear to within the noise.
@@ -25,12 +27,11 @@ class EkfConfig:
             from seeming to be measured: the covariance is transported to the corrected state after each update. With
             stereo measurements only.
 
-    The papers' filter is ``measurement="left", iterations=1, landmarks="euclidean"``, printed as it is there.
-
     Raises:
         ConfigurationError: a value is out of its range.
     """
 
+    papers: bool = False
     measurement: str = "stereo"
     iterations: int = 5
     landmarks: str = "inverse_depth"
@@ -41,3 +42,9 @@ class EkfConfig:
         for name, known in (("measurement", MEASUREMENTS), ("landmarks", LANDMARKS)):
             if getattr(self, name) not in known:
                 raise ConfigurationError(f"ekf: {name} must be one of {known}, got {getattr(self, name)!r}")
+
+    def resolved(self) -> EkfConfig:
+        """The options that count: those of the papers' filter where it is asked for."""
+        if self.papers:
+            return EkfConfig(True, "left", 1, "euclidean", False)
+        return self

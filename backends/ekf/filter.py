@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from backends.ekf.atomic import all_or_nothing
 from backends.ekf.config import EkfConfig
-from backends.ekf.covariance import POSE
-from backends.ekf.landmarks import distant_anchors
-from backends.ekf.measurement import StereoMeasurement, chained, innovation_covariances
-from backends.ekf.motion import motion_noise
+from backends.ekf.covariance import CAMERA, POSE
+from backends.ekf.landmarks import COORDINATES, Landmarks, distant_anchors
+from backends.ekf.measurement import Measurement
+from backends.ekf.motion import Motion, advanced, at_rest, motion_noise, turning
 from backends.ekf.recovery import agreement
 from backends.ekf.solve import Problem, UnsolvableError
-from backends.ekf.state import FilterState
+from backends.ekf.state import State
 from slam.checks import require_guess, require_not_measured, require_stamp
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
@@ -32,7 +31,6 @@ from slam.window.agreement import INFLATION, landmarks_pose
 from slam.window.gating import with_noise
 
 _DISPARITY = 0.01  # numerics: below this [px] a disparity is none: the landmark is put where it would be so large
-_VAGUE = 1e3  # cost: deviation of an innovation, in those of a pixel, above which all of P is brought up to date
 
 
 class EkfBackend:
@@ -41,169 +39,124 @@ class EkfBackend:
     The state is ``[r, φ, v, ω]`` (12), world position, Euler angles, world velocity and angle rates (paper B, section
     2), then three coordinates per landmark. The camera moves at constant velocity disturbed by impulses, with
     the printed A and W. A landmark enters with its full cross-covariance (paper A, Eqs. 8 and 10). See
-    `backends.ekf.angles` for the angles' world and for what the Euler model costs.
+    `backends.ekf.angles` for the angles' world and for what the Euler model costs, `backends.ekf.landmarks` for the
+    landmarks' coordinates, `backends.ekf.solve` for the update and `State.corrected` for what keeps it consistent.
 
     Args:
         rig: the cameras.
         models: noise, priors, motion and gate.
         options: see `EkfConfig`.
 
+    Attributes:
+        state: what is believed now. Each call makes a new one beside it, which takes its place at the end of the call.
+
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
 
-    #: Of a prior map: with more, the joint covariance (72 N² bytes, and copies of it while it grows) is too large.
+    #: Of a prior map: those that were measured keep their joint covariance (72 N² bytes).
     most_landmarks = 2000
 
     def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.rig = rig
         self.models = models
         self.config = from_options(EkfConfig, "ekf", options)
-        self._stamps: list[float] = []
-        self._poses: list[Array] = []
-        self._measured = True  # whether the newest pose may not be updated any more
-        self._state = FilterState(models, self.config)
+        self._options = self.config.resolved()
+        self._coordinates = COORDINATES[self._options.landmarks]
+        self._consistent = self._options.consistent and self._options.measurement == "stereo"
         self._farthest = rig.left.fu * float(np.linalg.norm(rig.b)) / _DISPARITY  # depth of a new landmark [m]
-
-    def saved(self) -> Callable[[], None]:
-        """A function that puts everything back as it is now."""
-        state, count, last = self._state.saved(), len(self._stamps), self._poses[-1:]
-        measured = self._measured
-
-        def restore() -> None:
-            state()
-            del self._stamps[count:], self._poses[count:]
-            self._poses[count - len(last) :] = last
-            self._measured = measured
-
-        return restore
+        self.state = State.first(models)
+        self._past: list[tuple[float, Array]] = []  # stamps and poses before the state's
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
 
     @one_blas_thread
-    @all_or_nothing
     def predict(self, stamp: float) -> Prediction:
         """See `slam.interfaces.Backend.predict`."""
-        require_stamp("ekf", stamp, self._stamps[-1] if self._stamps else None)
-        if self._stamps:
-            self._state.advance(stamp - self._stamps[-1])
-        self._stamps.append(float(stamp))
-        self._poses.append(self._state.pose())
-        self._measured = False
-        return self._prediction()
+        return self._predicted(stamp, self._advanced)
 
     @one_blas_thread
-    @all_or_nothing
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        if not self._stamps:
-            return self.predict(stamp)
-        require_stamp("ekf", stamp, self._stamps[-1])
-        self._state.rest()
-        self._stamps.append(float(stamp))
-        self._poses.append(self._state.pose())
-        self._measured = False
-        return self._prediction()
+        return self._predicted(stamp, lambda start, dt: at_rest(start))
 
     @one_blas_thread
-    @all_or_nothing
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
-        self._require_started("update")
-        require_not_measured("ekf", self._measured)
+        s = self._started("update")
+        require_not_measured("ekf", s.measured)
         require_guess("ekf", guess)
-        slots = self._state.landmarks.slots(observations.ids)
-        self._measured = True
-        if not len(slots):
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        self._state.make_local(slots)
-        problem = self._problem(observations, slots, guess)
-        try:
-            found = agreement(
-                problem, self._inflated_noises(), lambda: self._landmarks_pose(problem, slots), self.models
-            )
-            if found is None:
-                reason = "no observation, or only a minority, agrees with the prediction"
-                return UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids)
-            if found.solution.uncertainty(problem.sigma) > _VAGUE:
-                # What the rest becomes is a difference of numbers larger than itself by the condition of S: only the
-                # dense part keeps enough digits.
-                self._state.make_local(np.arange(len(self._state.landmarks)))
-            self._state.correct(slots, found)
-        except UnsolvableError as error:
-            return UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
-        self._poses[-1] = self._state.pose()
-        solution = found.solution
-        used = solution.used
-        dof = int(np.isfinite(problem.z[used]).sum())
-        return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], solution.nis, dof)
+        s = replace(s.with_all_of(observations.ids), measured=True)
+        s, report = self._updated(s, observations, guess)
+        self.state = s
+        return report
 
     @one_blas_thread
-    @all_or_nothing
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
-        self._require_started("add")
-        self._state.landmarks.require_new(observations.ids)
-        if not len(observations):
-            return
+        s = self._started("add")
+        s.landmarks.require_new(observations.ids)
         h = self.rig.triangulate(observations.uv_left, observations.uv_right)  # paper A, Eq. (8)
         bad = ~np.isfinite(h).all(axis=1)
         if bad.any():
             raise MeasurementError(f"ekf: landmark {observations.ids[bad][0]} has no right pixel or no positive depth")
-        self._measured = True
         h = h * np.minimum(1.0, self._farthest / h[:, 2:])
-        self._state.place(observations.ids, h, self.rig.triangulation_covariance(h, self.models.pixel_sigma))
+        covariances = self.rig.triangulation_covariance(h, self.models.pixel_sigma)
+        self.state = s.placed(self._coordinates, observations.ids, h, covariances)
 
-    @all_or_nothing
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`."""
-        ids = np.unique(np.asarray(ids, np.int64))
-        self._state.remove(ids)
+        self.state = self.state.removed(np.unique(np.asarray(ids, np.int64)))
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
-        self._require_started("estimate")
-        marks = self._state.landmarks
-        slots = np.argsort(marks.ids) if landmarks else np.zeros(0, np.intp)
-        D = marks.jacobian(slots)
-        blocks = D @ self._state.covariance.of_landmarks(slots)[0] @ D.transpose(0, 2, 1)
-        return Estimate(
-            self._stamps[-1], self._poses[-1].copy(), self._state.pose_covariance(),
-            marks.ids[slots], marks.points[slots], 0.5 * (blocks + blocks.transpose(0, 2, 1)),
-        )  # fmt: skip
+        s = self._started("estimate")
+        rows = np.argsort(s.landmarks.ids) if landmarks else np.zeros(0, np.intp)
+        marks = s.landmarks.take(rows)
+        D = self._coordinates.jacobian(marks.anchors, marks.c)
+        blocks = D @ (s.covariance.marginals()[0][rows] if landmarks else np.zeros((0, 3, 3))) @ D.transpose(0, 2, 1)
+        covariances = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        return Estimate(s.stamp, s.pose.copy(), s.pose_covariance(), marks.ids, marks.points, covariances)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        return self._state.landmarks.points[self._state.landmarks.slots(ids)]
+        return self.state.landmarks.points[self.state.landmarks.rows_of(ids)]
 
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`: what was believed at each stamp, never revised."""
-        return Trajectory(np.array(self._stamps), np.array(self._poses).reshape(-1, 4, 4))
+        s = self.state
+        path = [*self._past[: s.frame], (s.stamp, s.pose)] if s.frame >= 0 else []
+        return Trajectory(np.array([stamp for stamp, _ in path]), np.array([T for _, T in path]).reshape(-1, 4, 4))
+
+    def recent(self, n: int) -> RecentPoses:
+        """The camera's last n poses, at most five, as they were believed in their time; see `slam.data.RecentPoses`.
+
+        Raises:
+            MeasurementError: before the first `predict`.
+        """
+        return self._started("recent").recent_poses(n)
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
     @one_blas_thread
-    @all_or_nothing
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("ekf", ids, positions, covariances)
-        self._state.landmarks.require_new(ids)
-        if len(ids):
-            none = np.zeros((len(ids), 3, POSE))
-            self._state.append(ids, distant_anchors(positions, covariances), positions, none, covariances)
+        s, anchors = self.state, distant_anchors(positions, covariances)
+        s.landmarks.require_new(ids)
+        new = Landmarks.at(self._coordinates, ids.astype(np.int64), anchors, positions.astype(float), s.frame)
+        D = self._coordinates.inverse_jacobian(anchors, new.c)
+        self.state = s.inserted(new, D @ covariances @ D.transpose(0, 2, 1))
 
     @one_blas_thread
-    @all_or_nothing
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
-        self._require_started("place")
+        s = self._started("place")
         require_known("ekf", ids, local, covariances)
         require_in_front("ekf", ids, local)
-        self._state.landmarks.require_new(ids)
-        if len(ids):
-            self._measured = True
-            self._state.place(ids, local, covariances)
+        s.landmarks.require_new(ids)
+        self.state = s.placed(self._coordinates, ids, local, covariances)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
@@ -215,69 +168,107 @@ class EkfBackend:
         The measurements are gone; what they made of the path stays. But landmarks that were placed by pixels as they
         were corrected before, and seen at pixels as they are now, would look as if the camera had moved.
         """
-        self._measured = True
-        marks, rectified_rig = self._state.landmarks, self.rig.rectified
-        if not len(marks) or not self._poses:
-            return
-        T = self._poses[-1] @ rectified_rig.T_left_rectified
-        z, _ = rectified_rig.rig.project_stereo(se3.transform(se3.inverse(T), marks.points), jacobian=False)
-        rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
-        z = correct(z[rows])
-        if not np.isfinite(z).all():
-            raise MeasurementError("ekf: a mended measurement is not finite")
-        points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))
-        good = np.isfinite(points).all(axis=1)
-        change = np.zeros_like(marks.state)
-        rows, points = rows[good], points[good]
-        change[rows] = marks.coordinates.of(marks.anchors[rows], points) - marks.state[rows]
-        if np.isfinite(change).all():
-            marks.move(change)
+        s, rectified_rig = replace(self.state, measured=True), self.rig.rectified
+        if s.frame >= 0 and len(s.landmarks):
+            T = s.pose @ rectified_rig.T_left_rectified
+            local = se3.transform(se3.inverse(T), s.landmarks.points)
+            z, _ = rectified_rig.rig.project_stereo(local, jacobian=False)
+            rows = np.flatnonzero(rectified_rig.rig.left.in_image(z[:, :2]))
+            z = correct(z[rows])
+            if not np.isfinite(z).all():
+                raise MeasurementError("ekf: a mended measurement is not finite")
+            points = se3.transform(T, rectified_rig.rig.triangulate(z[:, :2], z[:, [2, 1]]))
+            good = np.isfinite(points).all(axis=1)
+            rows, points = rows[good], points[good]
+            change = self._coordinates.of(s.landmarks.anchors[rows], points) - s.landmarks.c[rows]
+            if np.isfinite(change).all():
+                s = replace(s, landmarks=s.landmarks.moved(self._coordinates, rows, change))
+        self.state = s
 
     # --- the filter's parts ---
 
-    def _prediction(self) -> Prediction:
-        """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
-        T, covariance, marks = self._poses[-1].copy(), self._state.covariance, self._state.landmarks
-        R = T[:3, :3]
-        h = (marks.points - T[:3, 3]) @ R
-        slots = np.flatnonzero(self.rig.left.in_view(h))
-        h = h[slots]
-        z, J = self.rig.project_stereo(h)
-        right = z[:, [2, 1]] if self.rig.is_rectified else self.rig.project(h)[1]
-        line = chained(z[:, :2], J[:, :2], h, R, self._state.camera[3:6], marks.jacobian(slots))
-        blocks, cross = covariance.of_landmarks(slots)
-        S = with_noise(innovation_covariances(line, covariance.pose, cross, blocks), self.models.pixel_sigma)
-        return Prediction(self._stamps[-1], T, self._state.pose_covariance(), marks.ids[slots], line.z, right, S)
+    def _advanced(self, start: Motion, dt: float) -> Motion:
+        """The camera after a step by the motion model."""
+        return advanced(self.models, start, self.state.covariance.dense[:CAMERA, :CAMERA], dt, self._consistent)
 
-    def _problem(self, observations: Observations, slots: IndexArray, guess: Array | None) -> Problem:
-        """The update in the coordinates [r, φ, measured landmarks]."""
+    def _predicted(self, stamp: float, moved: Callable[[Motion, float], Motion]) -> Prediction:
+        """Go to a time; `moved` says what the camera does meanwhile."""
+        s = self.state
+        require_stamp("ekf", stamp, s.stamp if s.frame >= 0 else None)
+        if s.frame < 0:
+            after = replace(s, stamp=float(stamp), frame=0, measured=False)
+        else:
+            after = s.advanced(float(stamp), moved(Motion(s.camera, s.R_world_angles), stamp - s.stamp))
+        prediction = self._prediction(after)
+        self._past[after.frame - 1 :] = [(s.stamp, s.pose)] if after.frame else []
+        self.state = after
+        return prediction
+
+    def _prediction(self, s: State) -> Prediction:
+        """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
+        marks, T = s.landmarks, s.pose
+        rows = np.flatnonzero(self.rig.left.in_view((marks.points - T[:3, 3]) @ T[:3, :3]))
+        blocks, cross = (part[rows] for part in s.covariance.marginals())
+        model, c = Measurement(self.rig, s.R_world_angles, self._coordinates, marks.anchors[rows]), marks.c[rows]
+        z, H = model.linearise(s.camera[:POSE], c, rows)
+        right = z[:, [2, 1]]
+        if not self.rig.is_rectified:
+            right = self.rig.project((marks.points[rows] - T[:3, 3]) @ T[:3, :3])[1]
+        S = with_noise(H.own_covariances(s.covariance.pose, cross, blocks)[:, :2, :2], self.models.pixel_sigma)
+        return Prediction(s.stamp, T.copy(), s.pose_covariance(), marks.ids[rows], z[:, :2], right, S)
+
+    def _updated(self, s: State, observations: Observations, guess: Array | None) -> tuple[State, UpdateReport]:
+        """The state after an update, and its report; all that was observed is in the state's dense part."""
+        if not len(observations):
+            return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        rows = s.landmarks.rows_of(observations.ids)
+        problem = self._problem(s, observations, rows, guess)
+        noises = []
+        if s.frame > 0:
+            noises = [factor**2 * motion_noise(self.models, s.dt) for factor in INFLATION]
+        try:
+            found = agreement(problem, noises, lambda: self._landmarks_pose(s, problem, rows), self.models)
+            if found is None:
+                reason = "no observation, or only a minority, agrees with the prediction"
+                return s, UpdateReport.nothing(UpdateStatus.EMPTY, reason, observations.ids.copy())
+            after = s.corrected(self._coordinates, found, rows, self._consistent)
+        except UnsolvableError as error:
+            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"ekf: {error}")
+        used, w = found.solution.used, found.solution.system.w
+        dof = int(np.isfinite(problem.z[used]).sum())
+        return after, UpdateReport(
+            UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], float(w @ w), dof
+        )
+
+    def _problem(self, s: State, observations: Observations, rows: IndexArray, guess: Array | None) -> Problem:
+        """The update by landmarks of some rows (M,) of the table."""
         z = np.concatenate([observations.uv_left, observations.uv_right[:, :1]], axis=1)
-        if self.config.measurement == "left":
+        if self._options.measurement == "left":
             z[:, 2] = np.nan
-        state, marks = self._state, self._state.landmarks
-        prior = np.concatenate([state.camera[:POSE], marks.state[slots].reshape(-1)])
-        model = StereoMeasurement(self.rig, state.R_world_angles, marks.coordinates, marks.anchors[slots])
+        model = Measurement(self.rig, s.R_world_angles, self._coordinates, s.landmarks.anchors[rows])
+
+        def gauge() -> Array:
+            """Jacobian (6 + 3M, 6) of g by a displacement of the world."""
+            own = np.eye(6)
+            own[:3, 3:] = -se3.hat(s.camera[:3])
+            own[3:, 3:] = np.linalg.inv(turning(s.R_world_angles, s.camera))
+            return np.concatenate([own, s.landmarks.gauge[rows].reshape(-1, 6)])
+
         return Problem(
-            prior, state.covariance.marginal(slots), z, self.models.pixel_sigma, model,
-            self.config.iterations, self.models.gate_probability,
-            None if guess is None else state.change_to(guess),
-            partial(state.gauge_jacobian, slots) if state.consistent else None,
+            s.covariance.dense, s.camera[:POSE], s.landmarks.c[rows], CAMERA + 3 * rows, z, self.models.pixel_sigma,
+            model, self._options.iterations, self.models.gate_probability,
+            None if guess is None else s.change_to(guess), gauge if self._consistent else None,
         )  # fmt: skip
 
-    def _inflated_noises(self) -> list[Array]:
-        """Motion noises (12, 12) of the last step, inflated."""
-        if len(self._stamps) < 2:
-            return []
-        noise = motion_noise(self.models, self._stamps[-1] - self._stamps[-2])
-        return [factor**2 * noise for factor in INFLATION]
-
-    def _landmarks_pose(self, problem: Problem, slots: IndexArray) -> Array | None:
+    def _landmarks_pose(self, s: State, problem: Problem, rows: IndexArray) -> Array | None:
         """The change of [r, φ] (6,) to the pose on which most of the landmarks agree, if there is one."""
-        T = self._state.pose() if problem.guess is None else self._state.pose_after(problem.guess)
-        points = self._state.landmarks.points[slots]
-        T_world_left = landmarks_pose(self.rig, points, problem.z, self.models, T, len(self._stamps))
-        return None if T_world_left is None else self._state.change_to(T_world_left)
+        change = np.zeros(POSE) if problem.guess is None else problem.guess
+        camera = s.camera + np.concatenate([change, np.zeros(POSE)])
+        T = replace(s, camera=camera).pose
+        found = landmarks_pose(self.rig, s.landmarks.points[rows], problem.z, self.models, T, s.frame + 1)
+        return None if found is None else s.change_to(found)
 
-    def _require_started(self, what: str) -> None:
-        if not self._stamps:
+    def _started(self, what: str) -> State:
+        if self.state.frame < 0:
             raise MeasurementError(f"ekf: {what} before the first predict")
+        return self.state

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import bdtrc
 
-from backends.ekf.covariance import POSE
+from backends.ekf.covariance import CAMERA
 from backends.ekf.solve import Gated, Problem, Solution, UnsolvableError, gate, solve
 from slam.geometry.se3 import Array
 from slam.models import EstimatorModels
@@ -29,9 +29,8 @@ Search = Callable[[], "Array | None"]
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """A solution, the problem that it solves, and the noise (12, 12) that joined the camera's covariance for it."""
+    """A solution, and the noise (12, 12) that joined the camera's covariance for it."""
 
-    problem: Problem
     solution: Solution
     noise: Array | None = None
 
@@ -83,7 +82,7 @@ def _agreed(problem: Problem, gated: Gated, noise: Array | None) -> Agreement | 
     used, few = int(solution.used.sum()), len(problem.z) < MIN_OBSERVATIONS
     if not few and ONE_AGREES_IN * used < len(problem.z) and _by_chance(gated, used, problem):
         return None
-    return Agreement(problem, solution, noise)
+    return Agreement(solution, noise)
 
 
 def _by_chance(gated: Gated, used: int, problem: Problem) -> bool:
@@ -127,7 +126,7 @@ def _restarted(problem: Problem, search: Search, models: EstimatorModels) -> Agr
         return None
     if solution is None or solution.used.sum() < least:
         return None
-    return Agreement(there, solution, noise)
+    return Agreement(solution, noise)
 
 
 def _half(problem: Problem) -> int:
@@ -135,9 +134,9 @@ def _half(problem: Problem) -> int:
 
 
 def _wider(problem: Problem, noise: Array) -> Problem:
-    covariance = problem.covariance.copy()
-    covariance[:POSE, :POSE] += noise[:POSE, :POSE]
-    return replace(problem, covariance=covariance)
+    P = problem.P.copy()
+    P[:CAMERA, :CAMERA] += noise
+    return replace(problem, P=P)
 
 
 def restart_noise(change: Array, models: EstimatorModels) -> Array:

@@ -1,8 +1,8 @@
-"""The measurement update of the camera and the measured landmarks: gated and iterated; the filter is not changed.
+"""The measurement update, gated and iterated: what it makes of a prior. The filter's state is not changed here.
 
-Every quantity of an update follows from the camera's [r, φ] and the measured landmarks. Their part of the covariance,
-``P_gg``, is small (6 + 3M), so that iterating and gating cost little; the whole state changes once, at the end, by
-``x + P[:, g] s`` and ``P − W Wᵀ`` with ``W = P[:, g] Hᵀ L⁻ᵀ``, where ``S = L Lᵀ``.
+In the papers' order: the innovation ν and its covariance ``S = H P Hᵀ + R = L Lᵀ``, the gate, the gain
+``K = P Hᵀ S⁻¹``, the corrected state ``x + K ν`` and covariance ``P − K S Kᵀ`` (paper A, Eq. 11). What is kept is
+``y = S⁻¹ ν``: the state changes by ``P Hᵀ y``, and ``s = Hᵀ y`` has entries for g = [r, φ, measured landmarks] alone.
 
 A component that is not measured (or gated) keeps its row with a zero Jacobian and a zero innovation: it adds nothing.
 """
@@ -12,17 +12,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, dtrtrs
+from scipy.linalg.blas import dgemm, dtrmm
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 
-from backends.ekf.jacobian import Displacement, Jacobian
-from backends.ekf.measurement import Linearisation, Measurement
+from backends.ekf import kernels
+from backends.ekf.covariance import POSE
+from backends.ekf.measurement import Displacement, Jacobian, Measurement
 from slam.chi_square import chi_square_limits
-from slam.data import BoolArray
+from slam.data import BoolArray, IndexArray
 from slam.geometry.se3 import Array
 
 #: A step is the last where the measurements it predicts linearly are right to this share of their noise. Iterating
@@ -35,11 +36,11 @@ _LINEAR = 1.0
 #: same sign, and each within its noise they moved it by 0.7 of them.
 _POSE_SHARE = 0.25
 _HALVINGS = 6  # numerics: of a step that does not lower the cost
-
 _SMALL = 48  # cost: rows of a triangular matrix that is inverted as a whole
 
-_LATER = np.maximum(np.arange(3)[:, None], np.arange(3))  # row of an entry in the lower triangle of a symmetric block
-_EARLIER = np.minimum(np.arange(3)[:, None], np.arange(3))
+
+#: Of a linear update: mask of its rows (M, 3), H, H P (3M, n), ν (3M,), S (3M, 3M), of which the lower triangle counts.
+Parts = tuple[BoolArray, Jacobian, Array, Array, Array]
 
 
 class UnsolvableError(ArithmeticError):
@@ -48,29 +49,38 @@ class UnsolvableError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """One update, in the coordinates g = [r, φ, measured landmarks].
+    """One update.
 
     Attributes:
-        prior: mean (6 + 3M,).
-        covariance: P_gg (6 + 3M, 6 + 3M), symmetric.
+        P: the covariance (n, n) of the state.
+        pose: prior mean of [r, φ] (6,).
+        c: that of the measured landmarks' coordinates (M, 3).
+        first: where these begin in the state (M,).
         z: measurements (M, 3) [px], NaN where a component is not measured.
         sigma: pixel noise [px].
-        model: what is predicted at a mean (6 + 3M,), and its derivatives.
+        model: what is predicted, and its derivatives.
         iterations: most linearisations.
         gate_probability: quantile of χ² beyond which a landmark's measurement is rejected.
         guess: a change of [r, φ] (6,) worth trying where the prior is far off, or None.
-        gauge_jacobian: gives the Jacobian (6 + 3M, 6) of g by a displacement of the world, if that is unobservable.
+        gauge: gives the Jacobian (6 + 3M, 6) of g by a displacement of the world, if that is unobservable.
     """
 
-    prior: Array
-    covariance: Array
+    P: Array
+    pose: Array
+    c: Array
+    first: IndexArray
     z: Array
     sigma: float
     model: Measurement
     iterations: int
     gate_probability: float
     guess: Array | None = None
-    gauge_jacobian: Callable[[], Array] | None = None
+    gauge: Callable[[], Array] | None = None
+
+    @cached_property
+    def g(self) -> IndexArray:
+        """Where [r, φ] and the measured landmarks stand in the state (6 + 3M,)."""
+        return np.concatenate([np.arange(POSE), (self.first[:, None] + np.arange(3)).reshape(-1)])
 
     @cached_property
     def displacement(self) -> Displacement | None:
@@ -78,26 +88,126 @@ class Problem:
 
         Of all displacements it is the one that explains the landmarks' change best, given their covariance.
         """
-        if self.gauge_jacobian is None:
+        if self.gauge is None:
             return None
-        U = self.gauge_jacobian()
-        lower, info = dpotrf(self.covariance[6:, 6:].T, lower=1, clean=0)
+        U, marks = self.gauge(), self.g[POSE:]
+        lower, info = dpotrf(self.P[marks][:, marks].T, lower=1, clean=0)
         if info != 0:
             return None
-        weighted = np.asarray(dpotrs(lower, U[6:], lower=1)[0])
+        weighted = np.asarray(dpotrs(lower, U[POSE:], lower=1)[0])
         L = np.zeros(U.T.shape)
-        L[:, 6:] = np.linalg.pinv(U[6:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
-        return Displacement(U, L)
+        L[:, POSE:] = np.linalg.pinv(U[POSE:].T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
+        return Displacement(U, L, self.g)
 
-    def mean(self, change: Array) -> Array:
-        """The mean (6 + 3M,) at which the model is asked after a change: without the world's displacement in it."""
-        if not change.any() or self.displacement is None:
-            return self.prior + change
-        return self.prior + (change - self.displacement.change @ (self.displacement.share @ change))
+    def mean(self, change: Array, whole: bool = False) -> tuple[Array, Array]:
+        """Pose (6,) and coordinates (M, 3) after a change of g, without the world's displacement unless `whole`."""
+        if change.any() and not whole and self.displacement is not None:
+            change = change - self.displacement.change @ (self.displacement.share @ change)
+        # A linear step may ask for a point beyond infinity: it is at infinity.
+        return self.pose + change[:POSE], self.model.coordinates.moved(self.c, change[POSE:].reshape(-1, 3))
 
-    def jacobian(self, line: Linearisation, rows: BoolArray, change: Array) -> Jacobian:
-        """Derivatives by the change, from those by the mean; zero where a row is not measured (mask (M, 3))."""
-        return Jacobian.of(line, rows, self.displacement if change.any() else None)
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """A correction s of g, the change of the state that it makes, what is predicted there, and the cost.
+
+    The cost is the squared distance from prior and measurements, ∞ where one cannot be seen.
+    """
+
+    s: Array
+    change: Array
+    z: Array
+    cost: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The linear update at an iterate, in whitened innovations: ``w = L⁻¹ ν`` has covariance 1.
+
+    To take out measurements is to project w on what is orthogonal to the columns of L⁻¹ that belong to them: that gives
+    what a factorisation without them would.
+
+    Attributes:
+        rows: its rows, a mask (M, 3).
+        H, HP: the Jacobian, and its product with the covariance (3M, n).
+        nu: the innovation taken back to the prior through H (3M,).
+        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
+        taken: orthonormal directions (3M, K) of what has been taken out.
+    """
+
+    rows: BoolArray
+    H: Jacobian
+    HP: Array
+    nu: Array
+    inverse: Array
+    taken: Array
+
+    @classmethod
+    def of(cls, rows: BoolArray, H: Jacobian, HP: Array, nu: Array, S: Array, gone: BoolArray) -> System:
+        """Without some rows (mask (M, 3)); of S only the lower triangle counts.
+
+        Raises:
+            UnsolvableError: S is not positive definite.
+        """
+        out = np.flatnonzero(gone)
+        if len(out):
+            nu, S = nu.copy(), S.copy()
+            nu[out], S[out], S[:, out], S[out, out] = 0.0, 0.0, 0.0, 1.0
+        upper, info = dpotrf(S.T)  # of the transpose, which is in the order that LAPACK wants
+        if info != 0:
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        inverse = _inverse(upper).T
+        inverse[out, out] = 0.0
+        return cls(rows & ~gone, H, HP, nu, inverse, np.zeros((len(nu), 0)))
+
+    def without(self, gone: BoolArray) -> System:
+        """Without some more rows (mask (M, 3))."""
+        columns = self.inverse[:, np.flatnonzero(gone & self.rows)]
+        more, _ = np.linalg.qr(columns - self.taken @ (self.taken.T @ columns))
+        return replace(self, rows=self.rows & ~gone, taken=np.concatenate([self.taken, more], axis=1))
+
+    def whiten(self, X: Array) -> Array:
+        """``L⁻¹ X``, as far as it is not taken out, for X (3M, ...)."""
+        W = self.inverse @ X
+        return np.asarray(W - self.taken @ (self.taken.T @ W))
+
+    def whitened(self, HX: Array) -> Array:
+        """`whiten` of H X, transposed (N, 3M), in Fortran's order: P shrinks by ``V Vᵀ``, where V is this of H P."""
+        V = dtrmm(1.0, self.inverse.T, HX.T, side=1)
+        if self.taken.size:
+            V = dgemm(-1.0, V @ self.taken, self.taken, beta=1.0, c=V, trans_b=1, overwrite_c=1)
+        return np.asarray(V)
+
+    @cached_property
+    def w(self) -> Array:
+        """The whitened innovation (3M,); its square is the NIS ``νᵀ S⁻¹ ν``."""
+        return self.whiten(self.nu)
+
+    @cached_property
+    def y(self) -> Array:
+        """``S⁻¹ ν`` (3M,)."""
+        return np.asarray(self.w @ self.inverse)
+
+    @cached_property
+    def by_pose(self) -> Array:
+        """The whitened innovation's covariance (3M, 6) with [r, φ]."""
+        return self.whiten(self.HP[:, :POSE])
+
+    def variances(self, P: Array) -> Array:
+        """Of [r, φ] (6,) after the update; rounding may leave one that is not positive."""
+        return np.asarray(P.diagonal()[:POSE] - (self.by_pose**2).sum(axis=0))
+
+    def distances(self) -> Array:
+        """Squared distance (M,) of each landmark's measurement from what all others predict; 0 for one without any.
+
+        For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off
+        by ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so that the distance is ``y_jᵀ Q_j⁻¹ y_j``.
+        """
+        lost = self.taken.T @ self.inverse
+        found, used = kernels.conditional_distances(self.inverse, lost, self.y), self.rows.any(axis=1)
+        if not np.isfinite(found[used]).all():
+            raise UnsolvableError("the innovation covariance is not positive definite")
+        return np.where(used, found, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,90 +216,15 @@ class Solution:
 
     Attributes:
         used: which landmarks (M,) it is made of.
-        s: the correction is ``P[:, g] s``.
-        H: the Jacobian of the last linearisation.
-        inverse: ``L⁻¹`` (3M, 3M), lower triangular.
-        measured: which rows (3M,) are measured.
-        nis: ``νᵀ S⁻¹ ν`` with the innovation taken back to the prior through the last linearisation.
+        change: of the state (n,).
+        system: the last linear update, from which the covariance follows.
         distances: of each landmark (M,): squared distance of its measurement from what all others predict.
-        variances: of [r, φ] (6,) after the update.
     """
 
     used: BoolArray
-    s: Array
-    H: Jacobian
-    inverse: Array
-    measured: BoolArray
-    nis: float
-    distances: Array
-    variances: Array
-
-    @cached_property
-    def B(self) -> Array:
-        """``Hᵀ L⁻ᵀ`` (6 + 3M, K): the same as `whitened` of the identity, transposed."""
-        B = self.H.transposed_times(self.inverse.T)
-        return B if self.measured.all() else B[:, self.measured]
-
-    def whitened(self, X: Array) -> Array:
-        """``L⁻¹ H X`` (K, N) for X (6 + 3M, N): the covariance shrinks by WᵀW, where W is this of ``P[g, :]``."""
-        W = dtrmm(1.0, self.inverse, self.H.times(X).T, side=1, lower=1, trans_a=1, overwrite_b=1).T
-        return np.asarray(W if self.measured.all() else W[self.measured])
-
-    def uncertainty(self, sigma: float) -> float:
-        """Largest standard deviation of an innovation, given those before it, in that of a pixel, `sigma` [px]."""
-        return 1 / (sigma * float(self.inverse.diagonal().min()))
-
-
-@dataclass(frozen=True, eq=False)
-class _Iterate:
-    """A correction, the change of the mean that it makes, what is predicted there, and the cost.
-
-    The cost is the squared distance from prior and measurements, ∞ where one cannot be seen.
-    """
-
-    s: Array
     change: Array
-    z: Array
-    cost: float
-
-
-@dataclass(frozen=True, eq=False)
-class _System:
-    """The linear update at an iterate: Jacobian H, innovation ν taken back to the prior, its covariance S.
-
-    `cross` is the innovation's covariance (3M, 6) with [r, φ], whose prior variances (6,) are `prior`.
-    """
-
-    rows: BoolArray
-    H: Jacobian
-    nu: Array
-    S: Array
-    cross: Array
-    prior: Array
-
-    @cached_property
-    def L(self) -> Array:
-        """The lower triangular L with ``L Lᵀ = S``."""
-        L, info = dpotrf(self.S.T, lower=1)  # S is symmetric: its transpose is in the order that LAPACK wants
-        if info != 0:
-            raise UnsolvableError("the innovation covariance is not positive definite")
-        return np.asarray(L)
-
-    @cached_property
-    def variances(self) -> Array:
-        """Of [r, φ] (6,) after the update; rounding may leave one that is not positive."""
-        W = dtrtrs(self.L, self.cross, lower=1)[0]
-        return np.asarray(self.prior - (W * W).sum(axis=0))
-
-    def only(self, rows: BoolArray, sigma: float) -> _System:
-        """With fewer rows (mask (M, 3))."""
-        if (rows == self.rows).all():
-            return self
-        kept = rows.reshape(-1)
-        S = np.where(kept[:, None] & kept, self.S, 0.0)
-        S.reshape(-1)[:: len(S) + 1][~kept] = sigma**2
-        nu, cross = np.where(kept, self.nu, 0.0), np.where(kept[:, None], self.cross, 0.0)
-        return _System(rows, self.H.only(rows), nu, S, cross, self.prior)
+    system: System
+    distances: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +237,8 @@ class Gated:
     used: BoolArray
     limits: Array
     distances: Array
-    start: _Iterate
-    system: _System
+    start: Iterate
+    system: Callable[[], System]
 
 
 def gate(problem: Problem, at_guess: bool = False) -> Gated:
@@ -212,21 +247,21 @@ def gate(problem: Problem, at_guess: bool = False) -> Gated:
     Raises:
         UnsolvableError: the prior is not finite, or S is not positive definite.
     """
-    if not (np.isfinite(problem.prior).all() and np.isfinite(problem.covariance).all()):
+    if not (np.isfinite(problem.pose).all() and math.isfinite(problem.P.trace())):
         raise UnsolvableError("the predicted state is not finite")
-    s: Array = np.zeros(len(problem.prior))
-    change = s
-    if at_guess:
-        s = _towards_guess(problem)
-        change = problem.covariance @ s
-    line = problem.model.linearise(problem.mean(change))
-    start = _Iterate(s, change, line.z, np.inf)
-    measured = np.isfinite(problem.z)
-    visible = np.asarray(np.isfinite(line.z).all(axis=1))
-    system = _system(problem, measured & visible[:, None], start, line)
+    nothing = np.zeros(len(problem.g)), np.zeros(len(problem.P))
+    s, change = _towards_guess(problem) if at_guess else nothing
+    z, H = problem.model.linearise(*problem.mean(change[problem.g]), problem.first)
+    start, measured = Iterate(s, change, z), np.isfinite(problem.z)
+    visible = np.asarray(np.isfinite(z).all(axis=1))
+    parts = rows, _, _, nu, S = _linear_update(problem, measured & visible[:, None], start, H)
     limits = chi_square_limits(measured.sum(axis=1), problem.gate_probability)
-    distances = np.where(visible, _squared_distances(system.nu, _diagonal_blocks(system.S)), np.nan)
-    return Gated(distances <= limits, limits, distances, start, system)
+    own = kernels.own_distances(nu, S)
+    if not np.isfinite(own).all():
+        raise UnsolvableError("the predicted innovations are not finite or not positive definite")
+    distances = np.where(visible, own, np.nan)
+    used = np.asarray(distances <= limits)
+    return Gated(used, limits, distances, start, lambda: System.of(*parts, rows & ~used[:, None]))
 
 
 def solve(problem: Problem, gated: Gated) -> Solution | None:
@@ -241,155 +276,124 @@ def solve(problem: Problem, gated: Gated) -> Solution | None:
     Raises:
         UnsolvableError: S is not positive definite, the new state not finite, or a variance not positive.
     """
-    used = gated.used
-    while used.any():
-        solution = _iterate(problem, used, gated.start, gated.system)
-        excess = solution.distances / gated.limits
+    used, first = gated.used, gated.system() if gated.used.any() else None
+    while first is not None and used.any():
+        change, system = _iterate(problem, gated.start, first)
+        distances = system.distances()
+        excess = distances / gated.limits
         worst = excess.max()
         if worst <= 1:
-            if not (solution.variances > 0).all():
+            if not (system.variances(problem.P) > 0).all():
                 raise UnsolvableError("the pose's variances would not stay positive")
-            return solution
+            return Solution(used, change, system, distances)
         used = used & (excess <= max(1.0, 0.5 * worst))
+        first = first.without(~used[:, None] & np.ones(3, bool))
     return None
 
 
-def _iterate(problem: Problem, used: BoolArray, start: _Iterate, first: _System) -> Solution:
-    """Update by the measurements of the landmarks `used` (M,); `first` is the system of all at the start.
+def _iterate(problem: Problem, start: Iterate, system: System) -> tuple[Array, System]:
+    """The change of the state (n,) by an update whose first linearisation, at `start`, is `system`; and the last one.
 
     Gauss-Newton on the posterior (the iterated Kalman filter); a step that raises the cost, or takes a landmark
     behind the camera, is shortened. Where the first step is far from linear, the guess may be the better next place.
     With one iteration the step is taken as it is: the papers' filter.
     """
-    rows = first.rows & used[:, None]
-    now = _Iterate(start.s, start.change, start.z, _cost(problem, rows, start.z, float(start.s @ start.change)))
-    system = first.only(rows, problem.sigma)
+    rows, now = system.rows, replace(start, cost=_cost(problem, system.rows, start))
     for iteration in range(1, problem.iterations + 1):
-        y = _solved(system)
-        s: Array = system.H.transposed_times(y[:, None])[:, 0]
-        if not np.isfinite(s).all():
+        s, change = system.H.transposed_times(system.y), system.y @ system.HP
+        if not np.isfinite(change).all():
             raise UnsolvableError("the corrected state is not finite")
         if problem.iterations == 1:
             break
-        following = _visit(problem, rows, s, plain=True)
+        following = _visit(problem, rows, s, change, whole=True)
         if following.cost <= now.cost and _linear(problem, system, now, following):
             break
-        following, whole = _descend(problem, rows, now, s)
-        if whole and _linear(problem, system, now, following):
+        following, complete = _descend(problem, rows, now, Iterate(s, change, following.z))
+        if complete and _linear(problem, system, now, following):
             break
         if iteration == 1 and problem.guess is not None:
-            at_guess = _visit(problem, rows, _towards_guess(problem))
+            at_guess = _visit(problem, rows, *_towards_guess(problem))
             following = min(following, at_guess, key=lambda iterate: iterate.cost)
         if following is now and iteration == 1:
             raise UnsolvableError("no step towards the solution lowers the cost")
-        s = following.s
+        change = np.asarray(following.change)
         if iteration == problem.iterations or following is now:
             break
-        now, system = following, _system(problem, rows, following)
-    inverse = _inverse(system.L)
-    distances = _conditional_distances(inverse, y)
-    nis = float(system.nu @ y)
-    return Solution(used, s, system.H, inverse, rows.reshape(-1), nis, distances, system.variances)
+        z, H = problem.model.linearise(*problem.mean(following.change[problem.g]), problem.first)
+        now = replace(following, z=z)
+        system = System.of(*_linear_update(problem, rows, now, H), np.zeros_like(rows))
+    return change, system
 
 
-def _inverse(L: Array) -> Array:
-    """``L⁻¹`` of a lower triangular L (N, N), by halves: LAPACK's own takes twice as long for many rows."""
-    half = len(L) // 2
+def _inverse(U: Array) -> Array:
+    """``U⁻¹`` of an upper triangular U (N, N), by halves: LAPACK's own takes twice as long for many rows."""
+    half = len(U) // 2
     if half < _SMALL:
-        return np.asarray(dtrtri(L, lower=1)[0])
-    first, last = _inverse(L[:half, :half]), _inverse(L[half:, half:])
-    out = np.zeros(L.shape, order="F")
+        return np.asarray(dtrtri(U)[0])
+    first, last = _inverse(U[:half, :half]), _inverse(U[half:, half:])
+    out = np.zeros(U.shape, order="F")
     out[:half, :half], out[half:, half:] = first, last
-    out[half:, :half] = dtrmm(1.0, last, dtrmm(-1.0, first, L[half:, :half], side=1, lower=1), lower=1)
+    out[:half, half:] = dtrmm(-1.0, first, dtrmm(1.0, last, U[:half, half:], side=1))
     return out
 
 
-def _solved(system: _System) -> Array:
-    """``S⁻¹ ν``."""
-    return np.asarray(dpotrs(system.L, system.nu, lower=1)[0])
-
-
-def _linear(problem: Problem, system: _System, now: _Iterate, following: _Iterate) -> bool:
+def _linear(problem: Problem, system: System, now: Iterate, following: Iterate) -> bool:
     """Whether the measurements changed between two iterates as the Jacobian said, as far as the pose depends on it."""
     expected = system.H.times((following.change - now.change)[:, None]).reshape(-1, 3)
     errors = np.where(system.rows, following.z - now.z - expected, 0.0)
     if np.abs(errors).max() >= _LINEAR * problem.sigma:
         return False
-    moved = system.cross.T @ dpotrs(system.L, errors.reshape(-1), lower=1)[0]
-    return bool((moved**2 <= _POSE_SHARE**2 * system.variances).all())
+    moved = system.whiten(errors.reshape(-1)) @ system.by_pose
+    return bool((moved**2 <= _POSE_SHARE**2 * system.variances(problem.P)).all())
 
 
-def _cost(problem: Problem, rows: BoolArray, z: Array, prior_cost: float) -> float:
-    residual = np.where(rows, problem.z - z, 0.0)
-    cost = prior_cost + float(np.vdot(residual, residual)) / problem.sigma**2
+def _cost(problem: Problem, rows: BoolArray, at: Iterate) -> float:
+    residual = np.where(rows, problem.z - at.z, 0.0)
+    prior = float(at.s @ at.change[problem.g])
+    cost = prior + float(np.vdot(residual, residual)) / problem.sigma**2
     return cost if math.isfinite(cost) else math.inf
 
 
-def _towards_guess(problem: Problem) -> Array:
-    """The correction s (6 + 3M,) that changes the pose by the guess, and moves the landmarks along as P has it."""
+def _towards_guess(problem: Problem) -> tuple[Array, Array]:
+    """The correction s of g, and the change of the state, by which the pose goes to the guess and the landmarks along
+    as their covariances with it have it.
+    """
     assert problem.guess is not None
-    s = np.zeros(len(problem.prior))
+    s = np.zeros(len(problem.g))
     with suppress(np.linalg.LinAlgError):  # a pose that is known exactly cannot be moved
-        s[:6] = np.linalg.solve(problem.covariance[:6, :6], problem.guess)
-    return s
+        s[:POSE] = np.linalg.solve(problem.P[:POSE, :POSE], problem.guess)
+    return s, s[:POSE] @ problem.P[:POSE]
 
 
-def _visit(problem: Problem, rows: BoolArray, s: Array, plain: bool = False) -> _Iterate:
-    """The iterate with a correction; `plain`: with the world's displacement in it, which is less work."""
-    change = problem.covariance @ s
-    z = problem.model.predict(problem.prior + change if plain else problem.mean(change))
-    return _Iterate(s, change, z, _cost(problem, rows, z, float(s @ change)))
+def _visit(problem: Problem, rows: BoolArray, s: Array, change: Array, whole: bool = False) -> Iterate:
+    """The iterate with a correction; `whole`: with the world's displacement in it, which is less work."""
+    z = problem.model.predict(*problem.mean(change[problem.g], whole))
+    at = Iterate(s, change, z)
+    return replace(at, cost=_cost(problem, rows, at))
 
 
-def _descend(problem: Problem, rows: BoolArray, now: _Iterate, target: Array) -> tuple[_Iterate, bool]:
+def _descend(problem: Problem, rows: BoolArray, now: Iterate, target: Iterate) -> tuple[Iterate, bool]:
     """The longest of the steps 1, 1/2, 1/4, ... towards `target` that does not raise the cost, else `now`.
 
     Also whether it is the whole step.
     """
     for halving in range(_HALVINGS):
-        trial = _visit(problem, rows, now.s + 0.5**halving * (target - now.s))
+        share = 0.5**halving
+        s, change = now.s + share * (target.s - now.s), now.change + share * (target.change - now.change)
+        trial = _visit(problem, rows, s, change)
         if trial.cost <= now.cost * (1 + 1e-9):
             return trial, halving == 0
     return now, False
 
 
-def _system(problem: Problem, rows: BoolArray, now: _Iterate, line: Linearisation | None = None) -> _System:
-    line = line or problem.model.linearise(problem.mean(now.change))
-    H = problem.jacobian(line, rows, now.change)
-    nu = np.where(rows, problem.z - line.z, 0.0).reshape(-1)
-    if now.change.any():
-        nu += H.times(now.change[:, None])[:, 0]
-    HP = H.times(problem.covariance)
-    S = H.times(HP.T)
-    S.reshape(-1)[:: len(S) + 1] += problem.sigma**2
-    return _System(rows, H, nu, S, HP[:, :6], problem.covariance.diagonal()[:6])
-
-
-def _conditional_distances(inverse: Array, y: Array) -> Array:
-    """Squared distance (M,) of each landmark's innovation from what all other measurements predict for it.
-
-    For the rows j of a landmark, ``y_j = (S⁻¹ν)_j`` and ``Q_j = (S⁻¹)_jj``: given the others, its innovation is off by
-    ``Q_j⁻¹ y_j`` with covariance ``Q_j⁻¹``, so the distance is ``y_jᵀ Q_j⁻¹ y_j``. Unused landmarks have 0. `inverse`
-    is the lower triangular ``L⁻¹``.
-    """
-    Q = np.empty((len(y) // 3, 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            Q[:, i, j] = Q[:, j, i] = np.einsum("nm,nm->m", inverse[:, i::3], inverse[:, j::3])
-    return _squared_distances(y, Q)
-
-
-def _squared_distances(nu: Array, covariances: Array) -> Array:
-    """``ν_jᵀ S_j⁻¹ ν_j`` (M,) for the parts ν_j of ν (3M,) and positive definite S_j (M, 3, 3)."""
-    from slam.geometry.gauss_kernels import squared_distances
-
-    distances = np.asarray(squared_distances(nu.reshape(-1, 3), covariances))
-    if np.isnan(distances).any():
-        raise UnsolvableError("the innovation covariance is not positive definite")
-    return distances
-
-
-def _diagonal_blocks(lower: Array) -> Array:
-    """The (M, 3, 3) blocks on the diagonal of a symmetric (3M, 3M) matrix, by its lower triangle."""
-    first = np.arange(0, len(lower), 3)[:, None, None]
-    return lower[first + _LATER, first + _EARLIER]
+def _linear_update(problem: Problem, rows: BoolArray, at: Iterate, H: Jacobian) -> Parts:
+    """Rows, H, H P, ν and S of the update linearised at an iterate, where the plain Jacobian is H."""
+    moved = at.change.any()
+    H = H if rows.all() else H.only(rows)
+    if moved and problem.displacement is not None:
+        H = H.without(problem.displacement)
+    nu = np.where(rows, problem.z - at.z, 0.0).reshape(-1)
+    if moved:
+        nu += H.times(at.change[:, None])[:, 0]
+    HP = H.times(problem.P)
+    return rows, H, HP, nu, H.covariance(HP, problem.sigma**2)

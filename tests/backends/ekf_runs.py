@@ -27,12 +27,6 @@ def nees(backend: EkfBackend, truth: np.ndarray) -> float:
     return float(xi @ np.linalg.solve(found.covariance, xi))
 
 
-def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """A covariance in units of another's standard deviations: entries of m², m rad/s and 1/m² become comparable."""
-    deviation = np.sqrt(np.diag(of))
-    return P / np.outer(deviation, deviation)
-
-
 def halfway(data: Scene, frames: int, models: EstimatorModels = MODELS, **options) -> tuple[EkfBackend, set[int]]:
     """A filter after some frames of a scene, and the landmarks it knows."""
     backend, known = EkfBackend(data.rig, models, **options), set()

@@ -8,24 +8,21 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from backends.ekf.angles import (
-    CANONICAL,
-    anchor,
-    attitude,
-    body_rate_derivative,
-    pose_jacobian,
-    reanchor,
-)
-from backends.ekf.jacobian import Displacement, Jacobian
-from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks
-from backends.ekf.measurement import StereoMeasurement, innovation_covariances
-from backends.ekf.solve import Problem, UnsolvableError, _iterate, gate, solve
+from backends.ekf.angles import CANONICAL, anchor, attitude, body_rate_derivative, pose_jacobian, reanchor
+from backends.ekf.covariance import CAMERA, Covariance
+from backends.ekf.landmarks import Euclidean, InverseDepth, Landmarks, gauge_jacobian
+from backends.ekf.measurement import Jacobian, Measurement
+from backends.ekf.motion import Motion, advanced
+from backends.ekf.recovery import Agreement
+from backends.ekf.solve import Problem, UnsolvableError, gate, solve
+from backends.ekf.state import State
 from slam.errors import MeasurementError
 from slam.geometry import se3
 from slam.geometry.euler import angles, body_rate_matrix, rotation
+from slam.models import EstimatorModels, MotionModel
 from slam.testing import GENERAL_RIG
 from tests.backends.scenes import RIG
-from tests.slam.numeric import jacobian, positive
+from tests.slam.numeric import assert_equal_to_rounding, jacobian, positive
 
 ATTITUDES = [np.array(phi) for phi in ([0.0, 0, 0], [0.3, -0.7, 2.0], [1.5, 1.2, -3.0], [-2.0, -1.4, 0.5])]
 
@@ -74,7 +71,7 @@ def test_a_new_angles_world_is_the_same_state(phi):
     rng = np.random.default_rng(0)
     world, state = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(12)
     state[3:6] = phi
-    new_world, new, _ = reanchor(world, state)
+    new, new_world, _ = reanchor(world, state)
     np.testing.assert_allclose(attitude(new_world, new[3:6]), attitude(world, phi), atol=1e-12)
     body = body_rate_matrix(phi) @ state[9:12]
     np.testing.assert_allclose(body_rate_matrix(new[3:6]) @ new[9:12], body, atol=1e-12)
@@ -86,7 +83,7 @@ def test_the_jacobian_of_a_new_angles_world(phi):
     rng = np.random.default_rng(1)
     world, state = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(12)
     state[3:6] = phi
-    new_world, _, J = reanchor(world, state)
+    _, new_world, J = reanchor(world, state)
 
     def moved(x):  # the same change of variables with the new world held fixed
         after = x.copy()
@@ -100,32 +97,16 @@ def test_the_jacobian_of_a_new_angles_world(phi):
 # --- measurements ---
 
 
-def model(rig, world) -> StereoMeasurement:
-    """With landmarks in world coordinates: they have no anchors."""
-    return StereoMeasurement(rig, world, Euclidean(), np.zeros((0, 3, 4)))
+def model(rig, world, coordinates=None, anchors=None) -> Measurement:
+    """With landmarks in world coordinates, which have no anchors, unless others are given."""
+    return Measurement(rig, world, coordinates or Euclidean(), np.zeros((0, 3, 4)) if anchors is None else anchors)
 
 
-def linearise(rig, world, pose, points):
-    return model(rig, world).linearise(np.concatenate([pose, points.reshape(-1)]))
-
-
-def dense(line, rows: np.ndarray, displacement: Displacement | None = None) -> np.ndarray:
-    H = Jacobian.of(line, rows, displacement)
-    whole = H.times(np.eye(6 + 3 * len(rows)))
-    np.testing.assert_allclose(H.transposed_times(np.eye(3 * len(rows))).T, whole, atol=1e-9)
+def dense(H: Jacobian, n: int) -> np.ndarray:
+    whole = H.times(np.eye(n))
+    for i in range(len(whole)):
+        np.testing.assert_allclose(H.transposed_times(np.eye(len(whole))[i]), whole[i], atol=1e-9)
     return whole
-
-
-def test_products_with_the_jacobian():
-    rng = np.random.default_rng(7)
-    points = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
-    line, rows = linearise(RIG, np.eye(3), np.zeros(6), points), np.ones((5, 3), bool)
-    rows[3] = rows[1, 2] = False
-    U, L, P = rng.standard_normal((21, 6)), rng.standard_normal((6, 21)), positive(21, rng)
-    plain, reduced = dense(line, rows), dense(line, rows, Displacement(U, L))
-    np.testing.assert_allclose(reduced, plain - plain @ U @ L, atol=1e-8)
-    H = Jacobian.of(line, np.ones((5, 3), bool), Displacement(U, L)).only(rows)
-    np.testing.assert_allclose(H.times(H.times(P).T), reduced @ P @ reduced.T, rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.parametrize("rig", [RIG, GENERAL_RIG], ids=["rectified", "general"])
@@ -134,35 +115,28 @@ def test_measurement_jacobians(rig, phi):
     rng = np.random.default_rng(2)
     world, r = se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(3)
     h = rng.uniform((-1, -1, 4), (1, 1, 10), (5, 3))
-    points = h @ attitude(world, phi).T + r
-    line = linearise(rig, world, np.concatenate([r, phi]), points)
-    np.testing.assert_allclose(line.z, rig.project_stereo(h)[0], atol=1e-9)
-
-    measured = model(rig, world).predict
-    x = np.concatenate([r, phi, points.reshape(-1)])
-    everything = np.ones((5, 3), bool)
-    np.testing.assert_allclose(dense(line, everything), jacobian(measured, x), rtol=1e-6, atol=1e-5)
+    points, pose, measured = h @ attitude(world, phi).T + r, np.concatenate([r, phi]), model(rig, world)
+    z, J = measured.linearise(pose, points, 6 + 3 * np.arange(5))
+    np.testing.assert_allclose(z, rig.project_stereo(h)[0], atol=1e-9)
+    H = dense(J, 21)
+    expected = jacobian(lambda x: measured.predict(x[:6], x[6:].reshape(-1, 3)), np.append(pose, points.reshape(-1)))
+    np.testing.assert_allclose(H, expected, rtol=1e-6, atol=1e-5)
+    P = positive(21, rng)
+    S = J.covariance(H @ P, 0.25)
+    np.testing.assert_allclose(np.tril(S), np.tril(H @ P @ H.T + 0.25 * np.eye(15)), rtol=1e-9, atol=1e-6)
+    own = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(5)])
+    found = J.own_covariances(P[:6, :6], P[6:, :6].reshape(5, 3, 6), own)
+    for i in range(5):
+        rows = slice(3 * i, 3 * i + 3)
+        np.testing.assert_allclose(found[i], H[rows] @ P @ H[rows].T, rtol=1e-9, atol=1e-6)
 
 
 def test_rows_not_measured_are_zero():
-    line = linearise(RIG, np.eye(3), np.zeros(6), np.array([[0.1, 0.2, 5.0], [0.3, -0.1, -4.0]]))
+    points = np.array([[0.1, 0.2, 5.0], [0.3, -0.1, -4.0]])
+    _, H = model(RIG, np.eye(3)).linearise(np.zeros(6), points, np.array([6, 9]))
     rows = np.array([[True, True, False], [False] * 3])
-    H = dense(line, rows)
+    H = H.only(rows).times(np.eye(12))
     assert np.isfinite(H).all() and (H[2:] == 0).all() and (H[:2, :9] != 0).any(axis=1).all()
-
-
-def test_innovation_covariances_are_blocks_of_the_dense_ones():
-    rng = np.random.default_rng(3)
-    points = rng.uniform((-1, -1, 4), (1, 1, 10), (4, 3))
-    line = linearise(RIG, np.eye(3), np.zeros(6), points)
-    P = positive(6 + 12, rng)
-    H = dense(line, np.ones((4, 3), bool))
-    S = H @ P @ H.T + 0.25 * np.eye(12)
-    cross = P[6:, :6].reshape(4, 3, 6)
-    blocks = np.array([P[6 + 3 * i : 9 + 3 * i, 6 + 3 * i : 9 + 3 * i] for i in range(4)])
-    found = innovation_covariances(line, P[:6, :6], cross, blocks) + 0.25 * np.eye(3)
-    for i in range(4):
-        np.testing.assert_allclose(found[i], S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-9)
 
 
 # --- the landmarks' coordinates ---
@@ -190,19 +164,183 @@ def test_a_pixel_error_at_first_sight_is_linear_in_inverse_depth():
 
 
 def test_landmarks_keep_their_names():
-    marks, anchors = Landmarks(InverseDepth()), np.tile(np.eye(3, 4), (4, 1, 1))
-    points = np.arange(12.0).reshape(4, 3) + 1
-    marks.append(np.array([7, 3, 9, 1]), anchors, points)
-    marks.remove(np.array([3, 9]), np.array([1]), np.array([3]))
-    assert marks.ids.tolist() == [7, 1] and marks.slots([1, 7]).tolist() == [1, 0]
-    np.testing.assert_allclose(marks.points, points[[0, 3]])
+    marks = Landmarks.at(
+        InverseDepth(), np.array([7, 3, 9, 1]), np.tile(np.eye(3, 4), (4, 1, 1)), np.full((4, 3), 2.0), 0
+    )
+    marks = marks.take(np.array([0, 3]))
+    assert marks.ids.tolist() == [7, 1] and marks.rows_of([1, 7]).tolist() == [1, 0]
     with pytest.raises(MeasurementError, match="landmark 3 is not in the map"):
-        marks.slots([3])
+        marks.rows_of([3])
     with pytest.raises(MeasurementError, match="landmark 7 is in the map already"):
         marks.require_new(np.array([4, 7]))
 
 
-# --- the update on the gathered state ---
+# --- the covariance against the dense formulas ---
+
+
+def grown(rng: np.random.Generator) -> tuple[Covariance, np.ndarray]:
+    """Seven landmarks in the state, four that left it and three that are only known; and the same as one matrix."""
+    camera = positive(CAMERA, rng)
+    J, noise = rng.standard_normal((11, 3, 6)), np.array([positive(3, rng) for _ in range(11)])
+    F = np.concatenate([np.eye(CAMERA), np.pad(J.reshape(-1, 6), ((0, 0), (0, 6)))])
+    P = F @ camera @ F.T
+    known = np.array([positive(3, rng) for _ in range(3)])
+    P = np.pad(P, (0, 9))
+    for i, block in enumerate([*noise, *known]):
+        rows = slice(12 + 3 * i, 15 + 3 * i)
+        P[rows, rows] += block
+    covariance = replace(Covariance.of_camera(camera).appended(J, noise), known=known)
+    return covariance.rearranged(np.arange(7), np.arange(7, 11), np.arange(11, 14)), P
+
+
+def whole(covariance: Covariance) -> np.ndarray:
+    """All of it as one matrix."""
+    P = np.block([[covariance.dense, covariance.cross], [covariance.cross.T, covariance.left]])
+    n = len(P)
+    P = np.pad(P, (0, 3 * len(covariance.known)))
+    for i, block in enumerate(covariance.known):
+        P[n + 3 * i : n + 3 * i + 3, n + 3 * i : n + 3 * i + 3] = block
+    return P
+
+
+def numbers(rows) -> np.ndarray:
+    return np.concatenate([np.arange(CAMERA), *[CAMERA + 3 * r + np.arange(3) for r in rows]])
+
+
+def test_landmarks_move_between_the_parts():
+    covariance, P = grown(np.random.default_rng(4))
+    assert_equal_to_rounding(whole(covariance), P)
+    blocks, cross = covariance.marginals()
+    for i in range(14):
+        rows = slice(12 + 3 * i, 15 + 3 * i)
+        assert_equal_to_rounding(blocks[i], P[rows, rows])
+        assert_equal_to_rounding(cross[i], P[rows, :6])
+    parts = [0, 2, 5, 8, 12], [1, 9, 10], [11, 13]
+    g = numbers([*parts[0], *parts[1], *parts[2]])
+    assert_equal_to_rounding(whole(covariance.rearranged(*map(np.array, parts))), P[np.ix_(g, g)])
+
+
+def test_the_last_poses_are_kept():
+    """Of three poses the last two, before the landmarks that have left; these come back from behind them."""
+    covariance, P = grown(np.random.default_rng(6))
+    M, poses = np.eye(len(P)), [np.random.default_rng(k).standard_normal((6, 6)) for k in range(3)]
+    for J in poses:
+        covariance = covariance.with_pose(J, 2)
+    kept = np.zeros((12, len(P)))
+    kept[:6, :6], kept[6:, :6] = poses[2], poses[1]
+    M = np.concatenate([M[:33], kept, M[33:]])
+    assert_equal_to_rounding(whole(covariance), M @ P @ M.T)
+    g = numbers([0, 1, 2, 3, 4, 5, 6, 8, 12])
+    back = covariance.rearranged(np.array([0, 1, 2, 3, 4, 5, 6, 8, 12]), np.array([7, 10]), np.array([11]))
+    assert_equal_to_rounding(back.dense, P[np.ix_(g, g)])
+    assert_equal_to_rounding(back.cross[:, :12], P[g][:, :6] @ np.concatenate([poses[2], poses[1]]).T)
+
+
+def test_the_camera_moves():
+    covariance, P = grown(np.random.default_rng(8))
+    J, noise = np.eye(len(P)), positive(CAMERA, np.random.default_rng(7))
+    J[:CAMERA, :CAMERA] = np.random.default_rng(9).standard_normal((CAMERA, CAMERA))
+    P = J @ P @ J.T
+    P[:CAMERA, :CAMERA] += noise
+    assert_equal_to_rounding(whole(covariance.camera_moved(J[:CAMERA, :CAMERA], noise)), P)
+
+
+def test_a_correction_and_its_transport():
+    """Landmarks that have left keep their own covariance; all else changes as written."""
+    rng = np.random.default_rng(10)
+    covariance, P = grown(rng)
+    n, W = len(covariance.dense), 0.1 * rng.standard_normal((len(P) - 9, 5))
+    J, K = rng.standard_normal((CAMERA, CAMERA)), rng.standard_normal((7, 3, 6))
+    expected = P.copy()
+    expected[: len(W), : len(W)] -= W @ W.T
+    expected[n:, n:] = P[n:, n:]
+    M = np.eye(len(P))
+    M[:CAMERA, :CAMERA] = J
+    M[CAMERA:n] += np.pad(K.reshape(-1, 6) @ J[:6], ((0, 0), (0, len(P) - CAMERA)))
+    found = covariance.corrected(np.asfortranarray(W[:n]), W[n:], J, K)
+    assert_equal_to_rounding(whole(found), M @ expected @ M.T)
+
+
+# --- the filter's steps against the printed formulas ---
+
+MODELS = EstimatorModels(MotionModel(0.3, 0.3), pixel_sigma=0.5)
+
+
+def state_of(landmarks: int, coordinates) -> tuple[State, np.ndarray, np.random.Generator]:
+    """A camera that moves among landmarks, and their true places in its coordinates."""
+    rng = np.random.default_rng(5)
+    h = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (landmarks, 3))
+    s = replace(State.first(MODELS), stamp=0.0, frame=0)
+    s = replace(s, covariance=s.covariance.camera_moved(np.eye(CAMERA), 1e-4 * positive(CAMERA, rng)))
+    return s.placed(coordinates, np.arange(landmarks), h, RIG.triangulation_covariance(h, 0.5)), h, rng
+
+
+def in_deviations(P: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """A covariance in units of another's standard deviations: entries of m², m rad/s and 1/m² become comparable."""
+    deviation = np.sqrt(np.diag(of))
+    return P / np.outer(deviation, deviation)
+
+
+def test_the_prediction_is_as_printed():
+    s, _, _ = state_of(4, InverseDepth())
+    camera, P, dt = s.camera + 0.1 * np.arange(12.0) / 12, s.covariance.dense, 0.25
+    s = replace(s, camera=camera)
+    found = s.advanced(dt, advanced(MODELS, Motion(camera, s.R_world_angles), P[:12, :12], dt, False))
+    A, W = np.eye(len(P)), np.zeros((len(P), 6))
+    A[:6, 6:12] = dt * np.eye(6)
+    W[:6], W[6:12] = dt * np.eye(6), np.eye(6)
+    linear, angular = MODELS.motion.velocity_variance(dt)
+    assert_equal_to_rounding(found.camera, A[:12, :12] @ camera)
+    expected = A @ P @ A.T + W @ np.diag([linear] * 3 + [angular] * 3) @ W.T
+    assert_equal_to_rounding(in_deviations(found.covariance.dense, expected), in_deviations(expected, expected))
+
+
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
+def test_the_update_is_the_joseph_form(coordinates):
+    s, h, rng = state_of(12, coordinates)
+    P, marks, first = s.covariance.dense, s.landmarks, CAMERA + 3 * np.arange(12)
+    z = RIG.project_stereo(h + 0.01 * rng.standard_normal(h.shape))[0] + 0.3 * rng.standard_normal((12, 3))
+    measured = model(RIG, s.R_world_angles, coordinates, marks.anchors)
+    problem = Problem(P, s.camera[:6], marks.c, first, z, 0.5, measured, 1, 0.9999)
+    solution = solve(problem, gate(problem))
+    assert solution.used.all()
+    x = np.concatenate([s.camera, marks.c.reshape(-1)])
+    predict = lambda x: measured.predict(x[:6], x[12:].reshape(-1, 3)).reshape(-1)  # noqa: E731
+    H, nu = jacobian(predict, x, 1e-5), z.reshape(-1) - predict(x)
+    S = H @ P @ H.T + 0.25 * np.eye(36)
+    K = np.linalg.solve(S, H @ P).T
+    J = np.eye(len(P)) - K @ H
+    joseph = J @ P @ J.T + 0.25 * K @ K.T
+    after = s.corrected(coordinates, Agreement(solution), np.arange(12), False)
+    difference = in_deviations(after.covariance.dense - joseph, joseph)
+    assert np.abs(difference).max() < 1e-5  # what the differences leave in H
+    found = np.concatenate([after.camera, after.landmarks.c.reshape(-1)])
+    np.testing.assert_allclose(found, x + K @ nu, rtol=1e-6, atol=1e-6)
+    assert solution.system.w @ solution.system.w == pytest.approx(nu @ np.linalg.solve(S, nu), rel=1e-6)
+
+
+@pytest.mark.parametrize("coordinates", [InverseDepth(), Euclidean()], ids=["inverse depth", "euclidean"])
+def test_augmentation_is_the_derivative_of_triangulation(coordinates):
+    s, _, _ = state_of(3, coordinates)
+    h = np.array([[0.4, -0.3, 6.0]])
+    noise, P, camera = RIG.triangulation_covariance(h, 0.5), s.covariance.dense, s.camera
+    after = s.placed(coordinates, np.array([9]), h, noise)
+
+    def of(x):
+        turned = attitude(s.R_world_angles, x[3:6])
+        return coordinates.of(after.landmarks.anchors[-1:], x[:3] + (h + x[6:]) @ turned.T)[0]
+
+    J = jacobian(of, np.concatenate([camera[:6], np.zeros(3)]))
+    cross = J[:, :6] @ P[:6]
+    own = J[:, :6] @ P[:6, :6] @ J[:, :6].T + J[:, 6:] @ noise[0] @ J[:, 6:].T
+    expected = np.block([[P, cross.T], [cross, own]])
+    # central differences by 1e-6 leave 1e-10 in J
+    found = in_deviations(after.covariance.dense, expected)
+    np.testing.assert_allclose(found, in_deviations(expected, expected), atol=1e-7)
+    np.testing.assert_allclose(after.landmarks.points[-1], (s.pose @ np.append(h[0], 1))[:3], atol=1e-12)
+
+
+# --- the update: iterated, gated ---
 
 
 def far_off(iterations: int, guess: bool = False) -> Problem:
@@ -211,86 +349,89 @@ def far_off(iterations: int, guess: bool = False) -> Problem:
     world, phi = anchor(np.eye(3))
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (12, 3))
     truth = np.concatenate([[0.3, -0.2, 1.5], phi + np.array([0.05, 0.15, -0.1])])
-    z = linearise(RIG, world, truth[:6], points).z + 0.5 * rng.standard_normal((12, 3))
-    prior = np.concatenate([np.zeros(3), phi, points.reshape(-1)])
-    prior[6:] += 0.05 * rng.standard_normal(36)
+    measured, pose = model(RIG, world), np.concatenate([np.zeros(3), phi])
+    z = measured.predict(truth, points) + 0.5 * rng.standard_normal((12, 3))
+    c = points + 0.05 * rng.standard_normal((12, 3))
     P = np.diag(np.concatenate([np.full(3, 1.5**2), np.full(3, 0.2**2), np.full(36, 0.05**2)]))
-    return Problem(prior, P, z, 0.5, model(RIG, world), iterations, 0.9999, truth - prior[:6] if guess else None)
+    change, first = truth - pose if guess else None, 6 + 3 * np.arange(12)
+    return Problem(P, pose, c, first, z, 0.5, measured, iterations, 0.9999, change)
 
 
-def cost(problem: Problem, x: np.ndarray) -> float:
-    d = x - problem.prior
-    residual = (problem.z - problem.model.predict(x)).reshape(-1) / problem.sigma
-    return float(d @ np.linalg.solve(problem.covariance, d) + residual @ residual)
+def ungated(problem: Problem):
+    """What all measurements give, whether they agree or not."""
+    return solve(problem, replace(gate(replace(problem, gate_probability=1 - 1e-15)), limits=np.full(12, 1e9)))
+
+
+def residuals(problem: Problem, change: np.ndarray) -> np.ndarray:
+    """Whitened: of the prior, whose covariance is diagonal, and of the measurements."""
+    z = problem.model.predict(problem.pose + change[:6], problem.c + change[6:].reshape(-1, 3))
+    return np.concatenate([change / np.sqrt(np.diag(problem.P)), ((problem.z - z) / problem.sigma).reshape(-1)])
 
 
 @pytest.mark.parametrize("guess", [False, True])
 def test_the_iterated_update_is_the_maximum_of_the_posterior(guess, monkeypatch):
     monkeypatch.setattr("backends.ekf.solve._LINEAR", 1e-6)
     problem = far_off(30, guess)
-    solution = solve(problem, replace(gate(problem), used=np.ones(12, bool)))
-    x = problem.prior + problem.covariance @ solution.s
-    deviation = np.sqrt(np.diag(problem.covariance))
-
-    def residuals(step):  # whitened by the prior, so that a general solver has an easy time
-        x = problem.prior + deviation * step
-        return np.concatenate([step, ((problem.z - problem.model.predict(x)) / problem.sigma).reshape(-1)])
-
-    best = least_squares(residuals, np.zeros(42), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    np.testing.assert_allclose(x, problem.prior + deviation * best.x, atol=1e-5)
-    assert solution.nis == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
+    solution, deviation = ungated(problem), np.sqrt(np.diag(problem.P))
+    assert solution.used.all()
+    best = least_squares(lambda x: residuals(problem, deviation * x), np.zeros(42), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(solution.change, deviation * best.x, atol=1e-5)
+    w = solution.system.w
+    assert w @ w == pytest.approx(2 * best.cost, rel=1e-3)  # νᵀS⁻¹ν there is the least cost
 
 
 def test_more_iterations_never_raise_the_cost():
     costs = []
     for iterations in (2, 3, 5, 8):
-        problem = far_off(iterations)
-        solution = solve(problem, replace(gate(problem), used=np.ones(12, bool)))
-        costs.append(cost(problem, problem.prior + problem.covariance @ solution.s))
-    assert costs[0] < cost(problem, problem.prior) and (np.diff(costs) <= 1e-9).all()
+        r = residuals(far_off(iterations), ungated(far_off(iterations)).change)
+        costs.append(r @ r)
+    start = residuals(far_off(2), np.zeros(42))
+    assert costs[0] < start @ start and (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 2 * 36
 
 
 def test_a_step_that_lowers_no_cost_is_no_information(monkeypatch):
     """Where the mean does not move towards the measurements, the variance must not fall either."""
-    problem = far_off(5)
     monkeypatch.setattr("backends.ekf.solve._descend", lambda problem, rows, now, target: (now, False))
     with pytest.raises(UnsolvableError, match="cost"):
-        solve(problem, replace(gate(problem), used=np.ones(12, bool)))
+        ungated(far_off(5))
 
 
-def test_conditional_distances_are_what_leaving_out_would_change():
-    """A landmark's squared distance from what the others predict is the fall of the NIS when it is left out."""
+def test_what_is_taken_out_was_never_there():
+    """A landmark's distance from what the others predict is the fall of the NIS when it is left out."""
     problem = far_off(1)
-    everything = np.ones(12, bool)
-    gated = gate(problem)
-    whole = _iterate(problem, everything, gated.start, gated.system)
-    for j in (0, 5, 11):
-        without = _iterate(problem, np.arange(12) != j, gated.start, gated.system)
-        assert whole.nis - without.nis == pytest.approx(whole.distances[j], rel=1e-6)
+    system, P = gate(replace(problem, gate_probability=1 - 1e-15)).system(), problem.P
+    for gone in ([0], [5], [11], [3, 4, 8]):
+        mask = np.isin(np.arange(12), gone)[:, None] & np.ones(3, bool)
+        without = system.without(mask)
+        if len(gone) == 1:
+            fall = system.w @ system.w - without.w @ without.w
+            assert fall == pytest.approx(system.distances()[gone[0]], rel=1e-6)
+        fresh = gate(replace(problem, z=np.where(mask, np.nan, problem.z), gate_probability=1 - 1e-15)).system()
+        np.testing.assert_allclose(without.y @ without.HP, fresh.y @ fresh.HP, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(without.distances(), fresh.distances(), rtol=1e-6, atol=1e-9)
+        V, W = without.whitened(without.HP), fresh.whitened(fresh.HP)
+        np.testing.assert_allclose(in_deviations(V @ V.T, P), in_deviations(W @ W.T, P), atol=1e-9)
 
 
 def test_a_large_displacement_of_the_world_changes_no_prediction():
     """By metres, in coordinates that are not linear in it: nor does an update that is linearised there measure it."""
     rng = np.random.default_rng(3)
     world, phi = anchor(np.eye(3))
-    points = rng.uniform((-4, -2, 8), (4, 2, 30), (40, 3))
-    anchors, coordinates = np.tile(np.eye(3, 4), (40, 1, 1)), InverseDepth()
-    c = coordinates.of(anchors, points)
-    inverse = np.linalg.inv(coordinates.jacobian(anchors, c))
-    gauge_jacobian = np.zeros((126, 6))
-    gauge_jacobian[:3, :3] = np.eye(3)
-    gauge_jacobian[3:6, 3:] = np.linalg.inv(world @ rotation(phi) @ body_rate_matrix(phi))
-    gauge_jacobian[6:] = np.concatenate([inverse, -inverse @ se3.hat(points)], axis=2).reshape(-1, 6)
+    points, anchors = rng.uniform((-4, -2, 8), (4, 2, 30), (40, 3)), np.tile(np.eye(3, 4), (40, 1, 1))
+    coordinates, pose = InverseDepth(), np.concatenate([np.zeros(3), phi])
+    c, U = coordinates.of(anchors, points), np.zeros((126, 6))
+    U[:3, :3] = np.eye(3)
+    U[3:6, 3:] = np.linalg.inv(world @ rotation(phi) @ body_rate_matrix(phi))
+    U[6:] = gauge_jacobian(coordinates, anchors, c, points).reshape(-1, 6)
     own = np.diag(np.concatenate([np.full(3, 0.1**2), np.full(3, 0.01**2), np.tile([1e-6, 1e-6, 1e-7], 40)]))
-    P = own + gauge_jacobian @ np.diag(np.repeat([3.0, 0.03], 3) ** 2) @ gauge_jacobian.T
-    prior = np.concatenate([np.zeros(3), phi, c.reshape(-1)])
-    measurement = StereoMeasurement(RIG, world, coordinates, anchors)
-    z = measurement.predict(prior)
-    problem = Problem(prior, 0.5 * (P + P.T), z, 0.5, measurement, 5, 0.999, gauge_jacobian=lambda: gauge_jacobian)
-    change = gauge_jacobian @ np.array([2.0, -1.0, 3.0, 0.03, -0.02, 0.05])
-    assert np.nanmax(np.abs(measurement.predict(prior + change) - z)) > 1.0
-    np.testing.assert_allclose(measurement.predict(problem.mean(change)), z, atol=1e-5)
-    there = change + np.linalg.cholesky(own) @ rng.standard_normal(126)
-    H = problem.jacobian(measurement.linearise(problem.mean(there)), np.ones((40, 3), bool), there)
-    np.testing.assert_allclose(H.times(gauge_jacobian), 0, atol=1e-4)  # [px/m], [px/rad]
+    P = own + U @ np.diag(np.repeat([3.0, 0.03], 3) ** 2) @ U.T
+    measured, first = model(RIG, world, coordinates, anchors), 6 + 3 * np.arange(40)
+    z = measured.predict(pose, c)
+    problem = Problem(0.5 * (P + P.T), pose, c, first, z, 0.5, measured, 5, 0.999, gauge=lambda: U)
+    change = U @ np.array([2.0, -1.0, 3.0, 0.03, -0.02, 0.05])
+    assert np.nanmax(np.abs(measured.predict(*problem.mean(change, whole=True)) - z)) > 1.0
+    np.testing.assert_allclose(measured.predict(*problem.mean(change)), z, atol=1e-5)
+    there = problem.mean(change + np.linalg.cholesky(own) @ rng.standard_normal(126))
+    H = measured.linearise(*there, first)[1].without(problem.displacement)
+    np.testing.assert_allclose(dense(H, 126) @ U, 0, atol=1e-4)  # [px/m], [px/rad]

@@ -103,7 +103,7 @@ def test_a_gap_of_any_length(gap):
             report = step(backend, stamp + (gap if k >= 15 else 0), seen, known)
             assert k == 0 or len(report.used) > 5 * len(report.rejected)
         assert errors(backend, poses)[1] < 0.05
-        P = backend._state.covariance.full()
+        P = backend.state.covariance.dense
         assert np.linalg.eigvalsh(P / np.sqrt(np.outer(P.diagonal(), P.diagonal()))).min() > 0
 
 
@@ -146,7 +146,7 @@ def test_an_update_that_ends_a_great_uncertainty_keeps_all_its_digits(landmarks)
     backend.predict(1e9 + 1e5)
     report = backend.update(seen(ids[::2]))
     assert report.status is UpdateStatus.OK and len(report.used) > 15
-    P = backend._state.covariance.full()
+    P = backend.state.covariance.dense
     deviation = np.sqrt(P.diagonal())
     assert np.linalg.eigvalsh(P / np.outer(deviation, deviation))[0] > 0
     assert (np.linalg.eigvalsh(backend.estimate().covariances)[:, 0] > 0).all()
@@ -208,8 +208,15 @@ def test_a_landmark_in_contradiction_with_the_others_is_found(drive):
 
 def test_a_point_predicted_behind_the_camera_does_no_harm(drive):
     backend, seen = predicted(drive, 5)
-    behind = backend._state.landmarks.slots(seen.ids[:1])
-    backend._state.landmarks.state[behind] *= [1, 1, -1]
+    marks = backend.state.landmarks
+    behind = marks.rows_of(seen.ids[:1])
+    points = marks.points.copy()
+    points[behind] -= 2 * (points[behind] - backend.state.pose[:3, 3])
+    anchors = marks.anchors.copy()
+    anchors[behind] = np.concatenate([np.eye(3), points[behind].T - [[0], [0], [5.0]]], axis=1)
+    c = marks.c.copy()
+    c[behind] = [0.0, 0.0, 0.2]
+    backend.state = replace(backend.state, landmarks=replace(marks, anchors=anchors, c=c, points=points))
     report = backend.update(seen)
     assert report.status is UpdateStatus.OK and report.rejected.tolist() == seen.ids[:1].tolist()
 
@@ -230,24 +237,16 @@ def test_nothing_that_agrees_leaves_the_prediction(drive):
 @pytest.mark.parametrize("where", ["pose", "landmark"])
 def test_a_broken_covariance_is_a_status_with_a_reason(drive, entry, where):
     backend, seen = predicted(drive, 5)
-    backend._state.covariance.make_local(backend._state.landmarks.slots(seen.ids))  # these are local now
-    row = (
-        1
-        if where == "pose"
-        else 12 + 3 * int(backend._state.covariance._place[backend._state.landmarks.slots(seen.ids[3:4])[0]])
-    )
-    backend._state.covariance._local[row, row] = entry
-    before, camera, points = (
-        backend._state.covariance.full(),
-        backend._state.camera.copy(),
-        backend._state.landmarks.points.copy(),
-    )
+    P = backend.state.covariance.dense.copy()
+    row = 1 if where == "pose" else 12 + 3 * int(backend.state.landmarks.rows_of(seen.ids[3:4])[0])
+    P[row, row] = entry
+    backend.state = replace(backend.state, covariance=replace(backend.state.covariance, dense=P))
+    before = backend.state
     report = backend.update(seen)
     assert report.status is UpdateStatus.FAILED and "ekf" in report.reason
     assert len(report.used) == 0
-    np.testing.assert_array_equal(backend._state.covariance.full(), before)
-    np.testing.assert_array_equal(backend._state.camera, camera)
-    np.testing.assert_array_equal(backend._state.landmarks.points, points)
+    assert backend.state.covariance is before.covariance and backend.state.landmarks is before.landmarks
+    np.testing.assert_array_equal(backend.state.camera, before.camera)
 
 
 @pytest.mark.slow
@@ -281,7 +280,7 @@ def test_hardly_any_disparity(drive, disparity, landmarks):
     backend.predict(0.6)
     report = backend.update(seen.select(np.array([i in known for i in seen.ids.tolist()])))
     assert report.status is UpdateStatus.OK and len(report.rejected) < 3
-    P = backend._state.covariance.full()
+    P = backend.state.covariance.dense
     d = np.sqrt(np.diag(P))
     assert np.linalg.eigvalsh(P / np.outer(d, d)).min() > 0
     assert np.linalg.eigvalsh(backend.estimate().covariances).min() > 0
