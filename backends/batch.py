@@ -1,46 +1,49 @@
 """The maximum-likelihood estimate from all measurements, by Levenberg-Marquardt: the reference for back ends.
 
-Every landmark is a variable and every accepted measurement a factor of its own; nothing is approximated.
+Every landmark is a variable and every accepted measurement a factor of its own; nothing is approximated but the motion
+model: between two poses it counts as the prediction that it gave.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from backends.smoother import SmootherBackend
-from backends.smoother.config import SmootherConfig
-from backends.smoother.rebuild import add_landmark, add_poses, optimise
-from backends.smoother.solver import FAILURES, Change
-from backends.smoother.variables import landmark_key, pose_key
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport
-from slam.errors import ConfigurationError
+from backends.smoother.factors import landmark_key, pose_key
+from backends.smoother.graph import FAILURES, Problem, Tracks, minimised
+from slam.bounds import require_not_negative
+from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
 from slam.geometry.trajectory import Trajectory
 from slam.models import EstimatorModels
+from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
 
 _ITERATIONS = 100  # numerics: of Levenberg-Marquardt at most
 
 
 @dataclass(frozen=True)
-class BatchConfig(SmootherConfig):
-    """Options of `BatchBackend`: those of the smoother that runs along, and its own.
+class BatchConfig:
+    """Options of `BatchBackend`.
 
     Attributes:
         online: whether the pose alone is the solved one as well, and not the smoother's.
-        lag: no option here: all poses stay variables.
+
+    Raises:
+        ConfigurationError: it is neither true nor false.
     """
 
     online: bool = False
-    lag: None = None
+
+    def __post_init__(self) -> None:
+        require_not_negative(self, {}, "batch")
 
 
 class BatchBackend:
@@ -48,35 +51,24 @@ class BatchBackend:
 
     `estimate` and `trajectory` raise `SlamError` where gtsam cannot solve the problem.
 
-    A smoother runs along: it predicts, gates and gives the first values. The problem is solved when the trajectory or
-    the landmarks are asked for; with ``online=True`` whenever the pose is, which costs more with every frame.
+    A smoother runs along, of whose graph every measured frame is a pose: it predicts, gates and gives the first values.
+    The problem is solved when the trajectory or the landmarks are asked for; with ``online=True`` whenever the pose is,
+    which costs more with every frame.
 
     Args:
         rig: the cameras.
         models: noise, priors, motion and gate.
-        online: whether the pose alone is the solved one as well, and not the smoother's.
-        options: of the smoother but for its lag, see `backends.smoother.config.SmootherConfig`.
+        options: see `BatchConfig`.
 
     Raises:
         ConfigurationError: an option is unknown or out of range.
     """
 
-    def __init__(
-        self,
-        rig: StereoRig,
-        models: EstimatorModels = EstimatorModels(),  # noqa: B008
-        online: bool = False,
-        **options: Any,
-    ) -> None:
-        if not isinstance(online, bool):
-            raise ConfigurationError(f"batch: online must be true or false, got {online!r}")
+    def __init__(self, rig: StereoRig, models: EstimatorModels = EstimatorModels(), **options: Any) -> None:  # noqa: B008
         self.rig = rig
         self.models = models
-        self.online = online
-        if "lag" in options:
-            raise ConfigurationError("batch: lag is an option of the smoother; nothing is left out here")
-        self._smoother = SmootherBackend(rig, models, lag=None, **options)
-        self.config = BatchConfig(**asdict(self._smoother.config), online=online)
+        self.config = from_options(BatchConfig, "batch", options)
+        self._smoother = SmootherBackend(rig, models, motion=0.0, past=10**6)
         self._solution: _Solution | None = None
 
     def predict(self, stamp: float) -> Prediction:
@@ -117,38 +109,43 @@ class BatchBackend:
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
         rough = self._smoother.estimate(landmarks)
-        if not (landmarks or self.online):
+        if not (landmarks or self.config.online):
             return rough
-        solution = self._solved()
-        marks = self._smoother.measurement_log.landmarks
-        slots = marks.slots(rough.ids)
+        solution, s = self._solved(), self._smoother.state
         positions, covariances = rough.positions.copy(), rough.covariances.copy()
-        for row, serial in enumerate(marks.serial[slots].tolist()):
+        serials = s.landmarks.serial[s.landmarks.rows_of(rough.ids)]
+        for row, serial in enumerate(serials.tolist()):
             if serial in solution.landmarks:
                 positions[row] = solution.values.atPoint3(landmark_key(serial))
                 covariances[row] = solution.covariance(landmark_key(serial), covariances[row])
-        path = self._smoother.measurement_log.path
-        if not path.count or path.stamps[-1] < rough.stamp:  # predicted only: its measurements are still to come
-            return Estimate(rough.stamp, rough.T_world_left, rough.covariance, rough.ids, positions, covariances)
-        P = solution.covariance(pose_key(path.count - 1), rough.covariance)
-        return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
+        T, P = rough.T_world_left, rough.covariance
+        if s.inside:  # else it is predicted only: its measurements are still to come
+            T, P = solution.poses[-1].copy(), solution.covariance(pose_key(s.number), P)
+        return Estimate(rough.stamp, T, P, rough.ids, positions, covariances)
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`: the smoother's."""
         return self._smoother.positions(ids)
 
+    def recent(self, n: int) -> RecentPoses:
+        """See `slam.interfaces.RecentBackend.recent`: the smoother's."""
+        return self._smoother.recent(n)
+
     @one_blas_thread
     def trajectory(self) -> Trajectory:
         """See `slam.interfaces.Backend.trajectory`."""
-        rough = self._smoother.trajectory()
-        if not len(rough):
-            return rough
-        solved = self._solved().poses
-        return Trajectory(rough.stamps, np.concatenate([solved, rough.poses[len(solved) :]]))
+        s = self._smoother.state
+        if not s.started:
+            return self._smoother.trajectory()
+        found = self._smoother.path.trajectory(s, self._solved().poses)
+        if not s.inside:
+            found.poses[-1] = s.last[1]
+        return found
 
     def _solved(self) -> _Solution:
-        count = self._smoother.measurement_log.path.count  # a pose without measurements may have come since
-        if self._solution is None or len(self._solution.poses) != count:
+        """The solution; a frame that is only predicted changes nothing of it."""
+        sights = self._smoother.state.sights
+        if self._solution is None or self._solution.sights is not sights:
             self._solution = _Solution(self._smoother)
         return self._solution
 
@@ -157,37 +154,49 @@ class _Solution:
     """A solved problem.
 
     Attributes:
+        sights: what it is the solution for.
         values: all variables.
-        poses: (F, 4, 4); those before a restart of the smoother are its own.
+        poses: of the graph (N, 4, 4); those before a restart of the smoother are its own.
         landmarks: serial numbers of the landmarks that are variables.
     """
 
     def __init__(self, smoother: SmootherBackend) -> None:
-        change = Change()
-        make, measurement_log = smoother.factor_maker, smoother.measurement_log
-        add_poses(change, make, measurement_log)
-        self.landmarks: set[int] = set()
-        for serial, rows in _by_landmark(measurement_log.measurements.landmark, measurement_log.history.known):
-            known = measurement_log.history.known.get(serial)
-            if known is not None:
-                T = np.eye(4) if known.frame is None else measurement_log.path.poses[known.frame]
-                add_landmark(
-                    change, make, measurement_log, landmark_key(serial), rows, transform(T, known.position[None])[0]
-                )
-                change.factors.add(make.known(landmark_key(serial), known))
-                self.landmarks.add(serial)
-                continue
-            z = measurement_log.measurements.z[rows]
-            nearest = int(np.nanargmax(z[:, 0] - z[:, 2]))  # its depth is known best
-            local = make.stereo.triangulate(z[nearest : nearest + 1])
-            T = measurement_log.path.poses[measurement_log.measurements.frame[rows[nearest]]]
-            add_landmark(change, make, measurement_log, landmark_key(serial), rows, transform(T, local)[0])
-            self.landmarks.add(serial)
-        self._factors = change.factors
-        self.values = optimise(change, _ITERATIONS)
-        self.poses, first = measurement_log.path.poses.copy(), measurement_log.history.first
-        for i in range(first, len(self.poses)):
-            self.poses[i] = self.values.atPose3(pose_key(i)).matrix()
+        s, make = smoother.state, smoother.factor_maker
+        self.sights = s.sights
+        problem, tracks = Problem(), Tracks(make, 2, None)
+        numbers = range(s.begun, s.number + 1)
+        for number in numbers:
+            tracks.add_pose(problem, s, number, s.begun)
+        count = np.zeros(s.serials, np.int64)
+        stereo = smoother.stereo
+        nearest: dict[int, tuple[float, Array]] = {}  # largest disparity, and where that puts the landmark
+        for number in numbers:
+            sight, T = s.sights[s.of(number)], s.poses[s.of(number)]
+            count[sight.serials] += 1
+            disparity = np.nan_to_num(sight.z[:, 0] - sight.z[:, 2], nan=-1.0)
+            places = transform(T, stereo.triangulate(sight.z))
+            for serial, d, place in zip(sight.serials.tolist(), disparity.tolist(), places):
+                if d > nearest.get(serial, (0.0, place))[0]:
+                    nearest[serial] = d, place
+        known = {serial: one for serial, one in s.known.items() if one.pose < 0 or one.pose >= s.begun}
+        self.landmarks = {
+            serial for serial in np.flatnonzero(count).tolist() if count[serial] > 1 and serial in nearest
+        }
+        self.landmarks |= {serial for serial in known if count[serial]}
+        for serial in sorted(self.landmarks):
+            if serial in known:
+                tracks.add_known(problem, s, serial)
+            else:
+                problem.values.insert(landmark_key(serial), nearest[serial][1])
+        for number in numbers:
+            sight = s.sights[s.of(number)]
+            for serial, z in zip(sight.serials.tolist(), sight.z.tolist()):
+                if serial in self.landmarks:
+                    problem.factors.add(make.explicit(make.point(z), number, serial))
+        self._factors = problem.factors
+        self.values = minimised(problem, _ITERATIONS)
+        solved = np.array([self.values.atPose3(pose_key(i)).matrix() for i in numbers])
+        self.poses = np.concatenate([s.poses[: s.of(s.begun)], solved])
 
     @cached_property
     def _marginals(self) -> gtsam.Marginals | None:
@@ -204,12 +213,3 @@ class _Solution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
-
-
-def _by_landmark(landmark: NDArray[np.int32], known: Container[int]) -> Iterator[tuple[int, IndexArray]]:
-    """Serial numbers of landmarks measured at least twice, or once and `known`, each with its measurements' rows."""
-    order = np.argsort(landmark, kind="stable")
-    serials, starts = np.unique(landmark[order], return_index=True)
-    for serial, rows in zip(serials.tolist(), np.split(order, starts[1:])):
-        if serial >= 0 and (len(rows) > 1 or serial in known):
-            yield serial, rows

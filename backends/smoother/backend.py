@@ -1,28 +1,23 @@
-"""The smoother back end: the protocol on top of the factor graph and the belief that follows from it."""
+"""The smoother back end: the protocol on top of the steps, the graph, and the path."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import gtsam
 import numpy as np
 
-from backends.smoother.belief import Belief
 from backends.smoother.config import SmootherConfig
-from backends.smoother.factor_graph import FactorGraph
 from backends.smoother.factors import FactorMaker
-from backends.smoother.measurement_log import MeasurementLog
-from backends.smoother.pose_set import PredictedPose
-from backends.smoother.prediction import normalised_innovation
-from backends.smoother.rollback import snapshot
-from backends.smoother.solver import SolverError
+from backends.smoother.graph import Graph
+from backends.smoother.mending import corrected, path_solved, rebuilt
+from backends.smoother.path import Path
+from backends.smoother.state import State
+from backends.smoother.steps import Steps
 from slam.checks import require_guess, require_not_measured, require_stamp
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport, UpdateStatus
+from slam.data import Estimate, IdArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import CopyError, MeasurementError
-from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
@@ -30,19 +25,17 @@ from slam.mapping.known_landmarks import require_in_front, require_known
 from slam.models import EstimatorModels
 from slam.options import from_options
 from slam.runtime.blas import one_blas_thread
-from slam.window import pose_only
-from slam.window.agreement import landmarks_pose
-from slam.window.gating import with_noise
-from slam.window.pose_only import residual_noise, seen_from
-from slam.window.recovery import Agreement, agreement, world_covariance
 from slam.window.stereo import RectifiedStereo
 
 
 class SmootherBackend:
-    """ISAM2 over smart stereo factors: all poses are estimated together and revised with every frame.
+    """gtsam's incremental fixed-lag smoother over smart stereo factors.
 
-    The motion model is the papers' (see `backends.smoother.motion`). Which landmarks are eliminated and which are
-    variables: see `backends.smoother.factor_builder`. Covariances: see `backends.smoother.uncertainty`.
+    In every frame the newest pose is found from the landmarks as they stand, with the motion model as a prior
+    (`slam.window.pose_only`). Frames from which the landmarks have moved enough in the image become poses of the factor
+    graph: their measurements go into the smart factors, from which gtsam eliminates the landmarks, and the last poses
+    are estimated together. Other frames hang at the last pose of the graph. A landmark stands where its last
+    measurements put it, given the poses; covariances are gtsam's marginals.
 
     Args:
         rig: the cameras; measurements of any rig are rectified first.
@@ -57,18 +50,23 @@ class SmootherBackend:
         self.rig = rig
         self.models = models
         self.config = from_options(SmootherConfig, "smoother", options)
-        self._stereo = RectifiedStereo.of(rig)
-        self._make = FactorMaker(self._stereo, models)
-        self._graph = FactorGraph(self._make, self.config)
-        self._belief = Belief(self._graph, models)
-        self._answer: tuple[MeasurementLog, Belief] | None = None  # what `estimate` and `trajectory` last gave
-        self._measured = False  # whether the predicted pose has had its update
-        self._contradicted = 0  # updates in succession that disagreed with the path
+        self._steps = Steps(rig, models, self.config)
+        self._make = FactorMaker(self._steps.stereo, models)
+        self._graph = Graph(self._make, self.config.track, self.config.lag)
+        self._state = State.empty()
+        self._path = Path()
+        self._mended = False  # whether measurements were revised while poses were kept
+        self._answer: tuple[State, Trajectory] | None = None  # the last path, and the state that it is of
 
     @property
-    def measurement_log(self) -> MeasurementLog:
-        """Poses, measurements and landmarks as they are believed now; not to be changed."""
-        return self._graph.log
+    def state(self) -> State:
+        """All that is kept: poses, measurements, landmarks."""
+        return self._state
+
+    @property
+    def path(self) -> Path:
+        """How the frames hang at the poses of the graph."""
+        return self._path
 
     @property
     def factor_maker(self) -> FactorMaker:
@@ -76,13 +74,13 @@ class SmootherBackend:
         return self._make
 
     @property
-    def solver_seconds(self) -> float:
-        """CPU time spent in gtsam's solvers so far [s]: the least this back end could cost; the rest is overhead."""
-        return self._graph.solver_seconds
+    def stereo(self) -> RectifiedStereo:
+        """The rectified rig that measures."""
+        return self._steps.stereo
 
     @property
     def rebuilds(self) -> int:
-        """How often the problem was put into a new solver so far, after a failure or a divergence."""
+        """How often the graph was built anew after a failure of gtsam."""
         return self._graph.rebuilds
 
     # --- the protocol (documented in slam.interfaces.Backend) ---
@@ -95,120 +93,73 @@ class SmootherBackend:
     @one_blas_thread
     def predict_at_rest(self, stamp: float) -> Prediction:
         """See `slam.interfaces.RestingBackend.predict_at_rest`."""
-        return self._predict(stamp, rests=self.measurement_log.path.count > 0)
+        return self._predict(stamp, rests=self._state.started)
 
     def _predict(self, stamp: float, rests: bool) -> Prediction:
-        path = self.measurement_log.path
-        last = path.predicted.stamp if path.predicted is not None else float(path.stamps[-1]) if path.count else None
-        require_stamp("smoother", stamp, last)
-        self._graph.repair()
-        self._commit()
-        path = self.measurement_log.path
-        path.rests.discard(path.count)
-        if rests:
-            path.rests.add(path.count)
-        predicted = self._belief.predicted(stamp)
-        in_view = self._in_view(predicted)
-        self._answer, self._measured = None, False
-        self.measurement_log.path.predicted = predicted  # last: an interrupted call has predicted nothing
-        return in_view
+        s = self._state
+        require_stamp("smoother", stamp, float(s.stamps[1]) if s.started else None)
+        s = self._steps.predicted(s, float(stamp), rests)
+        rows, left, right, S = self._steps.in_view(s)
+        self._path.extend(s)
+        self._state = s
+        return Prediction(float(stamp), s.last[1].copy(), s.covariance, s.landmarks.ids[rows], left, right, S)
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
         """See `slam.interfaces.Backend.update`."""
-        self._require_started("update")
-        predicted = self.measurement_log.path.predicted
-        require_not_measured("smoother", predicted is None or self._measured)
+        s = self._started("update")
         require_guess("smoother", guess)
-        slots = self.measurement_log.landmarks.slots(observations.ids)
-        assert predicted is not None
-        report = self._corrected(predicted, slots, observations, guess)
-        self._measured = True
+        require_not_measured("smoother", s.measured)
+        z = self._steps.stereo.measure(observations)
+        s, report = self._steps.updated(s, self._graph, observations.ids.copy(), z, guess)
+        self._path.follow(s)
+        self._state = s
         return report
-
-    def _corrected(
-        self, predicted: PredictedPose, slots: IndexArray, observations: Observations, guess: Array | None
-    ) -> UpdateReport:
-        """The update by observations of landmarks `slots`."""
-        if not len(slots):
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
-        z, P = self._stereo.measure(observations), predicted.covariance
-        try:
-            found = self._solve_pose(predicted, slots, z, observations, guess)
-        except np.linalg.LinAlgError as error:
-            return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: the pose cannot be solved for: {error}")
-        self._contradicted = found.contradicted
-        T, used = found.T, found.used
-        if not used.any():
-            return UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", observations.ids)
-        if found.jump is not None:
-            predicted = replace(predicted, noise=predicted.noise + np.diag(found.jump))
-        solved = self._belief.points(replace(predicted, T=T), slots[used])
-        step = gtsam.Pose3.Logmap(gtsam.Pose3(inverse(predicted.T) @ T))
-        try:
-            nis, dof = normalised_innovation(self._stereo, self._make.sigma, solved, z[used], step)
-        except np.linalg.LinAlgError:  # covariances that differ by more than their digits
-            nis, dof = float("nan"), 0
-        with self._whole():
-            if found.jump is not None:
-                before = self._belief.covariances_from_measured()
-                failure = self._graph.restart(predicted.stamp, T, world_covariance(P), before, slots[used], z[used])
-            else:
-                failure = self._graph.append_measured_pose(predicted.stamp, T, slots[used], z[used])
-            if failure:
-                return UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: {failure}")
-            return UpdateReport(UpdateStatus.OK, "", observations.ids[used], observations.ids[~used], nis, dof)
 
     @one_blas_thread
     def add(self, observations: Observations) -> None:
         """See `slam.interfaces.Backend.add`."""
-        self._require_started("add")
-        self._require_new(observations.ids)
-        if not len(observations):
-            return
-        z = self._stereo.measure(observations)
-        local = self._stereo.triangulate(z)
-        bad = ~np.isfinite(local).all(axis=1)
-        if bad.any():
-            raise MeasurementError(
-                f"smoother: landmark {observations.ids[bad][0]} has no right pixel or no positive depth"
-            )
-        self._commit()
-        with self._whole():
-            self._graph.add_landmarks(observations.ids, z, local)
+        s = self._started("add")
+        if len(observations):
+            self._state = self._steps.added(s, observations.ids.copy(), self._steps.stereo.measure(observations))
 
     def remove(self, ids: IdArray | Sequence[int]) -> None:
         """See `slam.interfaces.Backend.remove`. What its measurements said about the poses is kept."""
-        slots = self.measurement_log.landmarks.slots(np.unique(np.asarray(ids, np.int64)))
-        with self._whole():
-            self._graph.remove_landmarks(slots)
+        self._state = self._steps.removed(self._state, np.unique(np.asarray(ids, np.int64)))
 
     @one_blas_thread
     def estimate(self, landmarks: bool = True) -> Estimate:
         """See `slam.interfaces.Backend.estimate`."""
-        self._require_started("estimate")
-        self._graph.repair()
-        log, belief = self._converged() if landmarks else (self.measurement_log, self._belief)
-        stamp, T, P = belief.newest()
-        marks = log.landmarks
-        slots = marks.all_slots() if landmarks else np.zeros(0, np.intp)
-        covariances = belief.landmark_covariances(slots) if len(slots) else np.zeros((0, 3, 3))
-        return Estimate(stamp, T, P, marks.ids[slots], marks.position[slots], covariances)
+        s = self._started("estimate")
+        marks = s.landmarks
+        rows = marks.order if landmarks else marks.order[:0]
+        covariances = self._steps.landmark_covariances(s, self._graph, rows) if len(rows) else np.zeros((0, 3, 3))
+        return Estimate(
+            float(s.stamps[1]), s.last[1].copy(), s.covariance, marks.ids[rows], marks.position[rows], covariances
+        )
 
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`."""
-        marks = self.measurement_log.landmarks
-        return marks.position[marks.slots(ids)]
+        marks = self._state.landmarks
+        return marks.position[marks.rows_of(ids)]
+
+    @one_blas_thread
+    def recent(self, count: int) -> RecentPoses:
+        """The last camera poses, at most `count` and as many as are in the graph, with their joint covariance."""
+        return self._path.recent(self._started("recent"), self._graph, count)
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
-        """See `slam.interfaces.Backend.trajectory`: every pose as it is believed now."""
-        self._graph.repair()
-        path = self._converged()[0].path
-        ahead = path.predicted
-        if ahead is not None:  # not in the graph yet: its measurements are still to come
-            return Trajectory(np.append(path.stamps, ahead.stamp), np.concatenate([path.poses, ahead.T[None]]))
-        return Trajectory(path.stamps.copy(), path.poses.copy())
+        """See `slam.interfaces.Backend.trajectory`: poses that have left the lag are final.
+
+        After a revision of the measurements, all poses whose measurements are kept are solved for together. The newest
+        pose stays where it is and the path before it moves, but where landmarks are known in the world.
+        """
+        s = self._state
+        if self._answer is None or self._answer[0] is not s:
+            graph = path_solved(s, self._make, self._path.graph(s.first)) if self._mended else None
+            self._answer = s, self._path.trajectory(s, graph)
+        return Trajectory(self._answer[1].stamps.copy(), self._answer[1].poses.copy())
 
     # --- a map that is known (documented in slam.interfaces.MapBackend) ---
 
@@ -216,38 +167,41 @@ class SmootherBackend:
     def insert(self, ids: IdArray, positions: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.insert`."""
         require_known("smoother", ids, positions, covariances)
-        self._require_new(ids)
-        with self._whole():
-            self._graph.add_known(ids, positions, covariances)
+        self._state.landmarks.require_new(ids)
+        arguments = np.array(ids, np.int64), np.array(positions, float), np.array(covariances, float)
+        if len(ids):
+            self._state = self._steps.inserted(self._state, *arguments)
 
     @one_blas_thread
     def place(self, ids: IdArray, local: Array, covariances: Array) -> None:
         """See `slam.interfaces.MapBackend.place`."""
-        self._require_started("place")
+        s = self._started("place")
         require_known("smoother", ids, local, covariances)
         require_in_front("smoother", ids, local)
-        self._require_new(ids)
-        if not len(ids):
-            return
-        self._commit()
-        with self._whole():
-            self._graph.add_known(ids, local, covariances, self.measurement_log.path.count - 1)
+        s.landmarks.require_new(ids)
+        arguments = np.array(ids, np.int64), np.array(local, float), np.array(covariances, float)
+        if len(ids):
+            self._state = self._steps.placed(s, *arguments)
 
     # --- measurements that are mended (documented in slam.interfaces.RevisingBackend) ---
 
     @property
     def revises_path(self) -> bool:
-        """See `slam.interfaces.RevisingBackend`: True while all poses and measurements are still in the problem."""
-        history = self.measurement_log.history
-        return history.first == history.restarted == 0 and not self._graph.poses_leave()
+        """See `slam.interfaces.RevisingBackend`: True while the first frame's measurements are still known."""
+        return self._state.first == self._state.begun == 0
 
     @one_blas_thread
     def revise(self, correct: Callable[[Array], Array]) -> None:
-        """See `slam.interfaces.RevisingBackend.revise`: solves the whole problem again, as long as that takes."""
-        self._commit()
-        if self.measurement_log.measurements.count:
-            with self._whole():
-                self._graph.revise(correct)
+        """See `slam.interfaces.RevisingBackend.revise`: the newest pose stays where it is.
+
+        The graph is built anew from corrected measurements, and landmarks move to where they put them. The path is
+        found anew when it is asked for.
+        """
+        s = self._state
+        if s.started:
+            before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph, self._make)
+            self._path.move(s, s.poses[0] @ inverse(before.poses[0]))
+            self._state, self._mended = replace(s, measured=True), True
 
     # --- copies ---
 
@@ -264,75 +218,7 @@ class SmootherBackend:
 
     # --- parts ---
 
-    @contextmanager
-    def _whole(self) -> Iterator[None]:
-        """Make a block atomic: if it is interrupted, the measurement log is restored."""
-        self._answer = None
-        self._graph.repair()
-        restore = snapshot(self.measurement_log)
-        try:
-            yield
-            self._belief.window()  # here, as it may have to repair the solver, which a query must not do
-        except BaseException:
-            self._graph.interrupted()
-            restore()
-            raise
-
-    def _converged(self) -> tuple[MeasurementLog, Belief]:
-        """Everything as the converged problem has it, without changing the state; as it stands if that fails."""
-        if self._answer is None:
-            log, belief = self.measurement_log, self._belief
-            with suppress(SolverError):
-                if log.path.count:
-                    graph = self._graph.converged()
-                    log, belief = graph.log, Belief(graph, self.models)
-            self._answer = log, belief
-        return self._answer
-
-    def _commit(self) -> None:
-        """Put a predicted pose without measurements into the graph."""
-        predicted = self.measurement_log.path.predicted
-        if predicted is not None:
-            with self._whole():
-                self._graph.append_pose(predicted.stamp, predicted.T)
-
-    def _in_view(self, predicted: PredictedPose) -> Prediction:
-        """Pose, and what is in the angle of view (paper A, Fig. 3) with its innovation covariance."""
-        T, marks, rig = predicted.T, self.measurement_log.landmarks, self.rig
-        slots = marks.used()
-        slots = slots[rig.left.in_view((marks.position[slots] - T[:3, 3]) @ T[:3, :3])]
-        points = self._belief.points(predicted, slots)
-        uv, J = rig.left.project_with_jacobian(points.local)
-        right = rig.right.project((points.local + rig.b) @ rig.R.T)
-        S = with_noise(points.covariance(J), self.models.pixel_sigma)
-        return Prediction(predicted.stamp, T.copy(), predicted.covariance, marks.ids[slots], uv, right, S)
-
-    def _solve_pose(
-        self, predicted: PredictedPose, slots: IndexArray, z: Array, observations: Observations, guess: Array | None
-    ) -> Agreement:
-        """Initial value of the newest pose, and which measurements agree with it."""
-        marks = self.measurement_log.landmarks
-        local, own = seen_from(predicted.T, marks.position[slots], marks.covariance[slots])
-        noise = residual_noise(self._stereo, self._make.sigma, local, own, z)
-        known = marks.prior[slots].any()  # what is known in the world does not move with the poses
-        P = predicted.covariance if known else predicted.covariance_to(self._belief.last_measured())
-        information = np.linalg.inv(P)
-        problem = pose_only.PoseProblem(
-            self._stereo, marks.position[slots], z, noise, predicted.T, information, self.models.gate_probability
-        )
-
-        def search() -> Array | None:
-            rows, seed = measurement_rows(observations.uv_left, observations.uv_right), self.measurement_log.path.count
-            return landmarks_pose(self.rig, problem.points, rows, self.models, predicted.T, seed)
-
-        start = predicted.T if guess is None else guess
-        return agreement(problem, start, search, self._contradicted, self._belief.lost())
-
-    def _require_started(self, what: str) -> None:
-        if not self.measurement_log.path.count and self.measurement_log.path.predicted is None:
+    def _started(self, what: str) -> State:
+        if not self._state.started:
             raise MeasurementError(f"smoother: {what} before the first predict")
-
-    def _require_new(self, ids: IdArray) -> None:
-        known = ids[self.measurement_log.landmarks.among(ids)]
-        if len(known):
-            raise MeasurementError(f"smoother: landmark {known[0]} is in the map already")
+        return self._state

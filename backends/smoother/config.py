@@ -12,27 +12,24 @@ class SmootherConfig:
     """Options of `SmootherBackend`.
 
     Attributes:
-        track: observations after which a landmark's smart factor is finished; each landmark's own limit lies between
-            `track` and twice that, so that no frame finishes them all.
-        explicit: most landmarks in view that become variables of their own when their smart factor is finished;
-            they constrain the trajectory over any length of time. The others continue in a new smart factor.
-        relinearise: error of linearised pixels beyond which a variable is relinearised [px], approximately: in
-            every tenth frame. Ten times as much in the other frames; nearly zero when the whole path or map is
-            requested.
-        window: poses whose joint covariance is computed in every frame; older ones are taken as fixed to the oldest.
-        lag: least number of poses that stay variables. Older ones are marginalised, so that neither time nor memory
-            grows with the run. Null (in Python None) keeps all poses and revises the whole path.
+        motion: median displacement of the landmarks in the image, as a share of the focal length, from which on a frame
+            becomes a pose of the graph; 0 takes every frame.
+        overlap: a frame also becomes one if less than this share of its landmarks was measured from the last one.
+        track: most measurements in one smart factor; a landmark that is measured more often continues in a new one.
+        lag: number of poses that are smoothed; older ones are marginalised, so that neither time nor memory grows
+            with the run. Null (in Python None) keeps all poses and revises the whole path.
+        past: number of poses, at least, whose measurements are kept, to revise the path when measurements are mended.
 
     Raises:
         ConfigurationError: a value is out of its range.
     """
 
-    track: int = 10
-    explicit: int = 300
-    relinearise: float = 0.01
-    window: int = 12
-    lag: int | None = 50
+    motion: float = 0.02
+    overlap: float = 0.8
+    track: int = 20
+    lag: int | None = 14
+    past: int = 50
 
     def __post_init__(self) -> None:
-        ranges = {"track": (2, 10**6), "explicit": (0, 10**6), "relinearise": (1e-9, 10**6), "window": (2, 10**6)}
-        require_not_negative(self, {**ranges, "lag": (self.window, 10**6)}, "smoother")
+        ranges = {"motion": (0, 10), "overlap": (0, 1), "track": (2, 10**6), "lag": (2, 10**6), "past": (0, 10**6)}
+        require_not_negative(self, ranges, "smoother")

@@ -1,202 +1,194 @@
-"""The smoother's landmarks: positions, covariances, and the measurements that are not in a finished factor yet."""
+"""The smoother's landmarks: what was measured of each lately, and where that puts it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from backends.smoother.path import grown
+from backends.smoother.landmark_kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.errors import MeasurementError
-from slam.geometry.arrays import isin
 from slam.geometry.se3 import Array
+from slam.window.stereo import RectifiedStereo
 
-#: So many of its last measurements give a landmark's position and covariance.
-RECENT = 12
-
-
-@dataclass(frozen=True)
-class Track:
-    """A landmark's measurements since its last factor was finished, and the factor that holds them.
-
-    It is never changed, only replaced: tracks as they were are kept by a copy of the dictionary that holds them.
-
-    Attributes:
-        limit: so many measurements finish it.
-        rows: rows of `Measurements`.
-        points: the same as gtsam objects.
-        keys: pose variables of the measurements.
-        stereo: number of measurements with a right pixel.
-        factor: slot of the smart factor in the solver, −1 while there is none.
-    """
-
-    limit: int
-    rows: tuple[int, ...] = ()
-    points: tuple[Any, ...] = ()
-    keys: tuple[int, ...] = ()
-    stereo: int = 0
-    factor: int = -1
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @property
-    def informative(self) -> bool:
-        """Whether a smart factor can be made: gtsam's throws where it is given left pixels only."""
-        return len(self.rows) >= 2 and self.stereo > 0
-
-    def longer(self, row: int, point: Any, key: int, stereo: bool) -> Track:
-        """With one more measurement."""
-        rows, points, keys = (*self.rows, row), (*self.points, point), (*self.keys, key)
-        return Track(self.limit, rows, points, keys, self.stereo + stereo, self.factor)
-
-    def without_last(self, stereo: bool) -> Track:
-        """Without the newest measurement."""
-        rows, points, keys = self.rows[:-1], self.points[:-1], self.keys[:-1]
-        return Track(self.limit, rows, points, keys, self.stereo - stereo, self.factor)
-
-    def in_factor(self, slot: int) -> Track:
-        """The same in the smart factor of a slot."""
-        return Track(self.limit, self.rows, self.points, self.keys, self.stereo, slot)
-
-    def restarted(self) -> Track:
-        """Without measurements: their factor is finished and stays as it is."""
-        return Track(self.limit)
+RECENT = 12  # so many of its last measurements give a landmark's position and covariance
+_GAIN, _STEPS = 0.01, 10  # numerics: a landmark is refined until a step would lessen its sum of squares by less
+_DAMPING = 0.01  # numerics: the first that is tried where a plain step fails, as a share of the information
+_BEHIND = 1e4  # numerics: sum of squares of a measurement whose landmark lies behind the camera
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What was known of a landmark before it was measured.
-
-    Attributes:
-        position: in world coordinates, or in the camera's where `frame` is one (3,) [m].
-        covariance: its covariance (3, 3) [m²].
-        frame: frame of the camera in whose coordinates that is; None for the world's.
-        seen: whether it was measured from there: then it is its inverse depth that is Gaussian, nearly.
-    """
-
-    position: Array
-    covariance: Array
-    frame: int | None = None
-    seen: bool = True
-
-    def is_before(self, first: int) -> bool:
-        """Whether it is relative to the camera of a frame before `first`."""
-        return self.frame is not None and self.frame < first
-
-
 class Landmarks:
-    """The map: a slot for each landmark; slots are reused.
+    """The map, a row for each landmark.
 
     Attributes:
-        ids: landmark of each slot (S,), −1 for free ones.
-        serial: number of each landmark in the order of their coming (S,); an id may come back, a serial number not.
+        ids: (S,).
+        serial: number of each in the order of their coming (S,); an id may come back, a serial number not.
         position: in world coordinates (S, 3) [m].
-        covariance: of the position where all poses are known (S, 3, 3) [m²].
-        information: of each of its last measurements on the position (S, RECENT, 3, 3) [1/m²], see `uncertainty`.
-        older: of all earlier ones together (S, 3, 3).
-        mean, prior: position (S, 3) and information (S, 3, 3) in world coordinates known beforehand; zero for none.
-        recent: rows of its last measurements (S, RECENT), −1 where there are fewer; a ring.
-        seen: number of measurements (S,).
-        last: frame of the last one (S,).
-        variable: the landmark's own variable (S,), −1 while it has none.
-        tracks: by slot.
+        own: its covariance where all poses are known (S, 3, 3) [m²], in world axes.
+        mean, information: what was known of it besides its measurements, in world coordinates: position (S, 3) and
+            information (S, 3, 3), zero for nothing.
+        world: whether that does not depend on any pose (S,).
+        z, pose: its last measurements (S, RECENT, 3), and the numbers of their poses (S, RECENT), −1 for none.
     """
 
-    def __init__(self) -> None:
-        self.ids = np.full(256, -1, np.int64)
-        self.serial = np.zeros(256, np.int64)
-        self.position = np.zeros((256, 3))
-        self.covariance = np.zeros((256, 3, 3))
-        self.information = np.zeros((256, RECENT, 3, 3))
-        self.older = np.zeros((256, 3, 3))
-        self.mean = np.zeros((256, 3))
-        self.prior = np.zeros((256, 3, 3))
-        self.recent = np.full((256, RECENT), -1, np.int64)
-        self.seen = np.zeros(256, np.int64)
-        self.last = np.zeros(256, np.int64)
-        self.variable = np.full(256, -1, np.int64)
-        self.tracks: dict[int, Track] = {}
-        self._by_id = np.zeros(0, np.intp)  # slots of all landmarks, by ascending id
-        self._added = 0
-        self._free: list[int] = list(range(255, -1, -1))
+    ids: IdArray
+    serial: IdArray
+    position: Array
+    own: Array
+    mean: Array
+    information: Array
+    world: BoolArray
+    z: Array
+    pose: IndexArray
 
     def __len__(self) -> int:
-        return len(self._by_id)
+        return len(self.ids)
 
-    def among(self, ids: IdArray) -> BoolArray:
-        """Which of the ids (M,) are in the map."""
-        return isin(ids, self.ids[self._by_id])
+    @classmethod
+    def of(cls, ids: IdArray, first: int, position: Array, own: Array, information: Array, world: bool) -> Landmarks:
+        """Landmarks that are known, but not measured yet; `first` is the first one's serial number."""
+        n = len(ids)
+        return cls(
+            ids, first + np.arange(n), position, own, position, information, np.full(n, world),
+            np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1),
+        )  # fmt: skip
 
-    def slots(self, ids: IdArray) -> IndexArray:
-        """Slots (M,) of landmarks; raises MeasurementError where one is not in the map."""
+    @classmethod
+    def none(cls) -> Landmarks:
+        """No landmark."""
+        nine = np.zeros((0, 3, 3))
+        return cls.of(np.zeros(0, np.int64), 0, np.zeros((0, 3)), nine, nine, False)
+
+    def joined(self, other: Landmarks) -> Landmarks:
+        """These and others."""
+        names = self.__dataclass_fields__
+        return Landmarks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
+    def select(self, keep: np.ndarray) -> Landmarks:
+        """Some of the rows (a mask or indices)."""
+        return Landmarks(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    @cached_property
+    def order(self) -> IndexArray:
+        """Rows by ascending id."""
+        return np.argsort(self.ids, kind="stable")
+
+    def rows_of(self, ids: IdArray) -> IndexArray:
+        """Rows of landmarks.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
         ids = np.asarray(ids, np.int64)
-        known = self.ids[self._by_id]
-        place = np.searchsorted(known, ids)
-        if not ((place < len(known)).all() and (known[place] == ids).all()):
-            raise MeasurementError(f"smoother: landmark {ids[~self.among(ids)][0]} is not in the map")
-        return self._by_id[place]
+        known = self.ids[self.order]
+        at = np.searchsorted(known, ids).clip(0, max(len(known) - 1, 0))
+        bad = known[at] != ids if len(known) else np.ones(len(ids), bool)
+        if bad.any():
+            raise MeasurementError(f"smoother: landmark {ids[bad][0]} is not in the map")
+        return self.order[at]
 
-    def all_slots(self) -> IndexArray:
-        """Slots of all landmarks, by ascending id."""
-        return self._by_id.copy()
+    def require_new(self, ids: IdArray) -> None:
+        """Raise MeasurementError if one of the ids is in the map."""
+        taken = np.isin(ids, self.ids)
+        if taken.any():
+            raise MeasurementError(f"smoother: landmark {ids[taken][0]} is in the map already")
 
-    def used(self) -> IndexArray:
-        """Slots of all landmarks, ascending."""
-        return np.flatnonzero(self.ids >= 0)
+    def measured(self, rows: IndexArray, z: Array, pose: int) -> Landmarks:
+        """With one more measurement (M, 3) of some landmarks, from the pose of a number."""
+        zs, poses = self.z.copy(), self.pose.copy()
+        oldest = poses[rows].argmin(axis=1)
+        zs[rows, oldest], poses[rows, oldest] = z, pose
+        return replace(self, z=zs, pose=poses)
 
-    def add(self, ids: IdArray, position: Array, frame: int, limits: Sequence[int]) -> IndexArray:
-        """Take in landmarks that have not been measured yet; returns their slots."""
-        if len(self._free) < len(ids):
-            self._grow(len(ids))
-        slots = np.array([self._free.pop() for _ in ids], np.intp)
-        self.ids[slots], self.position[slots], self.last[slots] = ids, position, frame
-        self.serial[slots] = np.arange(self._added, self._added + len(slots))
-        self._added += len(slots)
-        self.recent[slots], self.seen[slots], self.variable[slots] = -1, 0, -1
-        self.information[slots], self.older[slots], self.prior[slots] = 0, 0, 0
-        for slot, limit in zip(slots.tolist(), limits):
-            self.tracks[slot] = Track(limit)
-        self._sort()
-        return slots
+    def without_measurements(self) -> Landmarks:
+        """As they stand, with what is known of them now in place of their measurements."""
+        information = np.where(self.world[:, None, None], self.information, inverses(self.own))
+        mean = np.where(self.world[:, None], self.mean, self.position)
+        return replace(
+            self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
+        )
 
-    def measured(self, slots: IndexArray, rows: IndexArray, frame: int) -> None:
-        """Note one more measurement of each landmark."""
-        place = self.seen[slots] % RECENT
-        self.older[slots] += self.information[slots, place]
-        self.information[slots, place] = 0
-        self.recent[slots, place] = rows
-        self.seen[slots] += 1
-        self.last[slots] = frame
+    def refined(self, stereo: RectifiedStereo, sigma: float, first: int, poses: Array) -> Landmarks:
+        """Where their measurements put them, given the poses (K, 4, 4) from number `first` on.
 
-    def put_in_factors(self, factors: Mapping[int, int]) -> None:
-        """Note the smart factors that hold some landmarks' tracks, both by slot."""
-        for slot, factor in factors.items():
-            self.tracks[slot] = self.tracks[slot].in_factor(factor)
+        Each landmark by Levenberg-Marquardt for itself: a plain step from a distant start may end behind the camera.
+        """
+        rows = np.where(self.pose >= first, np.arange(self.pose.size).reshape(self.pose.shape), -1)
+        todo = np.flatnonzero((rows >= 0).any(axis=1))
+        if not len(todo):
+            return self
+        frames, z = (self.pose - first).ravel(), self.z.reshape(-1, 3)
 
-    def remove(self, slots: IndexArray) -> None:
-        """Take landmarks out of the map."""
-        for slot in slots.tolist():
-            del self.tracks[slot]
-            self._free.append(slot)
-        self.ids[slots] = self.variable[slots] = -1
-        self._sort()
+        def at(x: Array, m: IndexArray) -> tuple[Array, Array, Array]:
+            information, gradient, squares, behind = information_of(
+                stereo.intrinsics, stereo.R_left, poses, frames, z, x, rows[m], sigma
+            )
+            off = self.mean[m] - x
+            pull = (self.information[m] @ off[:, :, None])[:, :, 0]
+            cost = squares + _BEHIND * behind + (off * pull).sum(axis=1)
+            return information.sum(axis=1), gradient + pull, cost
 
-    def _sort(self) -> None:
-        """Order the slots by id."""
-        slots = self.used()
-        self._by_id = slots[np.argsort(self.ids[slots])]
+        x, own = self.position.copy(), self.own.copy()
+        seen, all_rows = todo, np.zeros((len(self), 3, 3))
+        damping, gradient, cost = np.zeros(len(self)), np.zeros((len(self), 3)), np.zeros(len(self))
+        all_rows[todo], gradient[todo], cost[todo] = at(x[todo], todo)
+        for _ in range(_STEPS):
+            H = _regular(all_rows[todo] + self.information[todo])
+            np.einsum("mii->mi", H)[:] *= 1 + damping[todo, None]
+            step = np.linalg.solve(H, gradient[todo][:, :, None])[:, :, 0]
+            far = (gradient[todo] * step).sum(axis=1) > _GAIN
+            todo, step = todo[far], step[far]
+            if not len(todo):
+                break
+            tried = x[todo] + step
+            found = at(tried, todo)
+            better = found[2] < cost[todo]
+            done = todo[better]
+            x[done], all_rows[done], gradient[done], cost[done] = tried[better], *(part[better] for part in found)
+            damping[todo] = np.where(better, 0.1 * damping[todo], np.maximum(10 * damping[todo], _DAMPING))
+        own[seen] = inverses(all_rows[seen] + self.information[seen])
+        return replace(self, position=x, own=own)
 
-    def _grow(self, needed: int) -> None:
-        """Room for at least `needed` more landmarks."""
-        old = len(self.ids)
-        for name in (
-            "ids", "serial", "position", "covariance", "information", "older", "mean", "prior",
-            "recent", "seen", "last", "variable",
-        ):  # fmt: skip
-            setattr(self, name, grown(getattr(self, name), old + needed))
-        self.ids[old:] = self.variable[old:] = -1
-        self._free = list(range(len(self.ids) - 1, old - 1, -1)) + self._free
+    def covariances(
+        self, stereo: RectifiedStereo, sigma: float, chosen: IndexArray, first: int, poses: Array, joint: Array
+    ) -> Array:
+        """Covariances (M, 3, 3) in the world of some landmarks, given the joint one of poses.
+
+        With the information ``I_j = E_jᵀE_j`` of each measurement on the landmark, and G_j as how a point moves that is
+        fixed to pose j, ``∂l/∂x_j = (ΣI)⁻¹ I_j G_j``: each pose carries the landmark along by its share of the
+        information. Measurements from earlier poses count for the first one.
+
+        Args:
+            stereo: the rectified rig.
+            sigma: noise of its pixels [px].
+            chosen: rows of the landmarks (M,).
+            first: number of the first of the poses.
+            poses: (K, 4, 4).
+            joint: their covariance (6 K, 6 K).
+        """
+        frames, z = (self.pose - first).clip(0).ravel(), self.z.reshape(-1, 3)
+        rows = np.where(self.pose >= 0, np.arange(self.pose.size).reshape(self.pose.shape), -1)[chosen]
+        x, own = self.position[chosen], self.own[chosen]
+        information, *_ = information_of(stereo.intrinsics, stereo.R_left, poses, frames, z, x, rows, sigma)
+        older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
+        J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
+        n, width = len(chosen), len(joint)
+        C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
+
+
+def _regular(H: Array) -> Array:
+    """Information matrices (M, 3, 3) with a little added to keep the inverse finite: far points leave depth free."""
+    H = H.copy()
+    diagonal = np.einsum("mii->mi", H)
+    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-12
+    return H
+
+
+def inverses(H: Array) -> Array:
+    """Inverses (M, 3, 3) of information matrices or covariances, symmetric to the last digit."""
+    P = np.linalg.inv(_regular(H))
+    return 0.5 * (P + np.swapaxes(P, 1, 2))

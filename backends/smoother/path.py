@@ -1,88 +1,74 @@
-"""The camera's path as the smoother has it: the poses of all frames, and the newest one before it is measured."""
+"""The path: every frame hangs at a pose of the graph, or is one."""
 
 from __future__ import annotations
 
-from copy import copy
-
 import numpy as np
 
-from backends.smoother.motion import bounded
-from backends.smoother.pose_set import PredictedPose
-from slam.data import IndexArray
-from slam.geometry.se3 import Array
-
-
-def grown(array: np.ndarray, rows: int) -> np.ndarray:
-    """`array` with room for at least `rows` rows: itself, or a copy of twice the size."""
-    if rows <= len(array):
-        return array
-    larger = np.zeros((max(rows, 2 * len(array)), *array.shape[1:]), array.dtype)
-    larger[: len(array)] = array
-    return larger
+from backends.smoother.graph import Graph
+from backends.smoother.state import State
+from slam.data import RecentPoses
+from slam.geometry.se3 import Array, adjoint, inverse
+from slam.geometry.trajectory import Trajectory
 
 
 class Path:
-    """Stamps and poses ``T_world_left`` of all frames.
-
-    Attributes:
-        count: number of frames.
-        measured: those in which landmarks were measured, ascending.
-        jumps: those whose poses do not follow from the ones before; the camera goes on from there at an unknown speed.
-        rests: those in which the camera has not moved since the frame before.
-        predicted: the newest pose while it is only predicted: it is not among the frames yet. None otherwise.
-    """
+    """All frames, and all poses of the graph, also those that the state keeps no more."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.measured: list[int] = []
-        self.jumps: list[int] = []
-        self.rests: set[int] = set()
-        self.predicted: PredictedPose | None = None
-        self._stamps = np.zeros(64)
-        self._poses = np.zeros((64, 4, 4))
+        self._stamps: list[float] = []
+        self._number: list[int] = []  # of the pose of the graph at which each frame hangs
+        self._relative: list[Array] = []  # its pose relative to that (4, 4)
+        self._own: list[Array] = []  # covariance of that (6, 6)
+        self._poses: list[Array] = []  # of the graph, by number
 
-    @property
-    def stamps(self) -> Array:
-        """Times (F,) [s]; a view."""
-        return self._stamps[: self.count]
+    def extend(self, s: State) -> None:
+        """Take in a new frame. An earlier try at the same frame is overwritten."""
+        f = s.frame
+        self._stamps[f:], self._number[f:], self._relative[f:], self._own[f:] = (
+            [float(s.stamps[1])],
+            [0],
+            [np.eye(4)],
+            [s.own],
+        )
+        self.follow(s)
 
-    @property
-    def poses(self) -> Array:
-        """Poses (F, 4, 4); a view that may be written to."""
-        return self._poses[: self.count]
+    def follow(self, s: State) -> None:
+        """Take in what has become of the last two frames and of the graph."""
+        self._poses[s.first :] = list(s.poses)
+        f = s.frame
+        self._number[f], self._relative[f], self._own[f] = s.number, inverse(s.poses[-1]) @ s.last[1], s.own
+        if s.since and not s.inside and self._number[f - 1] == s.number:
+            self._relative[f - 1], self._own[f - 1] = inverse(s.poses[-1]) @ s.last[0], s.pair[:6, :6]
 
-    def interval(self, i: int) -> float:
-        """The time from the frame before frame `i` to that frame [s], as far as the motion model counts it."""
-        return bounded(float(self._stamps[i] - self._stamps[i - 1]))
+    def move(self, s: State, D: Array) -> None:
+        """Take in a state whose oldest poses were moved by D (4, 4) in the world, and all before them as well."""
+        self._poses[: s.first] = [D @ T for T in self._poses[: s.first]]
+        self.follow(s)
 
-    def newest(self, most: int, first: int = 0) -> IndexArray:
-        """The two newest frames and before them those with measurements, from `first` on, at most so many together.
+    def graph(self, first: int) -> Array:
+        """Poses of the graph before the one with number `first` (N, 4, 4)."""
+        return np.array(self._poses[:first]).reshape(-1, 4, 4)
 
-        A landmark's position depends on the poses that measured it alone, so that the other poses are not needed.
-        """
-        older = [i for i in self.measured[-most:] if first <= i < self.count - 2]
-        recent = range(max(first, self.count - 2), self.count)
-        return np.array([*older[max(0, len(older) + len(recent) - most) :], *recent], np.intp)
+    def trajectory(self, s: State, graph: Array | None = None) -> Trajectory:
+        """Poses of all frames; with other poses (N, 4, 4) for those of the graph, if they are given."""
+        if not self._stamps:
+            return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        poses = (np.array(self._poses) if graph is None else graph)[self._number] @ np.array(self._relative)
+        if graph is None:
+            poses[-1] = s.last[1]
+        return Trajectory(np.array(self._stamps), poses)
 
-    def note_measured(self) -> None:
-        """Note that landmarks were measured in the newest frame."""
-        if not self.measured or self.measured[-1] < self.count - 1:
-            self.measured.append(self.count - 1)
-
-    def jumped(self, frame: int) -> bool:
-        """Whether the pose of a frame does not follow from those before it."""
-        return frame in self.jumps
-
-    def upto(self, count: int) -> Path:
-        """The first `count` frames; they share their memory with this."""
-        out = copy(self)
-        out.count = count
-        return out
-
-    def append(self, stamp: float, T_world_left: Array) -> None:
-        """Add a frame; if its pose was predicted, this takes the prediction's place."""
-        self._stamps = grown(self._stamps, self.count + 1)
-        self._poses = grown(self._poses, self.count + 1)
-        self._stamps[self.count], self._poses[self.count] = stamp, T_world_left
-        self.count += 1
-        self.predicted = None
+    def recent(self, s: State, graph: Graph, count: int) -> RecentPoses:
+        """The last frames, at most so many, that hang at poses of the graph that are still smoothed."""
+        first, joint = graph.joint_covariance(s, self._number[max(0, s.frame + 1 - count)])
+        frames = [f for f in range(max(0, s.frame + 1 - count), s.frame + 1) if self._number[f] >= first]
+        J, own = np.zeros((6 * len(frames), len(joint))), np.zeros((6 * len(frames), 6 * len(frames)))
+        for i, f in enumerate(frames):
+            rows, k = slice(6 * i, 6 * i + 6), self._number[f] - first
+            J[rows, 6 * k : 6 * k + 6] = adjoint(inverse(self._relative[f]))
+            own[rows, rows] = self._own[f]
+        if len(frames) > 1 and self._number[frames[-2]] == s.number:
+            own[-12:, -12:] = s.pair
+        P = J @ joint @ J.T + own
+        poses = self.trajectory(s).poses[frames]
+        return RecentPoses(np.array(self._stamps)[frames], poses, 0.5 * (P + P.T))

@@ -1,0 +1,295 @@
+"""The factor graph in gtsam's fixed-lag smoother: poses, and smart factors that grow with every measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import SupportsFloat, SupportsIndex, SupportsInt
+
+import gtsam
+import numpy as np
+
+from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
+from backends.smoother.state import State
+from slam.errors import SlamError
+from slam.geometry.se3 import Array, transform
+
+#: What gtsam throws when it cannot solve.
+FAILURES = (RuntimeError, ValueError, LookupError)
+
+_ENDLESS = 1e9  # numerics: a lag that no run reaches
+
+
+class SolverError(SlamError):
+    """The solver failed; the message is gtsam's, in one line."""
+
+
+@dataclass
+class Track:
+    """A landmark's smart factor.
+
+    Attributes:
+        poses: numbers of the poses that measured it.
+        points: the measurements.
+        slot: of the factor in the solver, −1 while there is none.
+    """
+
+    poses: list[int] = field(default_factory=list)
+    points: list[gtsam.StereoPoint2] = field(default_factory=list)
+    slot: int = -1
+
+    @property
+    def informative(self) -> bool:
+        """Whether a factor can be made: gtsam's throws where it is given left pixels only."""
+        return len(self.poses) > 1 and any(point.uR() == point.uR() for point in self.points)
+
+
+@dataclass
+class Problem:
+    """Factors and first values, and what grew.
+
+    Attributes:
+        factors, values: for gtsam.
+        removed: slots of factors that others replace.
+        grown: landmarks with new measurements.
+        stamps: times of variables for the fixed lag: numbers of poses.
+    """
+
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    removed: list[int] = field(default_factory=list)
+    grown: dict[int, Track] = field(default_factory=dict)
+    stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The last poses as the graph has them.
+
+    Attributes:
+        first: number of the first one.
+        poses: (L, 4, 4).
+        covariance: joint covariance (12, 12) of the last two poses; (6, 6) of a single one.
+    """
+
+    first: int
+    poses: Array
+    covariance: Array
+
+
+class Tracks:
+    """Landmarks as factors: which measurement goes into which. Each is used once.
+
+    A landmark is a smart factor that grows; when it has `most` measurements, or when its first pose is about to leave,
+    the factor stays as it is and the landmark goes on in a new one. A landmark of which more is known than what was
+    measured is a variable of its own.
+    """
+
+    def __init__(self, make: FactorMaker, most: int, lag: int | None) -> None:
+        self._make, self._most, self._lag = make, most, lag
+        self._smart: dict[int, Track] = {}
+        self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
+
+    def add_pose(self, problem: Problem, s: State, number: int, first: int) -> None:
+        """A pose, and its tie to the one before it; the first one has a prior."""
+        row = s.of(number)
+        tie = s.ties[row]
+        if tie is None or number == first:
+            problem.factors.add(self._make.prior(number, s.poses[row], s.spread[row]))
+        else:
+            problem.factors.add(self._make.tie(number - 1, number, tie.relative, tie.covariance))
+        problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
+        problem.stamps[pose_key(number)] = float(number)
+
+    def add_rows(self, problem: Problem, s: State, number: int, first: int, begin: int = 0) -> None:
+        """What was measured from a pose, from some row on."""
+        sight, make = s.sights[s.of(number)], self._make
+        for serial, z in zip(sight.serials[begin:].tolist(), sight.z[begin:].tolist()):
+            point = make.point(z)
+            if self._is_variable(problem, s, serial, number, first):
+                self._variables[serial] = number
+                problem.stamps[landmark_key(serial)] = float(number)
+                problem.factors.add(make.explicit(point, number, serial))
+                continue
+            track = self._smart.get(serial)
+            if track is None or len(track.poses) >= self._most or self._leaves(track.poses[0], number):
+                self._smart[serial] = track = Track()
+            track.poses.append(number)
+            track.points.append(point)
+            problem.grown[serial] = track
+
+    def _leaves(self, pose: int, number: int) -> bool:
+        """Whether a pose leaves with the next one after `number`."""
+        return self._lag is not None and pose <= number - self._lag
+
+    def _is_variable(self, problem: Problem, s: State, serial: int, number: int, first: int) -> bool:
+        """Whether a landmark is a variable; it becomes one if it is known, and that is not used up yet."""
+        if serial in self._variables:
+            return self._lag is None or self._variables[serial] >= number - 1 - self._lag
+        known = s.known.get(serial)
+        if known is None or 0 <= known.pose < first:
+            return False
+        self.add_known(problem, s, serial)
+        return True
+
+    def add_known(self, problem: Problem, s: State, serial: int) -> None:
+        """A landmark of which something is known, as a variable."""
+        known = s.known[serial]
+        if known.pose < 0:
+            problem.factors.add(self._make.known(serial, known.position, known.covariance))
+            place = known.position
+        else:
+            problem.factors.add(self._make.known_from(known.pose, serial, known.position, known.covariance))
+            place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
+        problem.values.insert(landmark_key(serial), place)
+
+    def make_smart(self, problem: Problem) -> list[tuple[Track, int]]:
+        """The smart factors of what grew, and their places in the problem."""
+        made = []
+        for track in problem.grown.values():
+            if track.informative:
+                if track.slot >= 0:
+                    problem.removed.append(track.slot)
+                made.append((track, problem.factors.size()))
+                problem.factors.add(self._make.smart(track.points, track.poses))
+        return made
+
+    def forget(self, number: int) -> None:
+        """Forget tracks that will not go on at the pose of a number."""
+        if self._lag is not None:
+            self._smart = {
+                serial: track for serial, track in self._smart.items() if not self._leaves(track.poses[0], number)
+            }
+
+
+class Graph:
+    """gtsam's incremental fixed-lag smoother, and what is in it.
+
+    It follows a `State`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam fails,
+    it is built anew from what the state keeps.
+
+    Args:
+        make: makes the factors.
+        track: most measurements in a smart factor.
+        lag: number of poses that are smoothed; None for all.
+
+    Attributes:
+        rebuilds: how often it was built anew after a failure.
+    """
+
+    def __init__(self, make: FactorMaker, track: int, lag: int | None) -> None:
+        self.rebuilds = 0
+        self._make, self._track, self._lag = make, track, lag
+        self.restart()
+
+    def restart(self) -> None:
+        """Leave what is in it: the next state is put in whole."""
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1
+        parameters.setRelinearizeThreshold(0.01)
+        parameters.findUnusedFactorSlots = True
+        self._solver = gtsam.IncrementalFixedLagSmoother(
+            _ENDLESS if self._lag is None else float(self._lag), parameters
+        )
+        self._tracks = Tracks(self._make, self._track, self._lag)
+        self._number, self._taken = -1, 0
+
+    def followed(self, s: State) -> tuple[Solved, str]:
+        """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
+
+        Raises:
+            SolverError: gtsam fails with the new graph as well.
+        """
+        why = ""
+        if self._number == s.number - 1 >= s.begun:
+            number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
+            try:
+                return self._stepped(s, number), ""
+            except FAILURES as error:
+                why, self.rebuilds = _line(error), self.rebuilds + 1
+        return self.rebuilt(s), why
+
+    def rebuilt(self, s: State) -> Solved:
+        """The solution with all anew, from what the state keeps.
+
+        Raises:
+            SolverError: gtsam fails.
+        """
+        self.restart()
+        oldest = self.oldest(s)
+        try:
+            solved = self._update(s, range(oldest, s.number + 1), oldest)
+        except FAILURES as error:
+            raise SolverError(_line(error)) from error
+        return solved
+
+    def oldest(self, s: State) -> int:
+        """Number of the oldest pose in the graph."""
+        least = max(s.begun, s.first)
+        return least if self._lag is None else max(least, s.number - self._lag)
+
+    def _stepped(self, s: State, number: int) -> Solved:
+        return self._update(s, range(number + 1, s.number + 1), self.oldest(s))
+
+    def _update(self, s: State, numbers: Iterable[int], first: int) -> Solved:
+        problem = Problem()
+        for number in numbers:
+            if number > first:
+                self._tracks.add_rows(problem, s, number - 1, first, self._taken)
+            self._tracks.add_pose(problem, s, number, first)
+            self._tracks.add_rows(problem, s, number, first)
+            self._taken = len(s.sights[s.of(number)])
+        made = self._tracks.make_smart(problem)
+        self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
+        slots = self._solver.getISAM2Result().getNewFactorsIndices()
+        for track, place in made:
+            track.slot = slots[place]
+        self._tracks.forget(s.number)
+        values = self._solver.calculateEstimate()
+        poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
+        solved = Solved(first, poses, self._joint(list(range(max(first, s.number - 1), s.number + 1))))
+        if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
+            raise ValueError("the solution is not finite")
+        if (np.diag(solved.covariance) <= 0).any():
+            raise ValueError("a variance is not positive")
+        self._number = s.number
+        return solved
+
+    def joint_covariance(self, s: State, first: int | None = None) -> tuple[int, Array]:
+        """Number of the first pose, and the joint covariance (6 K, 6 K) of all poses from there on.
+
+        From `first` on, or the oldest in the graph; of the newest pose alone, if the graph is not the state's.
+        """
+        if self._number != s.number:
+            return s.number, s.spread[-1]
+        first = max(self.oldest(s), self.oldest(s) if first is None else first)
+        return first, self._joint(list(range(first, s.number + 1)))
+
+    def _joint(self, numbers: list[int]) -> Array:
+        isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
+        P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
+        return np.asarray(0.5 * (P + P.T))
+
+
+def minimised(problem: Problem, iterations: int) -> gtsam.Values:
+    """The values that fit all factors best, by Levenberg-Marquardt.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    try:
+        before = problem.factors.error(problem.values)
+        values = gtsam.LevenbergMarquardtOptimizer(problem.factors, problem.values, parameters).optimize()
+        after = problem.factors.error(values)
+    except FAILURES as error:
+        raise SolverError(_line(error)) from error
+    if not np.isfinite(after) or after > before:
+        raise SolverError(f"Levenberg-Marquardt found no solution (error {before:.6g} to {after:.6g})")
+    return values
+
+
+def _line(error: BaseException) -> str:
+    """What gtsam says, in one line."""
+    return f"gtsam: {' '.join(str(error).split())[:200] or type(error).__name__}"

@@ -1,0 +1,95 @@
+"""Measurements that are mended: the last poses, or all that are kept, are solved for again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from backends.smoother.factors import FactorMaker, pose_key
+from backends.smoother.graph import Graph, Problem, SolverError, Tracks, minimised
+from backends.smoother.state import State
+from backends.smoother.steps import Steps
+from slam.errors import MeasurementError
+from slam.geometry.se3 import Array, inverse, transform
+
+_ITERATIONS = 20  # numerics: of Levenberg-Marquardt at most
+
+
+def corrected(s: State, correct: Callable[[Array], Array]) -> State:
+    """With corrected measurements.
+
+    Raises:
+        MeasurementError: a corrected measurement is not finite.
+    """
+    marks, shape = s.landmarks, s.landmarks.z.shape
+    counts = np.cumsum([0, *map(len, s.sights)])
+    rows = np.concatenate([*(sight.z for sight in s.sights), marks.z.reshape(-1, 3)[marks.pose.ravel() >= 0]])
+    out = np.asarray(correct(rows.copy()), float)
+    if out.shape != rows.shape or not (np.isfinite(out) == np.isfinite(rows)).all():
+        raise MeasurementError("smoother: a corrected measurement is not finite")
+    sights = tuple(replace(sight, z=out[a:b]) for sight, a, b in zip(s.sights, counts, counts[1:]))
+    z = marks.z.reshape(-1, 3).copy()
+    z[marks.pose.ravel() >= 0] = out[counts[-1] :]
+    return replace(s, sights=sights, landmarks=replace(marks, z=z.reshape(shape)))
+
+
+def rebuilt(s: State, steps: Steps, graph: Graph, make: FactorMaker) -> State:
+    """The last poses after a correction: the newest one stays where it is, the others and the landmarks move."""
+    first = graph.oldest(s)
+    try:
+        now = optimised(s, make, steps.config.track, first)
+    except SolverError:
+        now = s.poses[s.of(first) :]
+    if not _anchored(s):
+        now = s.poses[-1] @ inverse(now[-1]) @ now
+    D = now[0] @ inverse(s.poses[s.of(first)])
+    moved = np.concatenate([D @ s.poses[: s.of(first)], now])
+    marks = s.landmarks
+    away = ~marks.world & ~(marks.pose >= first).any(axis=1)
+    position = np.where(away[:, None], transform(D, marks.position), marks.position)
+    marks = replace(marks, position=position, mean=np.where(away[:, None], position, marks.mean))
+    last = s.last.copy()
+    last[1] = moved[-1] @ inverse(s.poses[-1]) @ s.last[1]
+    before = s.poses[-1] if s.inside is False or len(moved) < 2 else s.poses[-2]
+    after = moved[-1] if s.inside is False or len(moved) < 2 else moved[-2]
+    last[0] = after @ inverse(before) @ s.last[0]
+    s = replace(s, poses=moved, last=last, landmarks=marks.refined(steps.stereo, steps.sigma, s.first, moved))
+    graph.restart()
+    return s
+
+
+def path_solved(s: State, make: FactorMaker, before: Array) -> Array:
+    """All poses of the graph, those that are kept solved for together; as they are where that fails.
+
+    The newest pose stays where it is, and the path moves, but where landmarks are known in the world.
+    """
+    first = max(s.begun, s.first)
+    try:
+        kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, len(s.poses), first)])
+    except SolverError:
+        kept = s.poses
+    M = np.eye(4) if _anchored(s) else s.poses[-1] @ inverse(kept[-1])
+    return M @ np.concatenate([before, kept])
+
+
+def optimised(s: State, make: FactorMaker, track: int, first: int) -> Array:
+    """Poses from number `first` on that fit their measurements best; the first has a prior.
+
+    Raises:
+        SolverError: gtsam failed, or found nothing better.
+    """
+    problem, tracks = Problem(), Tracks(make, track, None)
+    numbers = range(first, s.number + 1)
+    for number in numbers:
+        tracks.add_pose(problem, s, number, first)
+        tracks.add_rows(problem, s, number, first)
+    tracks.make_smart(problem)
+    values = minimised(problem, _ITERATIONS)
+    return np.array([values.atPose3(pose_key(i)).matrix() for i in numbers])
+
+
+def _anchored(s: State) -> bool:
+    """Whether landmarks are known in the world: then the path may not be moved in it."""
+    return any(known.pose < 0 for known in s.known.values())

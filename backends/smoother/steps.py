@@ -1,0 +1,309 @@
+"""The steps of the smoother: functions from a state to the next. Only `solved` and what calls it needs gtsam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from backends.smoother.config import SmootherConfig
+from backends.smoother.graph import Graph, Solved, SolverError
+from backends.smoother.landmarks import Landmarks, inverses
+from backends.smoother.state import Known, Sight, State, Tie, relative_covariance
+from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
+from slam.errors import MeasurementError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array, exp, inverse, log, points_by_pose, transform
+from slam.models import EstimatorModels
+from slam.window import motion, pose_only
+from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
+from slam.window.gating import squared_distances, with_noise
+from slam.window.recovery import Agreement, agreement, unknown_turn, world_covariance
+from slam.window.stereo import RectifiedStereo
+
+_STANDS = 1e-5  # numerics: step [rad], [m] of a camera that stands; none at all would leave no information matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the steps need besides the state.
+
+    Attributes:
+        rig: the cameras.
+        models: noise, priors, motion and gate.
+        config: limits.
+    """
+
+    rig: StereoRig
+    models: EstimatorModels
+    config: SmootherConfig
+
+    @cached_property
+    def stereo(self) -> RectifiedStereo:
+        """The rectified rig that measures."""
+        return RectifiedStereo.of(self.rig)
+
+    @cached_property
+    def sigma(self) -> float:
+        """Noise of rectified pixels [px]."""
+        return self.models.pixel_sigma * self.stereo.scale
+
+    @property
+    def past(self) -> int | None:
+        """Number of poses that are kept; None for all."""
+        return None if self.config.lag is None else self.config.lag + 1 + self.config.past
+
+    # --- prediction ---
+
+    def predicted(self, s: State, stamp: float, rests: bool = False) -> State:
+        """With the newest frame at `stamp` [s], by the motion model. The very first one is a pose of the graph."""
+        if not s.started:
+            T = self.models.initial_pose
+            sigmas = np.repeat([self.models.initial_rotation_sigma, self.models.initial_position_sigma], 3)
+            s = replace(s, stamps=np.array([np.nan, stamp]), last=np.stack([T, T]), frame=0)
+            return _begun(s, T, np.diag(sigmas**2), Sight.none())
+        dt = min(stamp - s.stamps[1], motion.LONGEST)
+        before = None if s.since == 0 else min(s.stamps[1] - s.stamps[0], motion.LONGEST)
+        first, J, T = motion.is_first(before, dt), np.zeros((6, 12)), s.last[1]
+        if rests:
+            J[:, 6:], noise = np.eye(6), _STANDS**2 * np.eye(6)
+        else:
+            if before is None or first:
+                T, J[:, 6:], Jw = motion.predict_from_rest(T, dt)
+            else:
+                T, J[:, :6], J[:, 6:], Jw = motion.predict(s.last[0], s.last[1], before, dt)
+            noise = (Jw * motion.velocity_sigmas(self.models, dt, first) ** 2) @ Jw.T
+        cross = J @ s.pair[:, 6:]
+        own = _carried(J, s.pair) + noise
+        pair = np.block([[s.own, cross.T], [cross, 0.5 * (own + own.T)]])
+        return replace(
+            s, stamps=np.array([s.stamps[1], stamp]), last=np.stack([s.last[1], T]), pair=pair, frame=s.frame + 1,
+            since=s.since + 1, inside=False, measured=False,
+        )  # fmt: skip
+
+    def in_view(self, s: State) -> tuple[IndexArray, Array, Array, Array]:
+        """Landmarks in the angle of view (paper A, Fig. 3), their pixels, and innovation covariances (M, 2, 2)."""
+        T, marks, rig = s.last[1], s.landmarks, self.rig
+        rows = marks.order
+        rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
+        local, own = pose_only.seen_from(T, marks.position[rows], marks.own[rows])
+        by_pose = points_by_pose(local)
+        by_motion = np.where(marks.world[rows, None, None], s.covariance, s.own)
+        C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
+        uv, J = rig.left.project_with_jacobian(local)
+        S = with_noise(J @ C @ np.swapaxes(J, 1, 2), self.models.pixel_sigma)
+        return rows, uv, rig.right.project((local + rig.b) @ rig.R.T), S
+
+    # --- update ---
+
+    def updated(
+        self, s: State, graph: Graph, ids: IdArray, z: Array, guess: Array | None
+    ) -> tuple[State, UpdateReport]:
+        """After measurements z (M, 3) of landmarks."""
+        rows, s = s.landmarks.rows_of(ids), replace(s, measured=True)
+        if not len(rows):
+            return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no landmark was observed")
+        try:
+            one = self._problem(s, rows, z)
+            found = self._agreement(s, one, rows, z, guess)
+            s = replace(s, contradicted=found.contradicted)
+            if not found.used.any():
+                return s, UpdateReport.nothing(UpdateStatus.EMPTY, "no observation passed the gate", ids.copy())
+            after, nis, why = self._corrected(s, graph, one, found, rows, z)
+        except (np.linalg.LinAlgError, SolverError) as error:
+            return s, UpdateReport.nothing(UpdateStatus.FAILED, f"smoother: the pose cannot be solved for: {error}")
+        used = found.used
+        reason = f"smoother: built anew after {why}" if why else ""
+        return after, UpdateReport(UpdateStatus.OK, reason, ids[used], ids[~used], nis, int(np.isfinite(z[used]).sum()))
+
+    def _problem(self, s: State, rows: IndexArray, z: Array) -> pose_only.PoseProblem:
+        """The newest pose alone, with the motion model as its prior, and landmarks as they stand."""
+        T, marks = s.last[1], s.landmarks
+        local, own = pose_only.seen_from(T, marks.position[rows], marks.own[rows])
+        noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
+        P = s.covariance if s.inside or marks.world[rows].any() else s.own
+        probability = self.models.gate_probability
+        return pose_only.PoseProblem(self.stereo, marks.position[rows], z, noise, T, np.linalg.inv(P), probability)
+
+    def _agreement(
+        self, s: State, one: pose_only.PoseProblem, rows: IndexArray, z: Array, guess: Array | None
+    ) -> Agreement:
+        """Initial value of the newest pose, and which measurements agree with it."""
+
+        def search() -> Array | None:
+            rectified = self.stereo.rectified_rig
+            pixels = z + np.array([0.0, 0.0, self.stereo.doffs])
+            turned = one.predicted @ rectified.T_left_rectified
+            found = landmarks_pose(rectified.rig, one.points, pixels, self.models, turned, s.number)
+            return None if found is None else found @ inverse(rectified.T_left_rectified)
+
+        lost = len(s.sights[-1]) >= MIN_CONSENSUS and unknown_turn(s.spread[-1])
+        return agreement(one, one.predicted if guess is None else guess, search, s.contradicted, lost)
+
+    def _corrected(
+        self, s: State, graph: Graph, one: pose_only.PoseProblem, found: Agreement, rows: IndexArray, z: Array
+    ) -> tuple[State, float, str]:
+        """The state after an update, its NIS, and why the graph was built anew, if it was."""
+        used, marks = found.used, s.landmarks
+        sight = Sight(marks.serial[rows[used]], z[used])
+        if found.jump is not None:
+            after = _begun(s, found.T, world_covariance(s.covariance), sight)
+            after = replace(after, known={serial: one for serial, one in s.known.items() if one.pose < 0})
+            after = replace(after, landmarks=marks.without_measurements().measured(rows[used], z[used], after.number))
+            return self.settled(after, graph.rebuilt(after)), float("nan"), ""
+        residuals, J = pose_only.residuals(one, found.T)
+        information = _information(J[used], one.noise[used], z[used])
+        x = log(inverse(one.predicted) @ found.T)
+        nis = float(squared_distances(residuals[used], one.noise[used]).sum() + x @ one.information @ x)
+        if s.inside:
+            after = replace(
+                s, sights=(*s.sights[:-1], sight), poses=np.concatenate([s.poses[:-1], found.T[None]]),
+                last=np.stack([s.last[0], found.T]),
+                landmarks=marks.measured(rows[used], z[used], s.number),
+            )  # fmt: skip
+            return self.settled(after, graph.rebuilt(after)), nis, ""
+        if not self._is_chosen(s, found.T, sight, rows[used]):
+            return _hung(s, found.T, information), nis, ""
+        tie = Tie(inverse(s.poses[-1]) @ s.last[1], s.own)
+        after = _hung(s, found.T, information)
+        after = replace(
+            after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, tie),
+            spread=np.concatenate([s.spread, after.covariance[None]]), inside=True,
+        )  # fmt: skip
+        after = replace(after, landmarks=marks.measured(rows[used], z[used], after.number))
+        solved, why = graph.followed(after)
+        return self.settled(after, solved), nis, why
+
+    def _is_chosen(self, s: State, T: Array, sight: Sight, rows: IndexArray) -> bool:
+        """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
+        if self.config.motion == 0:
+            return True
+        again = np.isin(sight.serials, s.sights[-1].serials)
+        if again.mean() < self.config.overlap:
+            return True
+        points = s.landmarks.position[rows[again]]
+        here, there = (transform(inverse(pose), points) for pose in (T, s.poses[-1]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = np.linalg.norm(here[:, :2] / here[:, 2:] - there[:, :2] / there[:, 2:], axis=1)
+        return bool(np.nanmedian(moved) >= self.config.motion)
+
+    def settled(self, s: State, solved: Solved) -> State:
+        """The state with what the graph says: the newest frame is a pose of it."""
+        poses = np.concatenate([s.poses[: s.of(solved.first)], solved.poses])
+        P, pair, last = solved.covariance, np.zeros((12, 12)), s.last.copy()
+        if s.since:
+            newest_first = np.roll(s.pair, 6, (0, 1))
+            if len(P) == 12 and not s.pair[:6, :6].any():  # the frame before is a pose of the graph
+                newest_first, last[0] = np.roll(P, 6, (0, 1)), poses[-2]
+            else:
+                last[0] = poses[-1] @ inverse(s.last[1]) @ s.last[0]
+            pair[:6, :6] = relative_covariance(newest_first, poses[-1], last[0])
+        last[1] = poses[-1]
+        spread = np.concatenate([s.spread[:-1], P[None, -6:, -6:]])
+        marks = s.landmarks.refined(self.stereo, self.sigma, s.first, poses)
+        s = replace(s, poses=poses, last=last, pair=pair, spread=spread, landmarks=marks)
+        return s if self.past is None or len(s.poses) < 1.5 * self.past else s.without_old(self.past)
+
+    # --- landmarks ---
+
+    def added(self, s: State, ids: IdArray, z: Array) -> State:
+        """With new landmarks at their first sight z (M, 3) in the newest pose (paper A, Eqs. 8 and 10).
+
+        Raises:
+            MeasurementError: one is in the map already, or has no right pixel or no positive depth.
+        """
+        s.landmarks.require_new(ids)
+        local = self.stereo.triangulate(z)
+        bad = ~np.isfinite(local).all(axis=1)
+        if bad.any():
+            raise MeasurementError(f"smoother: landmark {ids[bad][0]} has no right pixel or no positive depth")
+        back = np.linalg.inv(self.stereo.project(local)[1])
+        marks = _seen_from_newest(s, ids, local, self.sigma**2 * back @ np.swapaxes(back, 1, 2))
+        if s.inside:
+            nothing = np.zeros_like(marks.information)
+            marks = replace(marks, information=nothing).measured(np.arange(len(ids)), z, s.number)
+            s = replace(s, sights=(*s.sights[:-1], s.sights[-1].with_more(marks.serial, z)))
+        return _with(s, marks)
+
+    def inserted(self, s: State, ids: IdArray, positions: Array, covariances: Array) -> State:
+        """With landmarks known in the world; see `slam.interfaces.MapBackend.insert`."""
+        marks = Landmarks.of(ids, s.serials, positions, covariances, inverses(covariances), True)
+        known = {serial: Known(x, P, -1) for serial, x, P in zip(marks.serial.tolist(), positions, covariances)}
+        return replace(_with(s, marks), known={**s.known, **known}, measured=s.measured)
+
+    def placed(self, s: State, ids: IdArray, local: Array, covariances: Array) -> State:
+        """With landmarks known in the newest camera's coordinates; see `slam.interfaces.MapBackend.place`."""
+        marks = _seen_from_newest(s, ids, local, covariances)
+        T, by_pose = inverse(s.poses[-1]) @ s.last[1], points_by_pose(local)
+        there = T[:3, :3] @ (covariances + by_pose @ s.own @ np.swapaxes(by_pose, 1, 2)) @ T[:3, :3].T
+        relative = zip(marks.serial.tolist(), transform(T, local), there)
+        return replace(
+            _with(s, marks), known={**s.known, **{serial: Known(x, P, s.number) for serial, x, P in relative}}
+        )
+
+    def removed(self, s: State, ids: IdArray) -> State:
+        """Without landmarks; what their measurements say of the poses stays.
+
+        Raises:
+            MeasurementError: one is not in the map.
+        """
+        keep = np.ones(len(s.landmarks), bool)
+        keep[s.landmarks.rows_of(ids)] = False
+        return replace(s, landmarks=s.landmarks.select(keep))
+
+    def landmark_covariances(self, s: State, graph: Graph, rows: IndexArray) -> Array:
+        """Covariances (M, 3, 3) of landmarks in the world."""
+        first, joint = graph.joint_covariance(s)
+        poses = s.poses[s.of(first) :]
+        return s.landmarks.covariances(self.stereo, self.sigma, rows, first, poses, joint)
+
+
+def _begun(s: State, T: Array, covariance: Array, sight: Sight) -> State:
+    """With the newest frame, at T (4, 4), as the pose of the graph with which the problem begins (anew)."""
+    number = s.number + 1 if s.started else 0
+    return replace(
+        s, begun=number, poses=np.concatenate([s.poses, T[None]]), sights=(*s.sights, sight), ties=(*s.ties, None),
+        spread=np.concatenate([s.spread, covariance[None]]), last=np.stack([s.last[0], T]), pair=np.zeros((12, 12)),
+        since=0, inside=True,
+    )  # fmt: skip
+
+
+def _hung(s: State, T: Array, information: Array) -> State:
+    """With the newest frame at T (4, 4), by measurements with an information (6, 6), but as no pose of the graph."""
+    own = np.linalg.inv(information + np.linalg.inv(s.own))
+    gain = s.pair[:6, 6:] @ np.linalg.inv(s.own)
+    P = s.pair.copy()
+    P[:6, :6] -= gain @ (s.own - own) @ gain.T
+    P[:6, 6:] = gain @ own
+    P[6:, :6], P[6:, 6:] = P[:6, 6:].T, own
+    before = s.last[0] @ exp(gain @ log(inverse(s.last[1]) @ T))
+    return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T))
+
+
+def _information(J: Array, noise: Array, z: Array) -> Array:
+    """What measurements say of the pose (6, 6)."""
+    information = np.zeros((6, 6))
+    for have, columns in ((np.isfinite(z[:, 2]), 3), (np.isnan(z[:, 2]), 2)):
+        A = J[have, :columns]
+        information += np.einsum("mia,mij,mjb->ab", A, np.linalg.inv(noise[have, :columns, :columns]), A)
+    return information
+
+
+def _with(s: State, marks: Landmarks) -> State:
+    return replace(s, landmarks=s.landmarks.joined(marks), serials=s.serials + len(marks), measured=True)
+
+
+def _seen_from_newest(s: State, ids: IdArray, local: Array, covariances: Array) -> Landmarks:
+    """New landmarks at `local` (M, 3) in the newest camera, with covariances (M, 3, 3) in its axes."""
+    T = s.last[1]
+    own = T[:3, :3] @ covariances @ T[:3, :3].T
+    own = 0.5 * (own + np.swapaxes(own, 1, 2))
+    return Landmarks.of(ids, s.serials, transform(T, local), own, inverses(own), False)
+
+
+def _carried(J: Array, P: Array) -> Array:
+    """``J P Jᵀ`` (n, n), positive semidefinite whatever the rounding: after long gaps large numbers cancel."""
+    values, vectors = np.linalg.eigh(P)
+    A = J @ (vectors * np.sqrt(values.clip(min=0)))
+    return np.asarray(A @ A.T)
