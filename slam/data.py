@@ -452,23 +452,3 @@ class FrameResult:
         change = f"{len(self.added)} added, {len(self.erased)} erased, {self.map_size} in the map"
         objects = f", {count(len(self.objects), 'moving object')}" if self.objects else ""
         return f"FrameResult({self.index}, {self.status.value}{why}, {landmarks}, {change}{objects})"
-
-
-@dataclass(frozen=True, eq=False)
-class RecentPoses:
-    """The camera's last poses together, the newest last.
-
-    Attributes:
-        stamps: their times (K,) [s], ascending.
-        poses: T_world_left (K, 4, 4).
-        covariance: joint (6 K, 6 K), of perturbations on the right, each in the order of a pose's covariance.
-    """
-
-    stamps: Array
-    poses: Array
-    covariance: Array
-
-    __repr__ = of_shapes
-
-    def __len__(self) -> int:
-        return len(self.stamps)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from backends.smoother.solver import SolverError
 
 import slam
 from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
-from backends.smoother.solver import SolverError
 from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors

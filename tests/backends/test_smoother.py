@@ -5,9 +5,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from backends.smoother.solver import SolverError
 
 from backends.smoother import SmootherBackend, factor_builder, factor_graph, rebuild
-from backends.smoother.solver import SolverError
 from slam.data import Observations, UpdateStatus
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3

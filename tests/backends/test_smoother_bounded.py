@@ -8,13 +8,13 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
+from backends.smoother.marginal import MarginalPrior
+from backends.smoother.reference_pose import ReferencePose
+from backends.smoother.variables import landmark_key, pose_key
 
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
 from backends.smoother.factors import FactorMaker
-from backends.smoother.marginal import MarginalPrior
-from backends.smoother.reference_pose import ReferencePose
-from backends.smoother.variables import landmark_key, pose_key
 from slam.data import Observations
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry import se3

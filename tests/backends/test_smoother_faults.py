@@ -8,10 +8,10 @@ from itertools import count
 import gtsam
 import numpy as np
 import pytest
+from backends.smoother.measurement_log import _invertible
 
 from backends import smoother
 from backends.smoother import SmootherBackend, rebuild, solver
-from backends.smoother.measurement_log import _invertible
 from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
