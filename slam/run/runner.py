@@ -171,7 +171,7 @@ def run_recording(
     return _Run(recording, options, Replayed(recording, backend, record), record).drive(results, on_frame)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Run:
     """A run on its way: everything that its files are made of."""
 
