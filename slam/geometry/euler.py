@@ -38,3 +38,13 @@ def body_rate_matrix(phi: Array) -> Array:
     """``E(φ)`` (3, 3) with body angular rate ``ω = E(φ) φ̇``; singular at φy = ±π/2."""
     (sx, sy, _), (cx, cy, _) = np.sin(phi).tolist(), np.cos(phi).tolist()
     return np.array([[1, 0, -sy], [0, cx, sx * cy], [0, -sx, cx * cy]])
+
+
+def about(angle: Array, axis: int) -> Array:
+    """Rotations (N, 3, 3) by angles (N,) [rad] about one coordinate axis."""
+    angle = np.atleast_1d(np.asarray(angle, float))
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[:, i, i] = R[:, j, j] = np.cos(angle)
+    R[:, j, i], R[:, i, j] = np.sin(angle), -np.sin(angle)
+    return R

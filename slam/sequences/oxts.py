@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam.errors import SequenceError
+from slam.geometry.euler import about
 from slam.geometry.se3 import Array, pose
 from slam.geometry.stamps import increasing
 from slam.geometry.trajectory import Trajectory
@@ -54,18 +55,8 @@ def imu_poses(records: Array) -> Array:
     east = scale * np.radians(longitude)
     north = scale * np.log(np.tan(np.radians(90 + latitude) / 2))
     position = np.stack([east, north, altitude], axis=1)
-    R = _axis_rotation(2, yaw) @ _axis_rotation(1, pitch) @ _axis_rotation(0, roll)
+    R = about(yaw, 2) @ about(pitch, 1) @ about(roll, 0)
     return pose(R, position - position[0])
-
-
-def _axis_rotation(axis: int, angle: Array) -> Array:
-    """Rotations (N, 3, 3) about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.tile(np.eye(3), (len(angle), 1, 1))
-    R[:, i, i] = R[:, j, j] = np.cos(angle)
-    R[:, j, i] = np.sin(angle)
-    R[:, i, j] = -R[:, j, i]
-    return R
 
 
 def _record(file: Path, faults: FaultLog) -> list[float] | None:

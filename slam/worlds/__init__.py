@@ -9,15 +9,19 @@ May import `slam.geometry` and the data.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from slam.errors import UnknownNameError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import so3_exp
 from slam.naming import unknown
-from slam.worlds import miscalibration
 from slam.worlds.options import FAULTS, IMAGING, OBSERVATION, RECORDING, Option, option_table, parse_query
 from slam.worlds.sequence import WorldSequence
 from slam.worlds.world import World
@@ -27,7 +31,11 @@ __all__ = ["WorldSequence", "describe", "describe_common", "names", "open_world"
 _NAMES = ("aisle", "box", "boxes", "desk", "drive", "field", "people", "startup", "street", "town")
 
 #: Options that change the world itself; the others only change how it is recorded.
-_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {"seed", *miscalibration.NAMES}
+_RECORDING_ONLY = {o.name for o in (*OBSERVATION, *IMAGING, *FAULTS)} - {"density"} | {
+    "seed",
+    "focal_error",
+    "turn_error",
+}
 
 
 def names() -> list[str]:
@@ -47,9 +55,18 @@ def open_world(text: str) -> WorldSequence:
     values = parse_query(name, query, options(name))
     key = tuple(sorted((k, v) for k, v in values.items() if k not in _RECORDING_ONLY))
     world = _build(name, key)
-    rig = miscalibration.true_rig(world.rig, values)
+    rig = _true_rig(world.rig, values)
     recorded = world if rig is world.rig else replace(world, rig=rig, seen={})
     return WorldSequence(text, recorded, values, world.rig)
+
+
+def _true_rig(told: StereoRig, values: Mapping[str, Any]) -> StereoRig:
+    """The cameras that record, where the system is told another rig; that rig itself where no error is asked for."""
+    share, turn = 1 / (1 + values["focal_error"]), 1e-3 * values["turn_error"]
+    if share == 1 and turn == 0:
+        return told
+    left, right = (replace(camera, fu=share * camera.fu, fv=share * camera.fv) for camera in (told.left, told.right))
+    return StereoRig(left, right, so3_exp(np.full(3, turn)) @ told.R, told.b)
 
 
 def options(name: str) -> dict[str, Option]:

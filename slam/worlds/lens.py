@@ -26,12 +26,12 @@ class Lens:
 
     Attributes:
         view: the undistorted view.
-        maps: where each sample of the camera's image lies in the view, x and y; None where it lies in its own place.
+        places: where each sample of the camera's image lies in the view (H, W, 2); None where it is its own place.
         supersample: samples per pixel along each axis.
     """
 
     view: View
-    maps: tuple[np.ndarray, np.ndarray] | None
+    places: np.ndarray | None
     supersample: int
 
     @classmethod
@@ -53,11 +53,11 @@ class Lens:
         K[:2, 2] = margin - low * (K[0, 0], K[1, 1])
         size = np.ceil((high - low) * (K[0, 0], K[1, 1]) + 2 * margin).astype(int) + 1
         places = (rays * (K[0, 0], K[1, 1]) + K[:2, 2]).astype(np.float32).reshape(height, width, 2)
-        return cls(View(K, *size), (places[..., 0].copy(), places[..., 1].copy()), s)
+        return cls(View(K, *size), places, s)
 
     def expose(self, samples: np.ndarray) -> np.ndarray:
         """The camera's image from samples of the view: distorted, and averaged over each pixel."""
-        if self.maps is not None:
-            samples = cv2.remap(samples, *self.maps, cv2.INTER_LINEAR)
+        if self.places is not None:
+            samples = cv2.remap(samples, self.places, None, cv2.INTER_LINEAR)
         size = samples.shape[1] // self.supersample, samples.shape[0] // self.supersample
         return cv2.resize(samples, size, interpolation=cv2.INTER_AREA)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam.geometry.euler import rotation
+from slam.geometry.euler import about, rotation
 from slam.geometry.se3 import Array, pose
 
 #: Camera axes of a level camera that looks along world +y: x right, y down, z forward.
@@ -22,22 +22,12 @@ def camera_poses(positions: Array, yaw: Array, pitch: Array, roll: Array) -> Arr
         pitch: turn upwards (N,) [rad].
         roll: turn clockwise about the optical axis, as the camera sees it (N,) [rad].
     """
-    return pose(_turn(yaw, 2) @ R_LEVEL @ _turn(pitch, 0) @ _turn(roll, 2), positions)
+    return pose(about(yaw, 2) @ R_LEVEL @ about(pitch, 0) @ about(roll, 2), positions)
 
 
 def yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Array:
     """``Rz(yaw) Ry(pitch) Rx(roll)`` (3, 3): the orientation of an object in world axes (paper B, step d)."""
     return rotation(np.array([roll, pitch, yaw]))
-
-
-def _turn(angle: Array, axis: int) -> Array:
-    """Rotations (N, 3, 3) by angles (N,) about one axis."""
-    angle = np.atleast_1d(np.asarray(angle, float))
-    R = np.tile(np.eye(3), (len(angle), 1, 1))
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[:, i, i] = R[:, j, j] = np.cos(angle)
-    R[:, j, i], R[:, i, j] = np.sin(angle), -np.sin(angle)
-    return R
 
 
 def sway(t: Array, rng: np.random.Generator, slowest: float, fastest: float, terms: int = 5) -> Array:

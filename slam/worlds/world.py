@@ -7,12 +7,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slam.data import BoolArray, IdArray
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.worlds.geometry import Landmarks, Rectangle, RectangleArrays, in_parts
-from slam.worlds.places import Places
 
 _SMALL = 8000  # landmarks or rectangles that are gone through in every frame: the way to those near it would cost more
 
@@ -22,6 +22,33 @@ def _to_corner(rig: StereoRig) -> float:
     camera = rig.left
     x, y = max(camera.u0, camera.width - camera.u0) / camera.fu, max(camera.v0, camera.height - camera.v0) / camera.fv
     return float(1.1 * np.sqrt(1 + x * x + y * y))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Things in a tree by their places.
+
+    Attributes:
+        tree: of those that stand still.
+        still, moving: indices of things (S,), (M,).
+        radius: of the largest thing that stands still [m].
+    """
+
+    tree: cKDTree
+    still: IdArray
+    moving: IdArray
+    radius: float
+
+    @classmethod
+    def of(cls, points: Array, moves: BoolArray, radius: float = 0.0) -> Places:
+        """Of things at `points` (P, 3), of which some move; `radius` [m] is the largest one's."""
+        still = np.flatnonzero(~moves)
+        return cls(cKDTree(points[still]), still, np.flatnonzero(moves), radius)
+
+    def within(self, place: Array, distance: float) -> IdArray:
+        """Indices of what stands within a distance [m] of a place (3,), and of all that moves, in order."""
+        near = self.tree.query_ball_point(place, distance + self.radius)
+        return np.sort(np.concatenate([self.still[np.array(near, np.int64)], self.moving]))
 
 
 @dataclass(frozen=True, eq=False)
