@@ -100,9 +100,9 @@ class State:
         covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT + 1)
         path = [(self.stamp, self.pose), *self.recent][:n][::-1]
         P = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
-        P = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
+        joint = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
         stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
-        return RecentPoses(stamps, poses, 0.5 * (P + P.T))
+        return RecentPoses(stamps, poses, 0.5 * (joint + joint.T))
 
     # --- landmarks join and leave ---
 
