@@ -76,7 +76,7 @@ class Covariance:
     def with_pose(self, J: Array, most: int) -> Covariance:
         """With the present pose among those that are kept, J (6, 6) times [r, φ]; and at most so many of them."""
         k = POSE * min(self.poses, most - 1)
-        stay = np.r_[:k, POSE * self.poses : len(self.left)]
+        stay = np.concatenate([np.arange(k), np.arange(POSE * self.poses, len(self.left))])
         own, left = self.dense[:, :POSE] @ J.T, np.empty((POSE + len(stay), POSE + len(stay)))
         left[:POSE, :POSE], left[:POSE, POSE:] = J @ own[:POSE], J @ self.cross[:POSE, stay]
         left[POSE:, :POSE], left[POSE:, POSE:] = left[:POSE, POSE:].T, self.left[stay][:, stay]

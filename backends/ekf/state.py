@@ -99,10 +99,10 @@ class State:
         """The last poses, as they were believed in their time, with their joint covariance; at most n."""
         covariance = self.covariance.with_pose(self.pose_jacobian(), RECENT + 1)
         path = [(self.stamp, self.pose), *self.recent][:n][::-1]
-        blocks = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
-        P: Array = blocks[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
+        P = covariance.left[: POSE * len(path), : POSE * len(path)].reshape(len(path), POSE, len(path), POSE)
+        joint = P[::-1, :, ::-1].reshape(POSE * len(path), POSE * len(path))
         stamps, poses = np.array([stamp for stamp, _ in path]), np.array([T for _, T in path])
-        return RecentPoses(stamps, poses, 0.5 * (P + P.T))
+        return RecentPoses(stamps, poses, 0.5 * (joint + joint.T))
 
     # --- landmarks join and leave ---
 
