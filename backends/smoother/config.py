@@ -25,7 +25,7 @@ class SmootherConfig:
     """
 
     motion: float = 0.02
-    overlap: float = 0.8
+    overlap: float = 0.9
     track: int = 20
     lag: int | None = 14
     past: int = 50
