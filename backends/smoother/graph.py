@@ -169,9 +169,9 @@ class Graph:
     It follows a `State`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam fails,
     it is built anew from what the state keeps.
 
-    Its first pose is held firmly, as nothing is measured but relative to it: of a pose that is hardly known in the world
-    Cholesky's method would lose the digits. What is known of it is added to all covariances. If landmarks are known in
-    the world the first pose has its own covariance instead.
+    Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
+    world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
+    known in the world the first pose has its own covariance instead.
 
     Args:
         make: makes the factors.
@@ -199,7 +199,7 @@ class Graph:
         )
         self._tracks = Tracks(self._make, self._track, self._lag)
         self._number, self._taken = -1, 0
-        self._base = np.zeros((6, 6))  # what is known of the first pose, besides its prior
+        self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
         self._poses: dict[int, Array] = {}
         self._first = np.eye(4)
         self._anchored = False

@@ -289,7 +289,7 @@ def _hung(s: State, T: Array, information: Array) -> State:
 
 
 def _drift(P: Array, before: Array, newest: Array) -> Array:
-    """By how much more (6, 6) the newest pose is uncertain than the one before, from their joint covariance (12, 12)."""
+    """By how much (6, 6) the newest pose is less certain than the one before, from their joint covariance (12, 12)."""
     A = adjoint(inverse(newest) @ before)
     values, vectors = np.linalg.eigh(P[6:, 6:] - A @ P[:6, :6] @ A.T)
     return np.asarray((vectors * values.clip(min=0)) @ vectors.T)
