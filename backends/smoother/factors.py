@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import gtsam
 import gtsam_unstable
@@ -14,6 +14,7 @@ from slam.models import EstimatorModels
 from slam.window.stereo import RectifiedStereo
 
 
+@lru_cache(1024)
 def pose_key(number: int) -> int:
     """Variable of a pose, by its number."""
     return int(gtsam.symbol("x", number))

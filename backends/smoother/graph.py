@@ -32,17 +32,14 @@ class Track:
     Attributes:
         poses: numbers of the poses that measured it.
         points: the measurements.
+        stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
         slot: of the factor in the solver, −1 while there is none.
     """
 
     poses: list[int] = field(default_factory=list)
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
+    stereo: bool = False
     slot: int = -1
-
-    @property
-    def informative(self) -> bool:
-        """Whether a factor can be made: gtsam's throws where it is given left pixels only."""
-        return len(self.poses) > 1 and any(point.uR() == point.uR() for point in self.points)
 
 
 @dataclass
@@ -117,6 +114,7 @@ class Tracks:
                 self._smart[serial] = track = Track()
             track.poses.append(number)
             track.points.append(point)
+            track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial] = track
 
     def _leaves(self, pose: int, number: int) -> bool:
@@ -148,7 +146,7 @@ class Tracks:
         """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
-            if track.informative:
+            if track.stereo and len(track.poses) > 1:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
@@ -156,8 +154,8 @@ class Tracks:
         return made
 
     def forget(self, number: int) -> None:
-        """Forget tracks that will not go on at the pose of a number."""
-        if self._lag is not None:
+        """Forget tracks that will not go on at the pose of a number; once in a while."""
+        if self._lag is not None and not number % self._lag:
             self._smart = {
                 serial: track for serial, track in self._smart.items() if not self._leaves(track.poses[0], number)
             }
