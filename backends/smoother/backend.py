@@ -145,9 +145,9 @@ class SmootherBackend:
         return marks.position[marks.rows_of(ids)]
 
     @one_blas_thread
-    def recent(self, count: int) -> RecentPoses:
-        """The last camera poses, at most `count` and as many as are in the graph, with their joint covariance."""
-        return self._path.recent(self._started("recent"), self._graph, count)
+    def recent(self, n: int) -> RecentPoses:
+        """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
+        return self._path.recent(self._started("recent"), self._graph, n)
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
