@@ -281,7 +281,7 @@ class UpdateReport:
 
     Attributes:
         status: how it ended.
-        reason: one line where the status is not OK, else empty.
+        reason: one line where the status is not OK, or where a solver that failed was built anew; else empty.
         used: ids of the landmarks whose observations were used (K,).
         rejected: ids of those that failed the back end's gate (R,).
         nis: normalised innovation squared νᵀ S⁻¹ ν of all used observations together (NaN if none).

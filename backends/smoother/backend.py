@@ -100,9 +100,10 @@ class SmootherBackend:
         require_stamp("smoother", stamp, float(s.stamps[1]) if s.started else None)
         s = self._steps.predicted(s, float(stamp), rests)
         rows, left, right, S = self._steps.in_view(s)
+        found = Prediction(float(stamp), s.last[1].copy(), s.covariance, s.landmarks.ids[rows], left, right, S)
         self._path.extend(s)
         self._state = s
-        return Prediction(float(stamp), s.last[1].copy(), s.covariance, s.landmarks.ids[rows], left, right, S)
+        return found
 
     @one_blas_thread
     def update(self, observations: Observations, guess: Array | None = None) -> UpdateReport:
@@ -144,9 +145,9 @@ class SmootherBackend:
         return marks.position[marks.rows_of(ids)]
 
     @one_blas_thread
-    def recent(self, count: int) -> RecentPoses:
-        """The last camera poses, at most `count` and as many as are in the graph, with their joint covariance."""
-        return self._path.recent(self._started("recent"), self._graph, count)
+    def recent(self, n: int) -> RecentPoses:
+        """The last camera poses, at most n and as many as are in the graph, with their joint covariance."""
+        return self._path.recent(self._started("recent"), self._graph, n)
 
     @one_blas_thread
     def trajectory(self) -> Trajectory:
@@ -200,8 +201,8 @@ class SmootherBackend:
         s = self._state
         if s.started:
             before, s = s, rebuilt(corrected(s, correct), self._steps, self._graph, self._make)
-            self._path.move(s, s.poses[0] @ inverse(before.poses[0]))
-            self._state, self._mended = replace(s, measured=True), True
+            path = self._path.moved(s, s.poses[0] @ inverse(before.poses[0]))
+            self._path, self._state, self._mended = path, replace(s, measured=True), True
 
     # --- copies ---
 

@@ -25,9 +25,9 @@ class SmootherConfig:
     """
 
     motion: float = 0.02
-    overlap: float = 0.8
+    overlap: float = 0.9
     track: int = 20
-    lag: int | None = 14
+    lag: int | None = 16
     past: int = 50
 
     def __post_init__(self) -> None:

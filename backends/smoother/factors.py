@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import gtsam
 import gtsam_unstable
@@ -14,6 +14,7 @@ from slam.models import EstimatorModels
 from slam.window.stereo import RectifiedStereo
 
 
+@lru_cache(1024)
 def pose_key(number: int) -> int:
     """Variable of a pose, by its number."""
     return int(gtsam.symbol("x", number))
@@ -27,6 +28,12 @@ def landmark_key(serial: int) -> int:
 def to_pose3(T: Array) -> gtsam.Pose3:
     """A gtsam pose of a nearly rigid matrix (4, 4), made orthonormal: gtsam would not do that."""
     return gtsam.Pose3(gtsam.Rot3(nearest_rotation(T[:3, :3])), T[:3, 3])
+
+
+def _parameters(mode: gtsam.LinearizationMode) -> gtsam.SmartProjectionParams:
+    parameters = gtsam.SmartProjectionParams()
+    parameters.setLinearizationMode(mode)
+    return parameters
 
 
 class FactorMaker:
@@ -44,8 +51,8 @@ class FactorMaker:
         self._noise = gtsam.noiseModel.Isotropic.Sigma(3, self.sigma)
         rectified = stereo.rectified_rig.original.is_rectified
         self._sensor = () if rectified else (to_pose3(stereo.rectified_rig.T_left_rectified),)
-        self._parameters = gtsam.SmartProjectionParams()
-        self._parameters.setLinearizationMode(gtsam.LinearizationMode.HESSIAN)
+        self._quick = _parameters(gtsam.LinearizationMode.HESSIAN)
+        self._careful = _parameters(gtsam.LinearizationMode.JACOBIAN_SVD)
 
     @cached_property
     def _mono(self) -> tuple[gtsam.Cal3_S2, gtsam.noiseModel.Base]:
@@ -65,9 +72,16 @@ class FactorMaker:
         """A measurement (uL, vL, uR); uR may be NaN."""
         return gtsam.StereoPoint2(z[0], z[2], z[1])
 
-    def smart(self, points: Sequence[gtsam.StereoPoint2], poses: Sequence[int]) -> gtsam.NonlinearFactor:
-        """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel."""
-        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, self._parameters, *self._sensor)
+    def smart(
+        self, points: Sequence[gtsam.StereoPoint2], poses: Sequence[int], careful: bool = False
+    ) -> gtsam.NonlinearFactor:
+        """A landmark eliminated from its measurements, of which two or more are needed and one with a right pixel.
+
+        Both modes give the same information; the careful one takes longer, and does not throw where the landmark lies
+        behind a camera.
+        """
+        parameters = self._careful if careful else self._quick
+        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(self._noise, parameters, *self._sensor)
         factor.add(points, [pose_key(i) for i in poses], self._K)
         return factor
 

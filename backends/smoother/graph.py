@@ -12,12 +12,13 @@ import numpy as np
 from backends.smoother.factors import FactorMaker, landmark_key, pose_key, to_pose3
 from backends.smoother.state import State
 from slam.errors import SlamError
-from slam.geometry.se3 import Array, transform
+from slam.geometry.se3 import Array, adjoint, inverse, transform
 
 #: What gtsam throws when it cannot solve.
 FAILURES = (RuntimeError, ValueError, LookupError)
 
 _ENDLESS = 1e9  # numerics: a lag that no run reaches
+_FIRM = np.repeat([1e-10, 1e-8], 3)  # numerics: variances [rad²], [m²] with which the first pose is held
 
 
 class SolverError(SlamError):
@@ -31,17 +32,14 @@ class Track:
     Attributes:
         poses: numbers of the poses that measured it.
         points: the measurements.
+        stereo: whether one of them has a right pixel: gtsam's factor throws where it is given left pixels only.
         slot: of the factor in the solver, −1 while there is none.
     """
 
     poses: list[int] = field(default_factory=list)
     points: list[gtsam.StereoPoint2] = field(default_factory=list)
+    stereo: bool = False
     slot: int = -1
-
-    @property
-    def informative(self) -> bool:
-        """Whether a factor can be made: gtsam's throws where it is given left pixels only."""
-        return len(self.poses) > 1 and any(point.uR() == point.uR() for point in self.points)
 
 
 @dataclass
@@ -90,12 +88,12 @@ class Tracks:
         self._smart: dict[int, Track] = {}
         self._variables: dict[int, int] = {}  # numbers of the poses that measured them last
 
-    def add_pose(self, problem: Problem, s: State, number: int, first: int) -> None:
-        """A pose, and its tie to the one before it; the first one has a prior."""
+    def add_pose(self, problem: Problem, s: State, number: int, first: int, prior: Array | None = None) -> None:
+        """A pose, and its tie to the one before it; the first one has a prior, with another covariance if given."""
         row = s.of(number)
         tie = s.ties[row]
         if tie is None or number == first:
-            problem.factors.add(self._make.prior(number, s.poses[row], s.spread[row]))
+            problem.factors.add(self._make.prior(number, s.poses[row], s.spread[row] if prior is None else prior))
         else:
             problem.factors.add(self._make.tie(number - 1, number, tie.relative, tie.covariance))
         problem.values.insert(pose_key(number), to_pose3(s.poses[row]))
@@ -116,6 +114,7 @@ class Tracks:
                 self._smart[serial] = track = Track()
             track.poses.append(number)
             track.points.append(point)
+            track.stereo = track.stereo or z[2] == z[2]  # not NaN
             problem.grown[serial] = track
 
     def _leaves(self, pose: int, number: int) -> bool:
@@ -143,20 +142,20 @@ class Tracks:
             place = transform(s.poses[s.of(known.pose)], known.position[None])[0]
         problem.values.insert(landmark_key(serial), place)
 
-    def make_smart(self, problem: Problem) -> list[tuple[Track, int]]:
-        """The smart factors of what grew, and their places in the problem."""
+    def make_smart(self, problem: Problem, careful: bool = True) -> list[tuple[Track, int]]:
+        """The smart factors of what grew, and their places in the problem; see `FactorMaker.smart`."""
         made = []
         for track in problem.grown.values():
-            if track.informative:
+            if track.stereo and len(track.poses) > 1:
                 if track.slot >= 0:
                     problem.removed.append(track.slot)
                 made.append((track, problem.factors.size()))
-                problem.factors.add(self._make.smart(track.points, track.poses))
+                problem.factors.add(self._make.smart(track.points, track.poses, careful))
         return made
 
     def forget(self, number: int) -> None:
-        """Forget tracks that will not go on at the pose of a number."""
-        if self._lag is not None:
+        """Forget tracks that will not go on at the pose of a number; once in a while."""
+        if self._lag is not None and not number % self._lag:
             self._smart = {
                 serial: track for serial, track in self._smart.items() if not self._leaves(track.poses[0], number)
             }
@@ -167,6 +166,10 @@ class Graph:
 
     It follows a `State`, and nothing is in it alone: where it cannot go on from one state to the next, or gtsam fails,
     it is built anew from what the state keeps.
+
+    Its first pose is held firmly, as nothing is measured but relative to it: with a pose that is hardly known in the
+    world Cholesky's method would run out of digits. What is known of it is added to all covariances. If landmarks are
+    known in the world the first pose has its own covariance instead.
 
     Args:
         make: makes the factors.
@@ -179,6 +182,7 @@ class Graph:
 
     def __init__(self, make: FactorMaker, track: int, lag: int | None) -> None:
         self.rebuilds = 0
+        self._careful = 0  # number of the first pose whose factors may be made quickly again, after a failure
         self._make, self._track, self._lag = make, track, lag
         self.restart()
 
@@ -193,6 +197,10 @@ class Graph:
         )
         self._tracks = Tracks(self._make, self._track, self._lag)
         self._number, self._taken = -1, 0
+        self._base: Array = np.zeros((6, 6))  # what is known of the first pose, besides its prior
+        self._poses: dict[int, Array] = {}
+        self._first = np.eye(4)
+        self._anchored = False
 
     def followed(self, s: State) -> tuple[Solved, str]:
         """The solution for a state with one pose more than the last one; and why the graph was built anew, if it was.
@@ -201,12 +209,13 @@ class Graph:
             SolverError: gtsam fails with the new graph as well.
         """
         why = ""
-        if self._number == s.number - 1 >= s.begun:
+        if self._number == s.number - 1 >= s.begun and self._anchored == s.anchored:
             number, self._number = self._number, -1  # until it is done: an interrupted call leaves a graph unknown
             try:
                 return self._stepped(s, number), ""
             except FAILURES as error:
                 why, self.rebuilds = _line(error), self.rebuilds + 1
+                self._careful = s.number + (self._lag or self._track)
         return self.rebuilt(s), why
 
     def rebuilt(self, s: State) -> Solved:
@@ -218,7 +227,9 @@ class Graph:
         self.restart()
         oldest = self.oldest(s)
         try:
-            solved = self._update(s, range(oldest, s.number + 1), oldest)
+            self._anchored, self._first = s.anchored, s.poses[s.of(oldest)]
+            prior, self._base = held(s, oldest)
+            solved = self._update(s, range(oldest, s.number + 1), oldest, prior)
         except FAILURES as error:
             raise SolverError(_line(error)) from error
         return solved
@@ -231,15 +242,15 @@ class Graph:
     def _stepped(self, s: State, number: int) -> Solved:
         return self._update(s, range(number + 1, s.number + 1), self.oldest(s))
 
-    def _update(self, s: State, numbers: Iterable[int], first: int) -> Solved:
+    def _update(self, s: State, numbers: Iterable[int], first: int, prior: Array | None = None) -> Solved:
         problem = Problem()
         for number in numbers:
             if number > first:
                 self._tracks.add_rows(problem, s, number - 1, first, self._taken)
-            self._tracks.add_pose(problem, s, number, first)
+            self._tracks.add_pose(problem, s, number, first, prior)
             self._tracks.add_rows(problem, s, number, first)
             self._taken = len(s.sights[s.of(number)])
-        made = self._tracks.make_smart(problem)
+        made = self._tracks.make_smart(problem, s.number < self._careful)
         self._solver.update(problem.factors, problem.values, problem.stamps, problem.removed)
         slots = self._solver.getISAM2Result().getNewFactorsIndices()
         for track, place in made:
@@ -247,6 +258,7 @@ class Graph:
         self._tracks.forget(s.number)
         values = self._solver.calculateEstimate()
         poses = np.array([values.atPose3(pose_key(i)).matrix() for i in range(first, s.number + 1)])
+        self._poses = dict(zip(range(first, s.number + 1), poses))
         solved = Solved(first, poses, self._joint(list(range(max(first, s.number - 1), s.number + 1))))
         if not (np.isfinite(poses).all() and np.isfinite(solved.covariance).all()):
             raise ValueError("the solution is not finite")
@@ -268,7 +280,19 @@ class Graph:
     def _joint(self, numbers: list[int]) -> Array:
         isam, keys = self._solver.getISAM2(), [pose_key(i) for i in numbers]
         P = isam.marginalCovariance(keys[0]) if len(keys) == 1 else isam.jointMarginalCovariance(keys).fullMatrix()
+        A = adjoint(inverse(np.array([self._poses[i] for i in numbers])) @ self._first).reshape(-1, 6)
+        P = P + A @ self._base @ A.T
         return np.asarray(0.5 * (P + P.T))
+
+
+def held(s: State, number: int) -> tuple[Array, Array]:
+    """Covariance of the prior of a pose that comes first (6, 6), and what is known of it in the world besides."""
+    P = s.spread[s.of(number)]
+    if s.anchored:
+        return P, np.zeros((6, 6))
+    prior = np.diag(np.minimum(np.diag(P), _FIRM))
+    values, vectors = np.linalg.eigh(P - prior)
+    return prior, (vectors * values.clip(min=0)) @ vectors.T
 
 
 def minimised(problem: Problem, iterations: int) -> gtsam.Values:

@@ -10,7 +10,7 @@ import numpy as np
 from backends.smoother.landmark_kernels import carried_by, information_of
 from slam.data import BoolArray, IdArray, IndexArray
 from slam.errors import MeasurementError
-from slam.geometry.se3 import Array
+from slam.geometry.se3 import Array, points_by_pose
 from slam.window.stereo import RectifiedStereo
 
 RECENT = 12  # so many of its last measurements give a landmark's position and covariance
@@ -28,6 +28,7 @@ class Landmarks:
         serial: number of each in the order of their coming (S,); an id may come back, a serial number not.
         position: in world coordinates (S, 3) [m].
         own: its covariance where all poses are known (S, 3, 3) [m²], in world axes.
+        away: what the camera's drift adds to that since it was last measured (S, 3, 3) [m²].
         mean, information: what was known of it besides its measurements, in world coordinates: position (S, 3) and
             information (S, 3, 3), zero for nothing.
         world: whether that does not depend on any pose (S,).
@@ -38,6 +39,7 @@ class Landmarks:
     serial: IdArray
     position: Array
     own: Array
+    away: Array
     mean: Array
     information: Array
     world: BoolArray
@@ -52,7 +54,7 @@ class Landmarks:
         """Landmarks that are known, but not measured yet; `first` is the first one's serial number."""
         n = len(ids)
         return cls(
-            ids, first + np.arange(n), position, own, position, information, np.full(n, world),
+            ids, first + np.arange(n), position, own, np.zeros((n, 3, 3)), position, information, np.full(n, world),
             np.full((n, RECENT, 3), np.nan), np.full((n, RECENT), -1),
         )  # fmt: skip
 
@@ -96,16 +98,40 @@ class Landmarks:
         if taken.any():
             raise MeasurementError(f"smoother: landmark {ids[taken][0]} is in the map already")
 
-    def measured(self, rows: IndexArray, z: Array, pose: int) -> Landmarks:
-        """With one more measurement (M, 3) of some landmarks, from the pose of a number."""
+    @property
+    def from_newest(self) -> Array:
+        """Covariances (S, 3, 3) of the positions where the newest pose is known, in world axes."""
+        return self.own + self.away
+
+    def measured(self, rows: IndexArray, z: Array, pose: int, oldest: int = 0) -> Landmarks:
+        """With one more measurement (M, 3) of some landmarks, from the pose of a number.
+
+        What was measured last before pose `oldest` is left out from now on: the camera has drifted. It counts as what
+        was known beforehand.
+        """
+        old = np.zeros(len(self), bool)
+        old[rows] = (self.pose[rows].max(axis=1) < oldest) & self.away[rows].any(axis=(1, 2))
+        if old.any():
+            self = _put(self, old, self.without_measurements())
+        away = self.away.copy()
+        away[rows] = 0.0
         zs, poses = self.z.copy(), self.pose.copy()
         oldest = poses[rows].argmin(axis=1)
         zs[rows, oldest], poses[rows, oldest] = z, pose
-        return replace(self, z=zs, pose=poses)
+        return replace(self, z=zs, pose=poses, away=away)
+
+    def left_behind(self, rows: IndexArray, T: Array, drift: Array) -> Landmarks:
+        """After a pose T (4, 4) that measured only the landmarks `rows`, and is off by a drift (6, 6) from the last."""
+        unseen = ~self.world
+        unseen[rows] = False
+        by_pose = T[:3, :3] @ points_by_pose((self.position[unseen] - T[:3, 3]) @ T[:3, :3])
+        away = self.away.copy()
+        away[unseen] += by_pose @ drift @ np.swapaxes(by_pose, 1, 2)
+        return replace(self, away=away)
 
     def without_measurements(self) -> Landmarks:
         """As they stand, with what is known of them now in place of their measurements."""
-        information = np.where(self.world[:, None, None], self.information, inverses(self.own))
+        information = np.where(self.world[:, None, None], self.information, inverses(self.from_newest))
         mean = np.where(self.world[:, None], self.mean, self.position)
         return replace(
             self, mean=mean, information=information, z=np.full_like(self.z, np.nan), pose=-1 + 0 * self.pose
@@ -176,8 +202,15 @@ class Landmarks:
         older = np.where(self.world[chosen, None, None], 0.0, self.information[chosen])
         J = carried_by(np.arange(len(poses)), poses, frames, x, rows, information, older, own)
         n, width = len(chosen), len(joint)
-        C = own + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
+        C = own + self.away[chosen] + (J.reshape(3 * n, width) @ joint).reshape(n, 3, width) @ np.swapaxes(J, 1, 2)
         return np.asarray(0.5 * (C + np.swapaxes(C, 1, 2)))
+
+
+def _put(marks: Landmarks, chosen: BoolArray, others: Landmarks) -> Landmarks:
+    """Landmarks with some rows (S,) taken from others."""
+    names = marks.__dataclass_fields__
+    columns = ((getattr(marks, name), getattr(others, name)) for name in names)
+    return Landmarks(*(np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), its, mine) for mine, its in columns))
 
 
 def _regular(H: Array) -> Array:

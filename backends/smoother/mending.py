@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from backends.smoother.factors import FactorMaker, pose_key
-from backends.smoother.graph import Graph, Problem, SolverError, Tracks, minimised
+from backends.smoother.graph import Graph, Problem, SolverError, Tracks, held, minimised
 from backends.smoother.state import State
 from backends.smoother.steps import Steps
 from slam.errors import MeasurementError
@@ -42,7 +42,7 @@ def rebuilt(s: State, steps: Steps, graph: Graph, make: FactorMaker) -> State:
         now = optimised(s, make, steps.config.track, first)
     except SolverError:
         now = s.poses[s.of(first) :]
-    if not _anchored(s):
+    if not s.anchored:
         now = s.poses[-1] @ inverse(now[-1]) @ now
     D = now[0] @ inverse(s.poses[s.of(first)])
     moved = np.concatenate([D @ s.poses[: s.of(first)], now])
@@ -70,7 +70,7 @@ def path_solved(s: State, make: FactorMaker, before: Array) -> Array:
         kept = np.concatenate([s.poses[: s.of(first)], optimised(s, make, len(s.poses), first)])
     except SolverError:
         kept = s.poses
-    M = np.eye(4) if _anchored(s) else s.poses[-1] @ inverse(kept[-1])
+    M = np.eye(4) if s.anchored else s.poses[-1] @ inverse(kept[-1])
     return M @ np.concatenate([before, kept])
 
 
@@ -83,13 +83,8 @@ def optimised(s: State, make: FactorMaker, track: int, first: int) -> Array:
     problem, tracks = Problem(), Tracks(make, track, None)
     numbers = range(first, s.number + 1)
     for number in numbers:
-        tracks.add_pose(problem, s, number, first)
+        tracks.add_pose(problem, s, number, first, held(s, first)[0])
         tracks.add_rows(problem, s, number, first)
     tracks.make_smart(problem)
     values = minimised(problem, _ITERATIONS)
     return np.array([values.atPose3(pose_key(i)).matrix() for i in numbers])
-
-
-def _anchored(s: State) -> bool:
-    """Whether landmarks are known in the world: then the path may not be moved in it."""
-    return any(known.pose < 0 for known in s.known.values())

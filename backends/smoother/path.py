@@ -40,10 +40,14 @@ class Path:
         if s.since and not s.inside and self._number[f - 1] == s.number:
             self._relative[f - 1], self._own[f - 1] = inverse(s.poses[-1]) @ s.last[0], s.pair[:6, :6]
 
-    def move(self, s: State, D: Array) -> None:
-        """Take in a state whose oldest poses were moved by D (4, 4) in the world, and all before them as well."""
-        self._poses[: s.first] = [D @ T for T in self._poses[: s.first]]
-        self.follow(s)
+    def moved(self, s: State, D: Array) -> Path:
+        """The path of a state whose oldest poses were moved by D (4, 4) in the world, as all before them are."""
+        other = Path()
+        for name, rows in vars(self).items():
+            setattr(other, name, rows.copy())
+        other._poses = [D @ T for T in self._poses]
+        other.follow(s)
+        return other
 
     def graph(self, first: int) -> Array:
         """Poses of the graph before the one with number `first` (N, 4, 4)."""

@@ -130,6 +130,11 @@ class State:
         return self.first + len(self.poses) - 1
 
     @property
+    def anchored(self) -> bool:
+        """Whether landmarks are known in the world: then the path may not be moved in it."""
+        return any(known.pose < 0 for known in self.known.values())
+
+    @property
     def own(self) -> Array:
         """Covariance (6, 6) of the newest frame, where the newest pose of the graph is known."""
         return self.pair[6:, 6:]

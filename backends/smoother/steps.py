@@ -14,7 +14,7 @@ from backends.smoother.state import Known, Sight, State, Tie, relative_covarianc
 from slam.data import IdArray, IndexArray, UpdateReport, UpdateStatus
 from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
-from slam.geometry.se3 import Array, exp, inverse, log, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, exp, inverse, log, points_by_pose, transform
 from slam.models import EstimatorModels
 from slam.window import motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
@@ -54,6 +54,10 @@ class Steps:
         """Number of poses that are kept; None for all."""
         return None if self.config.lag is None else self.config.lag + 1 + self.config.past
 
+    def oldest(self, s: State) -> int:
+        """Number of the oldest pose that is smoothed."""
+        return s.begun if self.config.lag is None else max(s.begun, s.number - self.config.lag)
+
     # --- prediction ---
 
     def predicted(self, s: State, stamp: float, rests: bool = False) -> State:
@@ -87,7 +91,7 @@ class Steps:
         T, marks, rig = s.last[1], s.landmarks, self.rig
         rows = marks.order
         rows = rows[rig.left.in_view((marks.position[rows] - T[:3, 3]) @ T[:3, :3])]
-        local, own = pose_only.seen_from(T, marks.position[rows], marks.own[rows])
+        local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         by_pose = points_by_pose(local)
         by_motion = np.where(marks.world[rows, None, None], s.covariance, s.own)
         C = own + by_pose @ by_motion @ np.swapaxes(by_pose, 1, 2)
@@ -120,7 +124,7 @@ class Steps:
     def _problem(self, s: State, rows: IndexArray, z: Array) -> pose_only.PoseProblem:
         """The newest pose alone, with the motion model as its prior, and landmarks as they stand."""
         T, marks = s.last[1], s.landmarks
-        local, own = pose_only.seen_from(T, marks.position[rows], marks.own[rows])
+        local, own = pose_only.seen_from(T, marks.position[rows], marks.from_newest[rows])
         noise = pose_only.residual_noise(self.stereo, self.sigma, local, own, z)
         P = s.covariance if s.inside or marks.world[rows].any() else s.own
         probability = self.models.gate_probability
@@ -171,9 +175,12 @@ class Steps:
             after, poses=np.concatenate([s.poses, found.T[None]]), sights=(*s.sights, sight), ties=(*s.ties, tie),
             spread=np.concatenate([s.spread, after.covariance[None]]), inside=True,
         )  # fmt: skip
-        after = replace(after, landmarks=marks.measured(rows[used], z[used], after.number))
+        after = replace(after, landmarks=marks.measured(rows[used], z[used], after.number, self.oldest(after)))
         solved, why = graph.followed(after)
-        return self.settled(after, solved), nis, why
+        after = self.settled(after, solved)
+        drift = _drift(solved.covariance, after.poses[-2], after.poses[-1])
+        marks = after.landmarks.left_behind(rows[used], after.poses[-1], drift)
+        return replace(after, landmarks=marks), nis, why
 
     def _is_chosen(self, s: State, T: Array, sight: Sight, rows: IndexArray) -> bool:
         """Whether the newest frame, at T (4, 4), becomes a pose of the graph: see `SmootherConfig`."""
@@ -279,6 +286,13 @@ def _hung(s: State, T: Array, information: Array) -> State:
     P[6:, :6], P[6:, 6:] = P[:6, 6:].T, own
     before = s.last[0] @ exp(gain @ log(inverse(s.last[1]) @ T))
     return replace(s, last=np.stack([before, T]), pair=0.5 * (P + P.T))
+
+
+def _drift(P: Array, before: Array, newest: Array) -> Array:
+    """By how much (6, 6) the newest pose is less certain than the one before, from their joint covariance (12, 12)."""
+    A = adjoint(inverse(newest) @ before)
+    values, vectors = np.linalg.eigh(P[6:, 6:] - A @ P[:6, :6] @ A.T)
+    return np.asarray((vectors * values.clip(min=0)) @ vectors.T)
 
 
 def _information(J: Array, noise: Array, z: Array) -> Array:

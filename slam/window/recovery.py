@@ -4,7 +4,7 @@ Then the prediction is probably wrong, not the observations. There are two cases
 
 - It is so far off that the solution is not found from there: start from the pose on which the landmarks agree.
 - The camera is where its earlier poses exclude it: these were wrong, after a stretch with hardly anything to see. The
-  problem is restarted with that pose and the landmarks (`FactorGraph.restart`); earlier poses stay as they are.
+  problem is restarted with that pose and the landmarks; earlier poses stay as they are.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def agreement(problem: pose_only.PoseProblem, guess: Array, search: Search, cont
         guess: pose (4, 4) to begin with.
         search: finds the pose on which the landmarks agree; only called where most contradict the first solution.
         contradicted: updates just before this one in which most observations agreed on another pose.
-        lost: whether the problem shall be restarted in any case (`Belief.lost`).
+        lost: whether the problem shall be restarted in any case.
     """
     T, used = pose_only.solve(problem, guess)
     if 2 * used.sum() >= len(used):

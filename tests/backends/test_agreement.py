@@ -23,7 +23,8 @@ def test_the_pose_and_its_covariance_are_the_filters(name):
     data = scene(poses, points=60, sigma=sigma, limit=20)
     estimates = []
     for each in ("ekf", name):
-        backend = backends.create(each, RIG, models=models)
+        options = {"motion": 0.0} if each == "smoother" else {}  # all its frames are estimated with all measurements
+        backend = backends.create(each, RIG, models=models, **options)
         run(backend, data)
         estimates.append(backend.estimate())
     filtered, other = estimates

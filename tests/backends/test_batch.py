@@ -7,12 +7,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from backends.smoother.solver import SolverError
 
 import slam
 from backends import batch as batch_module
 from backends.batch import BatchBackend
 from backends.smoother import SmootherBackend
+from backends.smoother.graph import SolverError
 from experiments.simulated_recording import true_recording
 from slam.data import StereoFeatures
 from slam.evaluation.metrics import absolute_errors
@@ -50,15 +50,16 @@ def test_without_noise_smoother_and_batch_are_the_truth(world):
 def test_the_smoother_is_nearly_as_good_as_the_optimum():
     sequence = slam.open_sequence("synthetic:desk?frames=40&outliers=0")
     recording = true_recording(sequence, config=MapConfig(target_in_view=40))
-    batch, smoother = (make(recording.rig, recording.models) for make in (BatchBackend, SmootherBackend))
+    whole = {"lag": None, "motion": 0.0, "track": 60}  # it leaves nothing out
     errors = []
-    for backend in (batch, smoother):
+    for make, options in ((BatchBackend, {}), (SmootherBackend, whole), (SmootherBackend, {})):
+        backend = make(recording.rig, recording.models, **options)
         for _ in replay(recording, backend, guess=False):
             pass
         errors.append(absolute_errors(backend.trajectory(), sequence.ground_truth).translation_statistics.rmse)
-    best, ours = errors
-    # 1.02 over whole runs; one short run scatters about that in both directions.
-    assert ours < 1.1 * best
+    best, whole, ours = errors
+    # One short run scatters about the optimum in both directions.
+    assert whole < 1.1 * best and ours < 1.5 * best, errors
 
 
 def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
@@ -66,7 +67,7 @@ def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
     original = batch_module._Solution
 
     def solution(smoother):
-        solved.append(smoother.measurement_log.path.count)
+        solved.append(smoother.state.number + 1)
         return original(smoother)
 
     monkeypatch.setattr(batch_module, "_Solution", solution)
@@ -83,7 +84,7 @@ def test_the_solution_is_worked_out_when_asked_for_and_kept(monkeypatch):
     assert solved == [20], "a pose that is only predicted changes nothing"
     backend.predict(2.1)
     assert len(backend.trajectory()) == 22
-    assert solved == [20, 21]
+    assert solved == [20], "nor does a frame without measurements"
 
 
 def test_online_the_pose_is_the_solved_one():
@@ -122,7 +123,7 @@ def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error
             raise error
 
     data = drive()
-    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS)
+    backend, smoother = BatchBackend(RIG, MODELS), SmootherBackend(RIG, MODELS, motion=0.0)
     run(backend, data)
     run(smoother, data)
     monkeypatch.setattr(gtsam, "Marginals", Broken)
@@ -130,7 +131,8 @@ def test_covariances_that_gtsam_cannot_give_are_the_smoothers(monkeypatch, error
     np.testing.assert_allclose(estimate.covariance, rough.covariance, rtol=1e-9)
     np.testing.assert_allclose(estimate.covariances, rough.covariances, rtol=1e-9)
     off = np.abs(estimate.positions - rough.positions).max(axis=1)
-    assert 0 < np.median(off) < 0.01, "positions are the solved ones"
+    deviations = np.sqrt(np.trace(rough.covariances, axis1=1, axis2=2))
+    assert 0 < np.median(off / deviations) < 1, "positions are the solved ones"
 
 
 def test_a_problem_that_cannot_be_solved_is_one_line(monkeypatch):

@@ -1,32 +1,190 @@
-"""A camera that has lost its way is seated again among the landmarks, by the smoother itself and without a guess."""
+"""The smoother goes on: after failures of gtsam, interrupted calls, and where the camera has lost its way."""
 
 from __future__ import annotations
 
+import sys
+from itertools import count
+
+import gtsam
 import numpy as np
 import pytest
 
 from backends.smoother import SmootherBackend
+from slam.data import Observations, UpdateStatus
 from slam.geometry import se3
 from slam.models import EstimatorModels, MotionModel
 from slam.window import recovery
 from slam.window.pose_only import PoseProblem
 from slam.window.stereo import RectifiedStereo
-from tests.backends.scenes import RIG, cloud, observe, path, scene, step
+from tests.backends.scenes import RIG, cloud, observe, path, run, scene, step
 
 MODELS = EstimatorModels(MotionModel(0.5, 0.5), pixel_sigma=0.5)
 DT = 0.1
 
 
-def drive(backend, poses, points, sigma, unseen=(), seed=0):
-    """Take a back end along a path without a guess; the errors of the newest pose and what was rejected."""
-    rng, known, errors, rejected = np.random.default_rng(seed), set(), [], []
-    for k, T in enumerate(poses):
-        seen = observe(T, points, sigma, rng)
-        seen = seen.select(np.zeros(len(seen), bool)) if k in unseen else seen
-        report = step(backend, k * DT, seen, known)
-        errors.append(se3.log(se3.inverse(T) @ backend.estimate(landmarks=False).T_world_left))
-        rejected.append(len(report.rejected))
-    return np.array(errors), rejected
+def drive(frames: int = 22):
+    return scene(path(frames, DT, np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.03, 0.0])), points=150)
+
+
+def near_the_truth(backend, data, factor: float = 1.0) -> None:
+    trajectory = backend.trajectory()
+    assert len(trajectory) == len(data.poses)
+    off = se3.log(se3.inverse(data.poses) @ trajectory.poses)
+    assert np.abs(off[:, 3:]).max() < factor * 0.05 and np.abs(off[:, :3]).max() < factor * 0.01
+    P = backend.estimate().covariance
+    assert np.isfinite(P).all() and np.linalg.eigvalsh(P).min() > 0
+
+
+#: What gtsam throws.
+ERRORS = [
+    RuntimeError("\nIndeterminant linear system detected while working near variable\n86469 (Symbol: x5).\n"),
+    RuntimeError("Stereo Cheirality Exception"),
+    IndexError("invalid map<K, T> key"),
+    KeyError("x7"),
+    ValueError("removeFactorIndices: no such factor"),
+]
+
+
+@pytest.fixture
+def break_solver(monkeypatch):
+    """Makes some of the calls of a method of gtsam's smoother fail, counted over all instances."""
+    real = gtsam.IncrementalFixedLagSmoother
+
+    def set_up(method: str, calls, error: Exception) -> None:
+        number = count()
+
+        class Broken:
+            def __init__(self, *arguments) -> None:
+                self._solver = real(*arguments)
+
+            def __getattr__(self, name: str):
+                if name != method:
+                    return getattr(self._solver, name)
+
+                def broken(*arguments):
+                    if next(number) in calls:
+                        raise error
+                    return getattr(self._solver, name)(*arguments)
+
+                return broken
+
+        monkeypatch.setattr(gtsam, "IncrementalFixedLagSmoother", Broken)
+
+    return set_up
+
+
+@pytest.mark.parametrize("method", ["update", "calculateEstimate", "getISAM2"])
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_one_failure_costs_nothing(break_solver, method, error):
+    data, untouched = drive(), SmootherBackend(RIG, MODELS, motion=0.0)
+    run(untouched, data)
+    break_solver(method, [11], error)
+    backend = SmootherBackend(RIG, MODELS, motion=0.0)
+    reports = run(backend, data)
+    assert backend.rebuilds == 1
+    assert all(r.status is UpdateStatus.OK for r in reports[1:]), "the measurements were used after the rebuild"
+    said = [r.reason for r in reports[1:] if r.reason]
+    assert len(said) == 1 and said[0].startswith("smoother: built anew after gtsam: ") and "\n" not in said[0]
+    off = se3.log(se3.inverse(untouched.trajectory().poses) @ backend.trajectory().poses)
+    assert np.abs(off).max() < 1e-3
+    near_the_truth(backend, data)
+
+
+@pytest.mark.parametrize("lag", [None, 12])
+def test_failures_on_end_cost_their_frames(break_solver, lag):
+    data = drive()
+    break_solver("update", range(12, 16), ERRORS[0])
+    backend = SmootherBackend(RIG, MODELS, lag=lag, motion=0.0)
+    reports = run(backend, data)
+    failed = [r for r in reports if r.status is UpdateStatus.FAILED]
+    assert 1 <= len(failed) <= 3
+    for report in failed:
+        assert report.reason.startswith("smoother: the pose cannot be solved for: gtsam: Indeterminant")
+        assert "\n" not in report.reason and not len(report.used)
+    assert all(r.status is UpdateStatus.OK for r in reports[-4:])
+    near_the_truth(backend, data, factor=2)
+
+
+def test_recovery_is_the_same_every_time(break_solver):
+    data, ends = drive(), []
+    for _ in range(2):
+        break_solver("update", [7, 13], ERRORS[0])
+        backend = SmootherBackend(RIG, MODELS)
+        run(backend, data)
+        ends.append(backend.trajectory().poses)
+    np.testing.assert_array_equal(*ends)
+
+
+def test_impossible_measurements_do_not_end_a_run():
+    """Random pixels for known landmarks, for some frames: gated, or solved as well as can be, but no exception."""
+    data, known = drive(30), set()
+    backend = SmootherBackend(RIG, MODELS)
+    rng = np.random.default_rng(0)
+    for k, (stamp, _, seen) in enumerate(data):
+        if 10 <= k < 15:
+            left = rng.uniform((0, 0), (RIG.width - 1, RIG.height - 1), (len(seen), 2))
+            right = left - np.stack([rng.uniform(-5, 60, len(seen)), np.zeros(len(seen))], axis=1)
+            backend.predict(stamp)
+            backend.update(Observations(seen.ids, left, right).select(np.isin(seen.ids, list(known))))
+        else:
+            step(backend, stamp, seen, known)
+        assert np.isfinite(backend.estimate().T_world_left).all()
+    off = se3.log(se3.inverse(data.poses[-1]) @ backend.estimate().T_world_left)
+    assert np.abs(off[3:]).max() < 0.2 and np.abs(off[:3]).max() < 0.05
+
+
+def interrupt(call, number: int) -> bool:
+    """Whether a call was interrupted at the `number`-th function called within the smoother's modules."""
+    left = number
+
+    def profile(frame, event, _):
+        nonlocal left
+        if event == "call" and "backends/smoother/" in frame.f_code.co_filename.replace("\\", "/"):
+            left -= 1
+            if not left:
+                raise KeyboardInterrupt
+
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(before)
+    return False
+
+
+@pytest.mark.parametrize("lag", [None, 12])
+def test_a_call_that_is_interrupted_did_not_happen(lag):
+    """A KeyboardInterrupt at any function call within the smoother: the same call again, and the run goes on."""
+    data, known = drive(26), set()
+    backend = SmootherBackend(RIG, MODELS, lag=lag)
+    rng, interrupted = np.random.default_rng(0), 0
+    for k, (stamp, _, seen) in enumerate(data):
+        old = np.isin(seen.ids, list(known))
+        calls = (
+            lambda stamp=stamp: backend.predict(stamp),
+            lambda seen=seen, old=old: backend.update(seen.select(old)),
+            lambda seen=seen, old=old: backend.add(seen.select(~old)),
+            lambda: backend.estimate(),
+            lambda: backend.revise(lambda z: z),
+        )
+        for call in calls:
+            before = backend.state
+            if k > 2 and interrupt(call, int(rng.integers(1, 60))):
+                interrupted += 1
+                assert backend.state is before
+                call()
+            elif k <= 2:
+                call()
+        known.update(seen.ids.tolist())
+        assert len(backend.trajectory()) == k + 1
+    assert interrupted > 10
+    near_the_truth(backend, data)
+
+
+# --- a camera that has lost its way is seated again among the landmarks, without a guess ---
 
 
 def moved_in_the_dark(frames: int):
@@ -39,24 +197,22 @@ def moved_in_the_dark(frames: int):
     return poses, points
 
 
-@pytest.mark.parametrize("lag", [None, 50])
+@pytest.mark.parametrize("lag", [None, 14])
 def test_a_camera_that_was_moved_while_it_saw_nothing(lag):
     """It sees nothing for three frames, and is elsewhere then."""
     poses, points = moved_in_the_dark(90)
-    errors, rejected = drive(SmootherBackend(RIG, MODELS, lag=lag), poses, points, 0.5, range(67, 70))
+    backend, rng, known, off, rejected = SmootherBackend(RIG, MODELS, lag=lag), np.random.default_rng(0), set(), [], []
+    for k, T in enumerate(poses):
+        seen = observe(T, points, 0.5, rng)
+        report = step(backend, k * DT, seen.select(np.full(len(seen), not 67 <= k < 70)), known)
+        off.append(se3.log(se3.inverse(T) @ backend.estimate(landmarks=False).T_world_left))
+        rejected.append(len(report.rejected))
     assert sum(rejected[70:73]) > 30 and sum(rejected[74:]) < 10
-    assert np.abs(errors[74:]).max() < 0.03
-
-
-def test_what_is_known_of_the_pose_in_the_world_outlasts_the_lag():
-    poses, points = moved_in_the_dark(110)
-    backend = SmootherBackend(RIG, MODELS, lag=12)
-    drive(backend, poses, points, 0.5, range(67, 70))
-    assert backend.measurement_log.history.first > 80
+    assert np.abs(off[74:]).max() < 0.05
     assert np.sqrt(np.diag(backend.estimate(landmarks=False).covariance)).max() < 0.3
 
 
-@pytest.mark.parametrize(("lag", "seed"), [(None, 0), (None, 1), (50, 2)])
+@pytest.mark.parametrize(("lag", "seed"), [(None, 0), (None, 1), (14, 2)])
 def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed):
     """Two landmarks, then six seconds in the dark: no linearisation in the world holds for what is seen then."""
     rng = np.random.default_rng(seed)
@@ -77,7 +233,6 @@ def test_a_map_that_begins_where_nobody_knows_how_the_camera_is_turned(lag, seed
     moved = se3.inverse(np.array(found[90:-10])) @ np.array(found[100:])
     truth = se3.inverse(poses[90:-10]) @ poses[100:]
     off = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=1)
-
     assert np.sqrt((off**2).mean()) < 0.1 and rejected < 60
 
 

@@ -65,7 +65,7 @@ def test_ranges_are_those_that_are_checked(every):
     assert ranges["", "objects.mode"] == "detect, procedure1, off"
     assert ranges["", "objects.database"] == "text"
     assert ranges["", "map.monocular"] == "true or false"
-    assert ranges["smoother", "backend.lag"].startswith("[12, ")
+    assert ranges["smoother", "backend.lag"].startswith("[2, ")
     assert ranges["smoother", "backend.lag"].endswith(" or null")
 
 

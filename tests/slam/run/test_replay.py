@@ -80,9 +80,7 @@ def test_what_was_mended_in_a_run_is_mended_in_its_replay(desk, tmp_path, monkey
     recorded = load_recording(tmp_path / "run.npz")
     backend, given = StereoSlam(desk.rig, None, "smoother").backend, []
     z = np.array([[200.0, 100.0, 180.0]])
-    monkeypatch.setattr(
-        backend, "revise", lambda mend: given.append((len(backend.measurement_log.path.stamps), mend(z)))
-    )
+    monkeypatch.setattr(backend, "revise", lambda mend: given.append((len(backend.trajectory()), mend(z))))
     again = [r.revision for r in replay(recorded, backend)]
     assert [k for k, _ in given] == [8, 11]
     for k, mended in given:
