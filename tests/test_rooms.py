@@ -40,7 +40,7 @@ MAY_IMPORT = {
 #: The root's modules by room; all others are "base".
 ROOT_ROOMS = {
     "data": {"checks", "data", "interfaces", "landmarks", "models", "object_data", "object_models", "rig_error"},
-    "system": {"system", "config", "extraction", "results"},
+    "system": {"system", "session", "tracker", "config", "extraction", "results"},
     "commands": {"__main__"},
     "outside": {"__init__"},
 }

@@ -36,7 +36,7 @@ from slam.models import EstimatorModels
 from slam.rig_error import CommonError, Correction
 from slam.runtime.blas import one_blas_thread
 from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracking.localizer import Localizer
 
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph
@@ -95,23 +95,20 @@ class LoopCloser:
         self._localizer = Localizer(self._rig, association, models)
 
     @one_blas_thread
-    def update(
-        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
-    ) -> tuple[Atlas, Returned | None]:
+    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> tuple[Atlas, Returned | None]:
         """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
 
         Args:
             atlas: before the frame.
             step: the frame's result.
-            added: landmarks that joined the map in it.
             path: returns the path in odom so far.
         """
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
-        wanted = begins or (not step.state.unmatched and self._is_keyframe(atlas, step))
+        wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
         if not (self._config.enabled and wanted):
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
-        landmark_of[added.rows] = added.ids
+        landmark_of[step.added.rows] = step.added.ids
         step = replace(step, features=self._rectify(step.features))
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:

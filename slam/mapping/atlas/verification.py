@@ -13,9 +13,8 @@ from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
 from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.relocalizer import nowhere
 from slam.tracking.association import AssociationConfig, Matches, match_everywhere
-from slam.tracking.localizer import Localizer
+from slam.tracking.localizer import Localizer, nowhere
 
 _ROUNDS = 5  # numerics: most iterations of least squares
 _CONVERGED = 1e-6  # numerics: step [rad], [m]
