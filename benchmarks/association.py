@@ -23,10 +23,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig, match_everywhere, match_in_windows
-from slam.tracking.localizer import Localizer
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import follow, match_everywhere
+from slam.tracks.localizer import Localizer
+from slam.tracks.table import LandmarkTable
 
 RIG = StereoRig.rectified_pair(f=520.0, u0=319.5, v0=239.5, baseline=0.12, width=640, height=480)
 SIGMA = 0.5
@@ -93,10 +94,10 @@ def row(landmarks: int, features: int, uncertainty: float, outliers: float) -> s
     config = AssociationConfig()
     localizer = Localizer(RIG, config, EstimatorModels(pixel_sigma=SIGMA))
     prediction, rows, points, frame = scene(landmarks, features, uncertainty, outliers, np.random.default_rng(0))
-    look = (rows.descriptors, rows.laplacian, frame)
+    place, look = (prediction.uv_left, prediction.innovation), (rows.descriptors, rows.laplacian, frame)
     full = cpu_ms(lambda: all_distances(rows, frame))
-    windows = cpu_ms(lambda: match_in_windows(prediction, *look, config))
-    fixed = cpu_ms(lambda: match_in_windows(prediction, *look, replace(config, windows="fixed")))
+    windows = cpu_ms(lambda: follow(*place, *look, config))
+    fixed = cpu_ms(lambda: follow(*place, *look, replace(config, windows="fixed")))
     whole = cpu_ms(lambda: localizer.match(prediction, rows, points, frame, 0))
     found = len(localizer.match(prediction, rows, points, frame, 0))
     times = " | ".join(f"{t:.2f} ({t / full:.2f})" for t in (windows, fixed, whole))

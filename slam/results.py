@@ -9,10 +9,10 @@ import numpy as np
 
 from slam.data import FrameResult, FrameStatus, UpdateStatus
 from slam.geometry.se3 import Array, inverse
+from slam.input.warnings import REPEATED
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
-from slam.tracking.input_warnings import REPEATED
 
 
 def frame_result(

@@ -31,16 +31,16 @@ from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array
 from slam.geometry.trajectory import Trajectory
 from slam.interfaces import Backend, MapBackend
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas, TrackingGap
 from slam.mapping.atlas.loop_closer import Found, LoopCloser
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
-from slam.tracking.localizer import Localizer, nowhere
-from slam.tracking.patch_alignment import PatchAnchors
-from slam.tracking.standing import Standing
-from slam.tracking.state import TrackingState
+from slam.tracks.alignment import PatchAnchors
+from slam.tracks.localizer import Localizer, nowhere
+from slam.tracks.standing import Standing
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
 
 #: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
 #: back end measures the landmarks that gave that pose once more: a narrow prior would count them twice.

@@ -14,11 +14,12 @@ from slam.calibration import SavedCalibration, SelfCalibration
 from slam.config import SystemConfig
 from slam.data import Estimate, FrameResult, Prediction, StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError, SlamError
-from slam.extraction import Extracted, Extractor, as_frame
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
+from slam.input.extraction import Extracted, Extractor, as_frame
+from slam.input.features import usable
+from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.map_io import FIRST_FRAME, SavedMap
 from slam.mapping.step import Step
@@ -33,8 +34,7 @@ from slam.session import Elsewhere, Session, State
 from slam.showing import count
 from slam.third_party import named_failures
 from slam.tracker import Tracker
-from slam.tracking.feature_check import usable
-from slam.tracking.input_warnings import REPEATED
+from slam.tracks.table import LandmarkTable
 from slam.version import __version__
 
 
@@ -352,7 +352,7 @@ class StereoSlam:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about images, stamps or baseline, one line each (see `slam.tracking.input_warnings`)."""
+        """Warnings about images, stamps or baseline, one line each (see `slam.input.warnings`)."""
         return self._extractor.warnings
 
     def __getstate__(self) -> dict[str, object]:

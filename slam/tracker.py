@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam.data import Estimate, IdArray, Prediction, StereoFeatures
+from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
 from slam.geometry.arrays import Array, isin
 from slam.interfaces import Frontend, RestingBackend
-from slam.landmarks import LandmarkTable
 from slam.mapping.step import Step
 from slam.object_data import MotionLabels
 from slam.objects.modes import ObjectDetector
 from slam.rig_error import Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligned, Aligner
-from slam.tracking.protocol_check import require_estimate, require_positions, require_prediction, require_report
-from slam.tracking.standing import Standing
+from slam.third_party import checked
+from slam.tracks.alignment import Aligned, Aligner
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.standing import Standing
+from slam.tracks.table import LandmarkTable
 
 
 class Tracker:
@@ -51,8 +51,7 @@ class Tracker:
         standing = state.standing.after(self._session.rig, self._session.config.models.pixel_sigma, features)
         at_rest = standing.stands and isinstance(state.backend, RestingBackend)
         ask = state.backend.predict_at_rest if at_rest else state.backend.predict  # type: ignore[attr-defined]
-        prediction: Prediction = ask(features.stamp)
-        require_prediction(prediction, state.backend)
+        prediction: Prediction = checked(state.backend, "predict", ask(features.stamp))
         self.advanced = features.stamp
         return standing, prediction
 
@@ -106,8 +105,8 @@ class Tracker:
         positions, localizer = _positions(state, step.matches.ids), self._session.localizer
         dt = step.prediction.stamp - state.stamp
         asked, left_out = localizer.informative(step.prediction, step.matches, positions, dt)
-        report = state.backend.update(asked.observations(step.features), asked.T_world_left)
-        require_report(report, state.backend)
+        answer = state.backend.update(asked.observations(step.features), asked.T_world_left)
+        report: UpdateReport = checked(state.backend, "update", answer)
         tracking = localizer.state_after(step.tracking, step.prediction, step.features, asked, report)
         if state.begins_at(step.index):
             report = replace(report, reason=report.reason if len(step.landmarks) else NEW_MAP)
@@ -118,7 +117,8 @@ class Tracker:
     def estimate(self, state: State, step: Step) -> Step:
         """The camera's pose after an update; the rig's uncertainty is propagated to it, and its calibration learns."""
         self._session.calibration.observe(replace(step.measured, images=None), step.pose)
-        estimate, used = require_estimate(state.backend.estimate(landmarks=False), state.backend), step.report.used
+        estimate: Estimate = checked(state.backend, "estimate", state.backend.estimate(landmarks=False))
+        used = step.report.used
         rig_error, positions = self._session.rig_error, _positions(state, used)
         rig_error.uncertainty.observe(estimate.T_world_left, estimate.stamp, used, positions)
         return replace(step, estimate=estimate)
@@ -166,9 +166,9 @@ class Tracker:
 
     def whole_estimate(self, state: State) -> Estimate:
         """Pose and map of the back end, with the rig's uncertainty."""
-        return self._session.rig_error.added_to(require_estimate(state.backend.estimate(), state.backend))
+        return self._session.rig_error.added_to(checked(state.backend, "estimate", state.backend.estimate()))
 
 
 def _positions(state: State, ids: IdArray) -> Array:
     """Landmarks' positions (N, 3) [m] in the world."""
-    return require_positions(state.backend.positions(ids), ids, state.backend)
+    return np.asarray(checked(state.backend, "positions", state.backend.positions(ids), n=len(ids)))

@@ -2,5 +2,5 @@
 
 `mapper` runs once per frame, `selection` chooses new landmarks, `culling` those to erase, `monocular` triangulates
 features without a right image, `map_io` reads and writes maps, `relocalizer` starts back ends in a known map, and
-`atlas` closes loops. May import `slam.tracking`, `slam.geometry` and the data.
+`atlas` closes loops. May import `slam.tracks`, `slam.geometry` and the data.
 """

@@ -13,7 +13,6 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
-from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -21,8 +20,9 @@ from slam.mapping.known_landmarks import in_front
 from slam.mapping.monocular import MonocularDepth, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
-from slam.tracking.localizer import LandmarkMatches, Localizer
-from slam.tracking.visibility import MapView, expected_landmarks
+from slam.tracks.localizer import LandmarkMatches, Localizer
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import MapView, expected_landmarks
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,14 @@ import numpy as np
 
 from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MotionLabels, MovingObject
 from slam.rig_error import CommonError, Correction
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import PatchAnchors
-from slam.tracking.standing import Standing
-from slam.tracking.state import TrackingState
+from slam.tracks.alignment import PatchAnchors
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.standing import Standing
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
 
 _NONE = np.zeros(0, np.int64)
 _NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))

@@ -23,7 +23,7 @@ from slam.models import EstimatorModels, MotionModel
 from slam.object_models import ObjectModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
-from slam.tracking.association import AssociationConfig
+from slam.tracks.config import AssociationConfig
 from slam.worlds import names as world_names
 from slam.worlds import options as world_options
 from slam.worlds.options import Option

@@ -35,8 +35,8 @@ from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.rig_error import CommonError, Correction
 from slam.runtime.blas import one_blas_thread
-from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import Localizer
+from slam.tracks.config import AssociationConfig
+from slam.tracks.localizer import Localizer
 
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph

@@ -16,7 +16,7 @@ from slam.mapping.monocular import frame_covariance, two_view_depth
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
-from slam.tracking.localizer import Localizer, nowhere
+from slam.tracks.localizer import Localizer, nowhere
 from tests.slam.scene import RIG, Cloud
 
 BACKENDS = ("ekf", "smoother", "window")

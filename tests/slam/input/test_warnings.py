@@ -14,9 +14,9 @@ import slam
 from slam import worlds
 from slam.data import StereoFeatures, StereoFrame
 from slam.geometry.camera import PinholeCamera
+from slam.input.pair import pair_geometry
+from slam.input.warnings import InputWarnings, farthest_apart
 from slam.models import models_for
-from slam.tracking.input_warnings import InputWarnings, farthest_apart
-from slam.tracking.pair_check import pair_geometry
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=1")
 FRAME = next(iter(SEQUENCE))

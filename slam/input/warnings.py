@@ -11,10 +11,10 @@ from slam.errors import CalibrationError, MeasurementError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
+from slam.input.features import usable
+from slam.input.pair import NO_DISPARITY, PairGeometry, most, pair_geometry
 from slam.models import EstimatorModels
-from slam.tracking.feature_check import usable
-from slam.tracking.pair_check import NO_DISPARITY, PairGeometry, most, pair_geometry
-from slam.tracking.state import ENOUGH_FEATURES
+from slam.tracks.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 

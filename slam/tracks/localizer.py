@@ -16,13 +16,14 @@ from slam.geometry.arrays import isin, median
 from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
-from slam.tracking.informative import most_informative
-from slam.tracking.standing import Standing
-from slam.tracking.state import NO_POSE, TrackingState
-from slam.tracking.visibility import similar_view
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import Matches, follow, match_everywhere
+from slam.tracks.informative import most_informative
+from slam.tracks.standing import Standing
+from slam.tracks.state import NO_POSE, TrackingState
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import similar_view
 
 _MOST = 0.5  # fixed: share of what is in view that makes a majority
 
@@ -279,9 +280,8 @@ class Localizer:
         self, prediction: Prediction, landmarks: LandmarkTable, rows: NDArray[np.intp], features: StereoFeatures
     ) -> Matches:
         """Matches by rows of the whole map."""
-        descriptors = (landmarks.descriptors, landmarks.laplacian)
-        found = match_in_windows(prediction, *descriptors, features, self.config, among=rows)
-        return Matches(rows[found.landmarks], found.features)
+        looks = landmarks.descriptors, landmarks.laplacian
+        return follow(prediction.uv_left, prediction.innovation, *looks, features, self.config, rows)
 
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False

@@ -14,7 +14,7 @@ from slam.geometry import se3
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.tracking.state import PoseHypotheses, TrackingState
+from slam.tracks.state import PoseHypotheses, TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")

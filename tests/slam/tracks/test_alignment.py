@@ -12,9 +12,9 @@ from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.landmarks import LandmarkTable
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligner, PatchAnchors, warps_of
+from slam.tracks.alignment import Aligner, PatchAnchors, warps_of
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.table import LandmarkTable
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 

@@ -7,11 +7,11 @@ import pytest
 
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import Localizer, jump
-from slam.tracking.state import TrackingState
+from slam.tracks.config import AssociationConfig
+from slam.tracks.localizer import Localizer, jump
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
 from tests.slam.scene import RIG, Cloud
 
 T_TRUE = se3.exp(np.array([0.02, 0.3, -0.01, 0.2, 0.05, 0.4]))

@@ -10,13 +10,13 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
+from slam.input.warnings import InputWarnings
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.third_party import named_failures
-from slam.tracking.input_warnings import InputWarnings
 
 #: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].
 _ROWS = 1.5
@@ -81,7 +81,7 @@ class Extractor:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about the images so far, one line each (see `slam.tracking.input_warnings`)."""
+        """Warnings about the images so far, one line each (see `slam.input.warnings`)."""
         return [*self._warnings.lines, *filter(None, [self._warnings.repeated])]
 
     def warn_of_repeated(self, number: int) -> None:

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.data import BoolArray, IdArray, Patches, StereoFeatures
+from slam.errors import SlamError
 from slam.geometry.arrays import Array, ascending, isin
 from slam.geometry.rig import RectifiedRig, StereoRig
 from slam.interfaces import AligningFrontend, Frontend
-from slam.landmarks import LandmarkTable
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.protocol_check import require_aligned, require_patches
+from slam.third_party import checked
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.table import LandmarkTable
 
 _LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
 _RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that another such change stays below the largest
@@ -89,7 +91,7 @@ class Aligner:
 
     Args:
         rig: the cameras.
-        enabled: see `slam.tracking.association.AssociationConfig.align`; if False, features are left unchanged.
+        enabled: see `slam.tracks.follow.AssociationConfig.align`; if False, features are left unchanged.
     """
 
     def __init__(self, rig: StereoRig, enabled: bool) -> None:
@@ -132,7 +134,7 @@ class Aligner:
         outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
         left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
         answer = frontend.align(features.images, matched.patches, warps, left, right)
-        left, right = require_aligned(answer, len(rows), frontend)
+        left, right = _pixels(frontend, answer, len(rows))
         stereo = features.has_stereo[rows]
         found = similar & rectified.rig.left.in_image(left) & (rectified.rig.right.in_image(right) | ~stereo)
         right[~stereo] = np.nan
@@ -172,9 +174,18 @@ class Aligner:
         if not new.any():
             return anchors
         uv = self._rig.rectified.rectify_left(features.uv_left[rows[new]])
-        patches = frontend.patches(features.images, uv, features.scale[rows[new]])
-        require_patches(patches, len(uv), anchors.patches, frontend)
+        sizes = {"n": len(uv), **({"s": anchors.patches.images.shape[1]} if len(anchors) else {})}
+        answer = frontend.patches(features.images, uv, features.scale[rows[new]])
+        patches: Patches = checked(frontend, "patches", answer, **sizes)
         return anchors.with_new(ids[new], patches, T_world_left)
+
+
+def _pixels(frontend: AligningFrontend, answer: Any, count: int) -> tuple[Array, Array]:
+    """Left and right pixels (N, 2) that a front end has found; raises SlamError where it answered something else."""
+    both = [np.shape(uv) for uv in checked(frontend, "align", answer)]
+    if both != 2 * [(count, 2)]:
+        raise SlamError(f"{type(frontend).__name__}.align: must give left and right pixels ({count}, 2), got {both}")
+    return answer[0], answer[1]
 
 
 def warps_of(rectified: RectifiedRig, poses: Array, T_world_left: Array, positions: Array) -> Array:
