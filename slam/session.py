@@ -36,7 +36,6 @@ from slam.mapping.atlas.loop_closer import Found, LoopCloser
 from slam.mapping.map_io import SavedMap
 from slam.mapping.mapper import Mapper
 from slam.mapping.step import Step
-from slam.tracks.alignment import PatchAnchors
 from slam.tracks.localizer import Localizer, nowhere
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
@@ -62,7 +61,6 @@ class State:
         stamp: its time [s].
         tracking: how localization has gone.
         standing: whether the camera stands.
-        anchors: image patches of landmarks at first sight.
         dimensions: length of the descriptors; None before the first feature.
         mapped: whether there ever was a landmark.
         measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
@@ -79,7 +77,6 @@ class State:
     stamp: float = -np.inf
     tracking: TrackingState = field(default_factory=TrackingState)
     standing: Standing = field(default_factory=Standing)
-    anchors: PatchAnchors = field(default_factory=PatchAnchors.none)
     dimensions: int | None = None
     mapped: bool = False
     measured_at: float = -np.inf
@@ -105,7 +102,7 @@ class State:
         return replace(
             self, landmarks=step.landmarks, atlas=step.atlas, index=step.index, stamp=step.features.stamp,
             tracking=step.tracking, standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
-            anchors=step.anchors, checksum=checksum, mapped=self.mapped or len(step.added) > 0,
+            checksum=checksum, mapped=self.mapped or len(step.added) > 0,
             dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
             measured_at=step.features.stamp if known else self.measured_at,
         )  # fmt: skip

@@ -15,7 +15,7 @@ from slam.objects.modes import ObjectDetector
 from slam.rig_error import Revision
 from slam.session import NEW_MAP, Elsewhere, Session, State
 from slam.third_party import checked
-from slam.tracks.alignment import Aligned, Aligner
+from slam.tracks.alignment import Aligner
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.standing import Standing
 from slam.tracks.table import LandmarkTable
@@ -78,12 +78,12 @@ class Tracker:
                 return Elsewhere(matches.T_world_left, found)
             matches = LandmarkMatches.nothing()
         places = state.backend.positions
-        aligned = self._aligner.align(self._frontend, state.anchors, features, matches, landmarks, places)
-        if aligned.features is not features:
-            corrected = self._session.calibration.correct(aligned.features)
+        aligned, landmarks = self._aligner.align(self._frontend, features, matches, landmarks, places)
+        if aligned is not features:
+            corrected = self._session.calibration.correct(aligned)
         step = Step(
-            index, aligned.features, replace(corrected, images=None), prediction, landmarks, matches, standing,
-            tracking, aligned.anchors, state.atlas,
+            index, aligned, replace(corrected, images=None), prediction, landmarks, matches, standing, tracking,
+            state.atlas,
         )  # fmt: skip
         suspects = self._suspects(state, step)
         moving = isin(matches.ids, suspects)
@@ -133,11 +133,11 @@ class Tracker:
     def manage(self, state: State, step: Step) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
-        aligned, T = Aligned(step.measured, step.anchors), step.estimate.T_world_left
-        anchors = self._aligner.anchored(self._frontend, aligned, step.matches, step.added, T)
+        seen, T = step.matches.joined(step.added), step.estimate.T_world_left
+        landmarks = self._aligner.with_patches(self._frontend, step.measured, seen, step.landmarks, T)
         new = step.added.ids[~isin(step.added.ids, step.erased)]
         self._session.rig_error.uncertainty.change(new, _positions(state, new), step.erased)
-        return replace(step, anchors=anchors)
+        return replace(step, landmarks=landmarks)
 
     def close_loops(self, state: State, step: Step) -> Step:
         """Make the frame a keyframe where it differs; a loop corrects the path, and returns old landmarks to the map.

@@ -232,8 +232,7 @@ class Mapper:
         ids = self._new_ids(len(best))
         backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
         landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
-        both = LandmarkMatches(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
-        return landmarks, both
+        return landmarks, added.joined(LandmarkMatches(ids, new.rows[best]))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

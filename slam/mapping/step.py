@@ -11,7 +11,6 @@ from slam.geometry.se3 import Array
 from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MotionLabels, MovingObject
 from slam.rig_error import CommonError, Correction
-from slam.tracks.alignment import PatchAnchors
 from slam.tracks.localizer import LandmarkMatches
 from slam.tracks.standing import Standing
 from slam.tracks.state import TrackingState
@@ -34,7 +33,6 @@ class Step:
         matches: landmarks and the features that show them, without the withheld ones.
         standing: whether the camera stands.
         tracking: whether the pose is known.
-        anchors: image patches of landmarks at first sight.
         atlas: keyframes and loops.
         suspects: ids of landmarks that may move.
         withheld: those of them that were matched; they are withheld from the back end's update.
@@ -59,7 +57,6 @@ class Step:
     matches: LandmarkMatches
     standing: Standing
     tracking: TrackingState
-    anchors: PatchAnchors
     atlas: Atlas
     suspects: IdArray = field(default_factory=_NONE.copy)
     withheld: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)

@@ -54,9 +54,19 @@ class LandmarkMatches:
         """A copy without some landmarks."""
         return self.select(~isin(self.ids, ids))
 
+    def joined(self, other: LandmarkMatches) -> LandmarkMatches:
+        """These and others, of other landmarks."""
+        ids, rows = np.concatenate([self.ids, other.ids]), np.concatenate([self.rows, other.rows])
+        return replace(self, ids=ids, rows=rows)
+
     def select(self, rows: NDArray) -> LandmarkMatches:
         """Some of the landmarks (a mask or indices)."""
         return LandmarkMatches(self.ids[rows], self.rows[rows], self.T_world_left, doubted=self.doubted)
+
+    def rows_of(self, ids: IdArray) -> NDArray[np.intp]:
+        """Rows of the features that show landmarks, by their ids, all of which were found."""
+        order = np.argsort(self.ids, kind="stable")
+        return self.rows[order[np.searchsorted(self.ids, ids, sorter=order)]]
 
     def landmark_of(self, features: int) -> IdArray:
         """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
