@@ -17,7 +17,7 @@ from slam.errors import ConfigurationError, MeasurementError, SlamError
 from slam.geometry.rig import StereoRig
 from slam.geometry.trajectory import Trajectory
 from slam.input.extraction import Extracted, Extractor, as_frame
-from slam.input.features import usable
+from slam.input.features import documented, following
 from slam.input.warnings import REPEATED
 from slam.interfaces import Backend, Frontend
 from slam.mapping.atlas.atlas import Atlas
@@ -223,7 +223,7 @@ class StereoSlam:
                 protocols say, or raise an exception of their own, which is then the cause (`PartError`).
         """
         with self._stepping, self._named(f"frame {self._state.index + 1}"):
-            return self._process(features, None)
+            return self._process(documented(features, self.rig), None)
 
     def _timed_step(self, found: Extracted) -> FrameResult:
         """A step with what was found in images; the result has the time of extraction, too."""
@@ -268,7 +268,7 @@ class StereoSlam:
     @one_blas_thread
     def _process(self, features: StereoFeatures, checksum: tuple[int, int] | None) -> FrameResult:
         """A step, made again as a whole where another back end takes over; its state then replaces the last one's."""
-        features = usable(features, self.rig, self._state.dimensions, self._tracker.advanced)
+        features = following(features, self._state.dimensions, self._tracker.advanced)
         self._roll_back()
         state, session, tracker = self._state, self._session, self._tracker
         if state.prior_map is not None:

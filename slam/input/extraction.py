@@ -10,6 +10,7 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
+from slam.input.features import documented
 from slam.input.warnings import InputWarnings
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
@@ -76,7 +77,7 @@ class Extractor:
 
     def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
         rows = getattr(getattr(frontend, "config", None), "epipolar", _ROWS)
-        self._warnings = InputWarnings(rig, models, rows)
+        self._rig, self._warnings = rig, InputWarnings(rig, models, rows)
         self._extracting = OneThread("this system's front end")
 
     @property
@@ -94,7 +95,7 @@ class Extractor:
 
         Raises:
             ConfigurationError: there is no front end.
-            MeasurementError: this is no frame.
+            MeasurementError: this is no frame, or the features are not as documented.
             SlamError: another thread is extracting; or the front end failed (`PartError`).
         """
         if frontend is None:
@@ -103,7 +104,7 @@ class Extractor:
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
-            features = frontend.extract(frame)
+            features = documented(frontend.extract(frame), self._rig)
             if not (frame.left_mask is None and frame.right_mask is None):
                 features = features.outside(frame.left_mask, frame.right_mask)
         self._warnings.look(frame, features)

@@ -1,4 +1,4 @@
-"""Checks of the features that a caller gives, before a step changes anything."""
+"""Checks of features before a step changes anything: once what they are, then whether they follow the last frame's."""
 
 from __future__ import annotations
 
@@ -14,52 +14,63 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 
-#: Columns of `StereoFeatures`: number of dimensions, kinds of dtype that are taken, and the dtype that comes out.
-_COLUMNS: dict[str, tuple[int, str, type]] = {
-    "uv_left": (2, "f", np.float64),
-    "uv_right": (2, "f", np.float64),
-    "scale": (1, "f", np.float64),
-    "angle": (1, "f", np.float64),
-    "response": (1, "f", np.float64),
-    "laplacian": (1, "i", np.int8),
-    "descriptors": (2, "f", np.float32),
+#: Columns of `StereoFeatures`: numbers in a row (−1 for any), kinds of dtype that are taken, the dtype that comes out,
+#: and what a value must be.
+_COLUMNS: dict[str, tuple[tuple[int, ...], str, type, Any]] = {
+    "uv_left": ((2,), "f", np.float64, np.isfinite),
+    "uv_right": ((2,), "f", np.float64, lambda uv: ~np.isinf(uv)),
+    "scale": ((), "f", np.float64, np.isfinite),
+    "angle": ((), "f", np.float64, np.isfinite),
+    "response": ((), "f", np.float64, np.isfinite),
+    "laplacian": ((), "i", np.int8, np.isfinite),
+    "descriptors": ((-1,), "f", np.float32, np.isfinite),
 }
 
 
-def usable(features: StereoFeatures, rig: StereoRig, dimensions: int | None, after: float) -> StereoFeatures:
-    """The features with the documented dtypes; a frame without features gets descriptors (0, `dimensions`).
-
-    Args:
-        features: of a frame.
-        rig: the cameras.
-        dimensions: length of the descriptors so far; None if there were none.
-        after: stamp of the frame before [s].
+def documented(features: Any, rig: StereoRig) -> StereoFeatures:
+    """The features with the documented dtypes.
 
     Raises:
         MeasurementError: they are not as `StereoFeatures` says: a wrong type, shape or number of dimensions, a value
             that is not finite (except NaN in `uv_right`), a pixel farther outside the image than its width or height,
-            a stamp that is no number or not later than the one before, or images of another type or size.
+            a stamp that is no number, or images of another type or size.
     """
     if not isinstance(features, StereoFeatures):
         raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
-    stamp = _number("stamp", features.stamp)
+    stamp, threshold = _number("stamp", features.stamp), _number("threshold", features.threshold)
     if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP:
         raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
-    if stamp <= after:
-        raise MeasurementError(
-            f"features: the stamp {stamp} s is not later than {after} s, the last frame's (a frame whose step was "
-            "interrupted counts too): go on with a later one"
-        )
-    threshold = _number("threshold", features.threshold)
-    columns: dict[str, Any] = {name: _column(name, getattr(features, name)) for name in _COLUMNS}
-    _require_rows(columns)
-    for name in ("scale", "angle", "response", "descriptors"):
-        if not np.isfinite(columns[name]).all():
-            raise MeasurementError(f"features: a value of {name} is not finite")
-    _require_pixels(columns["uv_left"], columns["uv_right"], rig)
+    columns: dict[str, Any] = {name: _column(name, getattr(features, name), len(features)) for name in _COLUMNS}
+    size = np.array([rig.width, rig.height])
+    for name in ("uv_left", "uv_right"):
+        if ((columns[name] < -size) | (columns[name] > 2 * size)).any():  # NaN compares false
+            raise MeasurementError(f"features: a pixel of {name} lies far outside of the image")
     _require_images(features.images, rig)
-    columns["descriptors"] = _of_length(columns["descriptors"], dimensions)
     return replace(features, stamp=stamp, threshold=threshold, **columns)
+
+
+def following(features: StereoFeatures, dimensions: int | None, after: float) -> StereoFeatures:
+    """The features; a frame without any gets descriptors (0, `dimensions`).
+
+    Args:
+        features: as documented.
+        dimensions: length of the descriptors so far; None if there were none.
+        after: stamp of the frame before [s].
+
+    Raises:
+        MeasurementError: the stamp is not later, or the descriptors are of another length.
+    """
+    if features.stamp <= after:
+        raise MeasurementError(
+            f"features: the stamp {features.stamp} s is not later than {after} s, the last frame's (a frame whose step "
+            "was interrupted counts too): go on with a later one"
+        )
+    length = features.descriptors.shape[1]
+    if dimensions is None or length == dimensions:
+        return features
+    if len(features):
+        raise MeasurementError(f"features: descriptors have {length} numbers, those of earlier frames {dimensions}")
+    return replace(features, descriptors=np.zeros((0, dimensions), np.float32))
 
 
 def _number(name: str, value: Any) -> float:
@@ -72,38 +83,21 @@ def _number(name: str, value: Any) -> float:
     raise MeasurementError(f"features: {name} must be a number, got {str(value)[:40]!r}")
 
 
-def _column(name: str, array: Any) -> Array:
+def _column(name: str, array: Any, rows: int) -> Array:
     """One column with its documented dtype."""
-    dimensions, kinds, dtype = _COLUMNS[name]
-    if not isinstance(array, np.ndarray) or array.ndim != dimensions or array.dtype.kind not in kinds:
+    shape, kinds, dtype, good = _COLUMNS[name]
+    if not isinstance(array, np.ndarray) or array.ndim != 1 + len(shape) or array.dtype.kind not in kinds:
         got = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise MeasurementError(
-            f"features: {name} must be an array of {dimensions} dimensions of {dtype.__name__}, got {got}"
-        )
-    if array.dtype == dtype:
-        return np.asarray(array)
-    with np.errstate(over="ignore"):  # reported as not finite
-        return (np.sign(array) if "i" in kinds else np.asarray(array)).astype(dtype)
-
-
-def _require_rows(columns: dict[str, Any]) -> None:
-    n = len(columns["uv_left"])
-    for name, array in columns.items():
-        wrong = len(array) != n or (name.startswith("uv") and array.shape[1] != 2)
-        if wrong or (n and not array.size):
-            raise MeasurementError(f"features: {name} is of shape {array.shape}, with {n} rows in uv_left")
-
-
-def _require_pixels(left: Array, right: Array, rig: StereoRig) -> None:
-    """Check that left pixels are finite, right pixels finite or NaN, and none far outside its image."""
-    if not np.isfinite(left).all():
-        raise MeasurementError("features: a left pixel is not finite")
-    if np.isinf(right).any():
-        raise MeasurementError("features: a right pixel is infinite; NaN says that there is no stereo match")
-    size = np.array([rig.width, rig.height])
-    for name, uv in (("left", left), ("right", right)):
-        if ((uv < -size) | (uv > 2 * size)).any():  # NaN compares false
-            raise MeasurementError(f"features: a {name} pixel lies far outside of the image")
+        dimensions = f"{1 + len(shape)} dimensions of {dtype.__name__}"
+        raise MeasurementError(f"features: {name} must be an array of {dimensions}, got {got}")
+    if len(array) != rows or (shape == (2,) and array.shape[1] != 2) or (rows and not array.size):
+        raise MeasurementError(f"features: {name} is of shape {array.shape}, with {rows} rows in uv_left")
+    if array.dtype != dtype:
+        with np.errstate(over="ignore"):  # reported as not finite
+            array = (np.sign(array) if "i" in kinds else array).astype(dtype)
+    if not good(array).all():
+        raise MeasurementError(f"features: a value of {name} is not finite")
+    return np.asarray(array)
 
 
 def _require_images(images: Any, rig: StereoRig) -> None:
@@ -119,14 +113,3 @@ def _require_images(images: Any, rig: StereoRig) -> None:
         if not isinstance(image, np.ndarray) or image.dtype != np.float32 or image.shape != shape:
             got = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise MeasurementError(f"features: the {side} image must be float32 of shape {shape}, got {got}")
-
-
-def _of_length(descriptors: Array, dimensions: int | None) -> Array:
-    """Descriptors (N, D), checked to be as long as those before; an empty array gets that length too."""
-    if dimensions is None or descriptors.shape[1] == dimensions:
-        return descriptors
-    if len(descriptors):
-        raise MeasurementError(
-            f"features: descriptors have {descriptors.shape[1]} numbers, those of earlier frames {dimensions}"
-        )
-    return np.zeros((0, dimensions), descriptors.dtype)
