@@ -247,7 +247,7 @@ class Session:
             T, standing = before.T_world_left, Standing()
             new = self._new(T_world_left=T.tolist())
             prediction = new.predict(stamp)
-            after, common = new.estimate(landmarks=False), self.rig_error.common(as_given=False)
+            after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
             atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
         else:
             new, place, landmarks = self._start(T), None, state.landmarks

@@ -291,7 +291,7 @@ class StereoSlam:
             step = self._step(state, features, begun)
             assert not isinstance(step, Elsewhere)  # a back end that takes over is believed
         step = replace(step, erased=session.left_behind(self._state, step), repeated=repeated)
-        common = session.rig_error.common(as_given=True)
+        common = session.rig_error.common(as_reported=True)
         result = frame_result(step, state.mapped, revision, self._stages.milliseconds, common)
         self._state, self._stages = state.after(step, checksum), Stages()
         return result
@@ -329,7 +329,7 @@ class StereoSlam:
         self._roll_back()
         if self._state.prior_map is not None:
             return self._session.map_estimate(self._state, float("nan"))
-        estimate, common = self._tracker.whole_estimate(self._state), self._session.rig_error.common(as_given=False)
+        estimate, common = self._tracker.whole_estimate(self._state), self._session.rig_error.common(as_reported=False)
         return self.atlas.estimate(estimate, common, not of_map)
 
     @one_blas_thread

@@ -145,7 +145,7 @@ class Tracker:
         The rig's uncertainty is added to the pose.
         """
         session, rig_error = self._session, self._session.rig_error
-        estimate, common = rig_error.added_to(step.estimate), rig_error.common(as_given=False)
+        estimate, common = rig_error.added_to(step.estimate), rig_error.common(as_reported=False)
         step = replace(step, estimate=estimate, common=common, correction=session.calibration.applied)
         atlas, seen_again = session.loop_closer.update(state.atlas, step, state.path)
         if seen_again is not None:

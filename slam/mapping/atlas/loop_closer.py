@@ -238,7 +238,7 @@ class LoopCloser:
 
     def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray) -> NDArray[np.intp]:
         """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view."""
-        moved = inverse(atlas.rows.poses[:-1]) @ new.T_odom_left
+        moved = inverse(atlas.poses[:-1]) @ new.T_odom_left
         apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
         return self._not_measured(atlas, likely, known)[:1]
@@ -269,7 +269,7 @@ class LoopCloser:
 
     def _within_reach(self, atlas: Atlas, new: Keyframe, poses: Array, here: Array, covariance: Array) -> BoolArray:
         """Which keyframes (K,), at poses (K, 4, 4), the camera has left but may, given its uncertainty, see again."""
-        c, length = self._config, new.travelled - atlas.rows.travelled
+        c, length = self._config, new.travelled - atlas.travelled
         far = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
@@ -342,7 +342,7 @@ class LoopCloser:
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         atlas = replace(atlas, confirmed=True)
         if off > limit:
-            atlas = replace(atlas, rows=atlas.rows.inflated(loop.first, loop.second, off / _DIMENSIONS))
+            atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain = atlas.chain(rig, path())
             graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
         elif atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
@@ -366,7 +366,7 @@ class LoopCloser:
         every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
 
         def places(loops: Sequence[Loop]) -> list[Loop]:
-            return spaced(loops, atlas.rows.travelled, left)
+            return spaced(loops, atlas.travelled, left)
 
         if not atlas.loops or len(places([x for x in atlas.inactive_loops if x.pair in refused])) < 2:
             return atlas, None

@@ -124,7 +124,7 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
     np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
-    in_path = system._session.rig_error.common(as_given=False).root[:-2, -1]
+    in_path = system._session.rig_error.common(as_reported=False).root[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
 
 
