@@ -158,7 +158,7 @@ class Tracker:
         """The state after a step that was interrupted in a stage: what it did to the back end's map is undone."""
         if stage in ("associate", "objects"):
             self.objects.restart()
-        if stage in (None, "predict"):
+        if stage in (None, "predict") or state.prior_map is not None:  # that back end has not begun
             return state
         landmarks = self._session.mapper.reconcile(state.backend, state.landmarks)
         self._session.rig_error.uncertainty.keep(np.zeros(0, np.int64) if landmarks is None else landmarks.ids)
