@@ -116,7 +116,7 @@ class StereoSlam:
             else registry.require_methods("backends", backend)
         )
         self._session = Session(rig, c, names[1], first, rig_prior)
-        self._tracker = Tracker(self._session, self.frontend, detector_for(rig, c.objects, c.models))
+        self._tracker = Tracker(self._session, detector_for(rig, c.objects, c.models))
         self._stages = Stages()
         self._extractor = Extractor(self.frontend, rig, c.models)
         self._stepping = OneThread("this system")
@@ -249,7 +249,7 @@ class StereoSlam:
         with stage("predict"):  # the motion model advances the camera's pose (paper A, Eq. 11), unless it stands
             standing, prediction = (state.standing, begun) if begun else t.predict(state, features)
         with stage("associate"):  # correct the features; find landmarks in size-variable windows (paper A, IV)
-            step = t.associate(state, features, standing, prediction)
+            step = t.associate(state, features, standing, prediction, self.frontend)
             if isinstance(step, Elsewhere):  # the camera was found somewhere else in the map
                 return step
         with stage("update"):  # the landmarks' pixels correct pose and map
@@ -261,7 +261,7 @@ class StereoSlam:
         with stage("objects"):  # sort the features: still, moving, undecided; estimate moving bodies (paper B, 3)
             step = t.sort(state, step)
         with stage("manage"):  # count what was seen, erase bad landmarks, add new ones (paper A, IV)
-            step = t.manage(state, step)
+            step = t.manage(state, step, self.frontend)
         with stage("atlas"):  # the frame may become a keyframe; a loop corrects the path
             return t.close_loops(state, step)
 

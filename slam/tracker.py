@@ -26,17 +26,16 @@ class Tracker:
 
     Args:
         session: with the parts of the system, and the back ends.
-        frontend: which made the features; None where they are given.
         objects: detects what moves.
 
     Attributes:
         advanced: stamp to which a back end was last advanced [s]; an interrupted step counts.
     """
 
-    def __init__(self, session: Session, frontend: Frontend | None, objects: ObjectDetector) -> None:
+    def __init__(self, session: Session, objects: ObjectDetector) -> None:
         self.objects = objects
         self.advanced = -np.inf
-        self._session, self._frontend = session, frontend
+        self._session = session
         self._aligner = Aligner(session.rig, session.config.association.align)
 
     def revise(self, state: State) -> Revision | None:
@@ -56,9 +55,10 @@ class Tracker:
         return standing, prediction
 
     def associate(
-        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction
-    ) -> Step | Elsewhere:
-        """Match landmarks with features, and align the features if the front end can."""
+        self, state: State, features: StereoFeatures, standing: Standing, prediction: Prediction,
+        frontend: Frontend | None,
+    ) -> Step | Elsewhere:  # fmt: skip
+        """Match landmarks with features, and align the features if the front end that made them can."""
         corrected, found = self._session.calibration.correct(features), None
         landmarks = state.landmarks or LandmarkTable.empty(features.descriptors.shape[1])
 
@@ -78,7 +78,7 @@ class Tracker:
                 return Elsewhere(matches.T_world_left, found)
             matches = LandmarkMatches.nothing()
         places = state.backend.positions
-        aligned, landmarks = self._aligner.align(self._frontend, features, matches, landmarks, places)
+        aligned, landmarks = self._aligner.align(frontend, features, matches, landmarks, places)
         if aligned is not features:
             corrected = self._session.calibration.correct(aligned)
         step = Step(
@@ -130,11 +130,11 @@ class Tracker:
         labels = labels.with_undecided(standing.leaving(len(step.features)))
         return replace(step, labels=labels, objects=self.objects.update(state.backend, step.features))
 
-    def manage(self, state: State, step: Step) -> Step:
+    def manage(self, state: State, step: Step, frontend: Frontend | None) -> Step:
         """Change the map, and remember the image patches of new landmarks."""
         step = self._session.mapper.update(state.backend, step)
         seen, T = step.matches.joined(step.added), step.estimate.T_world_left
-        landmarks = self._aligner.with_patches(self._frontend, step.measured, seen, step.landmarks, T)
+        landmarks = self._aligner.with_patches(frontend, step.measured, seen, step.landmarks, T)
         new = step.added.ids[~isin(step.added.ids, step.erased)]
         self._session.rig_error.uncertainty.change(new, _positions(state, new), step.erased)
         return replace(step, landmarks=landmarks)
