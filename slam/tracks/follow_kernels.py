@@ -141,7 +141,7 @@ def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows,
             distance[count] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
             count += 1
     a, b, level, distance = a[:count], b[:count], level[:count], distance[:count]
-    pairs, found = np.empty((2, min(len(pixels), len(uv))), np.intp), 0
+    pairs, found = np.empty((2, len(pixels)), np.intp), 0  # tracks that look alike to the bit may share a feature
     done, taken, allowed = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_), np.empty(count, np.bool_)
     for number in range(levels):
         for p in range(count):

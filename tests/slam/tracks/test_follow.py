@@ -116,6 +116,15 @@ def test_no_greedy_theft():
     assert matches.landmarks.tolist() == [1]
 
 
+def test_tracks_that_look_alike_to_the_bit_share_a_feature():
+    look, sign = np.eye(1, 8, dtype=np.float32), np.ones(1, np.int8)
+    one = np.ones(1)
+    feature = StereoFeatures(0.0, np.zeros((1, 2)), np.full((1, 2), np.nan), one, one, one, sign, look)
+    many = np.zeros((500, 2)), np.tile(np.eye(2), (500, 1, 1)), look.repeat(500, axis=0), sign.repeat(500)
+    matches = follow(*many, feature, CONFIG)
+    assert matches.landmarks.tolist() == list(range(500)) and not matches.features.any()
+
+
 def test_ambiguous_features_are_left_alone():
     cloud = Cloud(1)
     features, _ = cloud.features(np.eye(4), 0.0)
