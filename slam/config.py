@@ -13,7 +13,7 @@ from slam.mapping.config import MapConfig
 from slam.models import FORBID_UNKNOWN, EstimatorModels, models_for, require_not_negative
 from slam.objects.config import ObjectsConfig
 from slam.settings import apply_settings
-from slam.tracking.association import AssociationConfig
+from slam.tracks.config import AssociationConfig
 
 #: Map management by kind of motion: a car does not soon return to what it has passed, and gets so much nearer to what
 #: lies ahead that descriptors change. With 200 landmarks, errors on three drives and three seeds of `street` are no

@@ -9,37 +9,26 @@ import numpy as np
 
 from slam.data import FrameResult, FrameStatus, UpdateStatus
 from slam.geometry.se3 import Array, inverse
-from slam.mapping.atlas.atlas import Atlas
-from slam.mapping.mapper import MapChange
+from slam.input.warnings import REPEATED
 from slam.mapping.step import Step
 from slam.object_data import MovingObject
 from slam.rig_error import CommonError, Revision
-from slam.tracking.input_warnings import REPEATED
 
 
 def frame_result(
-    step: Step,
-    change: MapChange,
-    objects: tuple[MovingObject, ...],
-    mapped_before: bool,
-    revision: Revision | None,
-    milliseconds: Mapping[str, float],
-    atlas: Atlas,
-    common: CommonError,
-) -> FrameResult:
+    step: Step, mapped_before: bool, revision: Revision | None, milliseconds: Mapping[str, float], common: CommonError
+) -> FrameResult:  # fmt: skip
     """The result of a step.
 
     Args:
-        step: the frame's result before the map changed.
-        change: of the map.
-        objects: the moving bodies.
+        step: the frame, after all stages.
         mapped_before: whether there ever was a landmark before this frame.
         revision: change of the correction of earlier frames' pixels before the step; None without one.
         milliseconds: wall time per stage.
-        atlas: after the step; transforms poses to the map.
         common: the part of the pose's error that it shares with the poses reported in other frames.
     """
-    status, reason = frame_status(step, len(change.added), mapped_before)
+    atlas = step.atlas
+    status, reason = frame_status(step, mapped_before)
     return FrameResult(
         index=step.index,
         status=status,
@@ -50,19 +39,19 @@ def frame_result(
         predicted=len(step.prediction.ids),
         matched=step.matches.ids,
         matched_features=step.matches.rows,
-        added=change.added.ids,
-        added_features=change.added.rows,
-        erased=change.erased,
-        map_size=len(change.landmarks),
+        added=step.added.ids,
+        added_features=step.added.rows,
+        erased=step.erased,
+        map_size=len(step.landmarks),
         milliseconds=dict(milliseconds),
         moving_features=step.labels.moving,
-        objects=tuple(_in_map(thing, atlas.T_map_odom) for thing in objects) if atlas.loops else objects,
+        objects=tuple(_in_map(thing, atlas.T_map_odom) for thing in step.objects) if atlas.loops else step.objects,
         revision=revision,
         T_map_odom=atlas.T_map_odom,
         loop=atlas.closed_in(step.index),
         refused_loop=atlas.refused_in(step.index),
         keyframe=bool(atlas.keyframes) and atlas.keyframes[-1].frame == step.index,
-        returned=change.returned.ids,
+        returned=step.returned.ids,
         common=common if atlas.anchor is None else CommonError(),
     )
 
@@ -81,16 +70,16 @@ def _in_map(thing: MovingObject, T_map_odom: Array) -> MovingObject:
     return replace(thing, estimate=estimate, motion=motion, motion_since_found=since)
 
 
-def frame_status(step: Step, added: int, mapped_before: bool) -> tuple[FrameStatus, str]:
+def frame_status(step: Step, mapped_before: bool) -> tuple[FrameStatus, str]:
     """How a frame ended, and why where it was not tracked."""
     if step.report.status is UpdateStatus.FAILED:
         return FrameStatus.FAILED, step.report.reason
-    if not step.state.unmatched:
+    if not step.tracking.unmatched:
         return FrameStatus.TRACKED, ""
     if not mapped_before:
-        return (FrameStatus.STARTED, "") if added else (FrameStatus.PREDICTED, "nothing to see yet")
+        return (FrameStatus.STARTED, "") if len(step.added) else (FrameStatus.PREDICTED, "nothing to see yet")
     reason = REPEATED if step.repeated else step.report.reason
     if step.matches.doubted:
         reason = f"{step.matches.doubted} landmarks agree on a pose too far from the prediction to be believed at once"
     reason = reason or f"only {len(step.report.used)} of {len(step.matches)} matched landmarks were used"
-    return (FrameStatus.LOST if step.state.lost else FrameStatus.PREDICTED), reason
+    return (FrameStatus.LOST if step.tracking.lost else FrameStatus.PREDICTED), reason

@@ -1,14 +1,77 @@
-"""Exceptions of third-party back ends and front ends, in one line that names the part, the call and the frame."""
+"""Third-party back ends and front ends: what they answer is checked, and what they raise is named, in one line."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Real
 from traceback import walk_tb
+from typing import Any
 
+import numpy as np
+
+from slam.checks import LATEST_STAMP
+from slam.data import Estimate, Patches, Prediction, UpdateReport, UpdateStatus
 from slam.errors import PartError, SlamError, cause, text_of
 
 _OURS = ("slam", "backends", "frontends")
+
+#: What each method answers: a type, and the types or shapes of its attributes. Equal letters stand for equal numbers.
+_POSE = {"stamp": Real, "T_world_left": (4, 4), "covariance": (6, 6), "ids": ("n",)}
+_PIXELS = {"uv_left": ("n", 2), "uv_right": ("n", 2), "innovation": ("n", 2, 2)}
+_REPORT = {"status": UpdateStatus, "reason": str, "used": ("k",), "rejected": ("r",), "nis": Real, "dof": Real}
+_ANSWERS: dict[str, tuple[type, dict[str, Any]]] = {
+    "predict": (Prediction, {**_POSE, **_PIXELS}),
+    "update": (UpdateReport, _REPORT),
+    "estimate": (Estimate, {**_POSE, "positions": ("n", 3), "covariances": ("n", 3, 3)}),
+    "positions": (np.ndarray, {"real": ("n", 3)}),
+    "patches": (Patches, {"images": ("n", "s", "s"), "centres": ("n", 2), "size": ("n",)}),
+    "align": (tuple, {}),
+}
+_FINITE = {"T_world_left", "covariance", "positions", "covariances", "real"}
+
+
+def checked(owner: object, method: str, answer: Any, **sizes: int) -> Any:
+    """What a method of a back end or front end answered, checked; a step does that with every answer, so it is cheap.
+
+    Args:
+        owner: the back end or front end.
+        method: its name.
+        answer: what it returned.
+        sizes: of the arrays, by the letters of `_ANSWERS`, where they are known.
+
+    Raises:
+        SlamError: it is of another type than documented, an array of another shape, or a pose or position not finite.
+    """
+    what = f"{type(owner).__name__}.{method}"
+    kind, attributes = _ANSWERS[method]
+    if not isinstance(answer, kind):
+        raise SlamError(f"{what}: must give a {kind.__name__}, got {type(answer).__name__}")
+    for name, wanted in attributes.items():
+        value, where = getattr(answer, name), what if name == "real" else f"{what}: {name}"
+        if isinstance(wanted, tuple):
+            _require_array(value, wanted, sizes, where)
+            if name in ("ids", "used", "rejected") and value.dtype.kind not in "iu":
+                raise SlamError(f"{where} must be an array of ids, got {value.dtype}")
+            if name in _FINITE and not np.isfinite(value).all():
+                raise SlamError(f"{where} is not finite")
+        elif not isinstance(value, wanted):
+            raise SlamError(f"{where} must be a {wanted.__name__}, got {type(value).__name__}")
+        elif name == "stamp" and not abs(value) <= LATEST_STAMP:
+            raise SlamError(f"{where} must be within {LATEST_STAMP:g} s")
+    return answer
+
+
+def _require_array(value: Any, wanted: tuple[Any, ...], sizes: dict[str, int], where: str) -> None:
+    """Check that a value is a numeric array of a shape, of which `sizes` remembers what its letters stand for."""
+    good = isinstance(value, np.ndarray) and value.ndim == len(wanted) and value.dtype.kind in "fiu"
+    if not good or any(
+        found != sizes.setdefault(size, found) if isinstance(size, str) else found != size
+        for size, found in zip(wanted, value.shape)
+    ):
+        shape = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in wanted)
+        got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise SlamError(f"{where} must be an array {shape} of numbers, got {got}".replace("'", ""))
 
 
 @contextmanager

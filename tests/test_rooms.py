@@ -17,16 +17,17 @@ MAY_IMPORT = {
     "geometry": {"kernels", "runtime"},
     "data": {"geometry"},
     "window": {"data", "geometry", "kernels", "runtime"},
-    "tracking": {"data", "geometry", "kernels", "runtime"},
+    "tracks": {"data", "geometry", "kernels", "runtime"},
     "calibration": {"data", "geometry", "kernels", "runtime"},
-    "mapping": {"tracking", "data", "geometry", "runtime"},
-    "objects": {"window", "tracking", "data", "geometry", "kernels", "runtime"},
+    "mapping": {"tracks", "data", "geometry", "runtime"},
+    "objects": {"window", "tracks", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},
     "evaluation": {"data", "geometry"},
-    "system": {"objects", "mapping", "tracking", "calibration", "data", "geometry", "runtime"},
+    "input": {"tracks", "data", "geometry", "runtime"},
+    "system": {"objects", "mapping", "tracks", "calibration", "input", "data", "geometry", "runtime"},
     "run": {
-        "system", "calibration", "objects", "mapping", "tracking", "sequences", "worlds", "evaluation", "data",
+        "system", "calibration", "objects", "mapping", "tracks", "input", "sequences", "worlds", "evaluation", "data",
         "geometry", "runtime",
     },
     "compare": {"run", "system", "sequences", "worlds", "evaluation", "data", "geometry", "objects"},
@@ -39,8 +40,8 @@ MAY_IMPORT = {
 
 #: The root's modules by room; all others are "base".
 ROOT_ROOMS = {
-    "data": {"checks", "data", "interfaces", "landmarks", "models", "object_data", "object_models", "rig_error"},
-    "system": {"system", "config", "extraction", "results"},
+    "data": {"checks", "third_party", "data", "interfaces", "models", "object_data", "object_models", "rig_error"},
+    "system": {"system", "session", "tracker", "config", "results"},
     "commands": {"__main__"},
     "outside": {"__init__"},
 }

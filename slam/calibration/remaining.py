@@ -23,13 +23,13 @@ class RemainingRigError:
 
     Attributes:
         uncertainty: what the rig's uncertainty adds to the covariances of poses and landmarks.
-        given: the correction of all measurements given to the back end.
+        measured_with: the correction of all measurements given to the back end.
     """
 
     def __init__(self, calibration: SelfCalibration, models: EstimatorModels) -> None:
         self._calibration = calibration
-        self.given = calibration.applied
-        self.uncertainty = SchmidtFilter(calibration.model, models, self.given.parameters)
+        self.measured_with = calibration.applied
+        self.uncertainty = SchmidtFilter(calibration.model, models, self.measured_with.parameters)
 
     def apply(self, backend: Backend) -> Revision | None:
         """Correct features by the present posterior from now on; returns the change, or None.
@@ -51,11 +51,11 @@ class RemainingRigError:
             self.uncertainty.path_follows(applied.parameters)
         else:
             self.uncertainty.path_keeps(applied.parameters, backend.positions, landmarks_follow=reviser is not None)
-        if reviser is None or applied is self.given:
+        if reviser is None or applied is self.measured_with:
             return None
-        revision = Revision(self.given, applied)
+        revision = Revision(self.measured_with, applied)
         reviser.revise(revision.rows)
-        self.given = revision.after
+        self.measured_with = revision.after
         return revision
 
     def added_to(self, estimate: Estimate) -> Estimate:
@@ -64,14 +64,14 @@ class RemainingRigError:
             return estimate
         return self.uncertainty.added_to(estimate, self._calibration.posterior.covariance)
 
-    def common(self, as_given: bool) -> CommonError:
+    def common(self, as_reported: bool) -> CommonError:
         """The part of the pose's error that it shares with those of other frames.
 
         Args:
-            as_given: for poses as reported in each frame, with the correction of that time; else for the present path,
-                in which a back end may have revised earlier poses.
+            as_reported: for poses as reported in each frame, with the correction of that time; else for the present
+                path, in which a back end may have revised earlier poses.
         """
         if not self._calibration.config.enabled:
             return CommonError()
-        made_with = self._calibration.applied.parameters if as_given else self.uncertainty.kept
+        made_with = self._calibration.applied.parameters if as_reported else self.uncertainty.kept
         return CommonError(*self.uncertainty.shared(self._calibration.posterior.covariance, made_with))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry.arrays import Array, BoolArray
-from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
+from slam.tracks.table import LandmarkTable
 
 _BLOCK = 256  # cost: landmarks compared with all others at once
 

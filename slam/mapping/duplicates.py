@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from slam.chi_square import SIGMAS
 from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
-from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
-from slam.tracking.association import pairs_in_boxes
-from slam.tracking.visibility import MapView
+from slam.tracks.follow import pairs_in_boxes
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import MapView
 
 _SAME_PIXELS = 6.0  # landmarks further apart in the image than this [px] are not the same
 

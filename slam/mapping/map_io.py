@@ -23,12 +23,12 @@ from slam.data import Estimate, IdArray
 from slam.errors import MeasurementError, SlamError
 from slam.files import read_bytes, whole_file
 from slam.geometry.se3 import Array
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas
 from slam.mapping.atlas.keyframes import Keyframe, Loop
 from slam.mapping.atlas.saved import ATLAS_TYPES, from_arrays, to_arrays
 from slam.mapping.known_landmarks import require_known
 from slam.showing import count
+from slam.tracks.table import LandmarkTable
 
 
 class HasMap(Protocol):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from slam.geometry.arrays import Array, isin
 from slam.geometry.pnp import MINIMAL_POINTS
 from slam.geometry.rig import StereoRig
 from slam.interfaces import Backend, MapBackend
-from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
@@ -21,25 +20,9 @@ from slam.mapping.known_landmarks import in_front
 from slam.mapping.monocular import MonocularDepth, unclaimed
 from slam.mapping.selection import new_landmarks
 from slam.mapping.step import Step
-from slam.tracking.localizer import LandmarkMatches, Localizer
-from slam.tracking.visibility import MapView, expected_landmarks
-
-
-@dataclass(frozen=True, eq=False)
-class MapChange:
-    """What a frame did to the map.
-
-    Attributes:
-        landmarks: the map after it.
-        added: new landmarks, and the features they were made of.
-        erased: ids of the landmarks that left the map.
-        returned: landmarks of a revisited place that rejoined the map, and the features that show them now.
-    """
-
-    landmarks: LandmarkTable
-    added: LandmarkMatches
-    erased: IdArray
-    returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+from slam.tracks.localizer import LandmarkMatches, Localizer
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import MapView, expected_landmarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +87,10 @@ class Mapper:
                 raise ConfigurationError("map.monocular: this back end cannot place landmarks")
             self._monocular = self._new_monocular()
 
-    def update(self, backend: Backend, landmarks: LandmarkTable, step: Step) -> MapChange:
+    def update(self, backend: Backend, step: Step) -> Step:
         """Count what was seen, erase bad landmarks, add new ones (paper A, IV)."""
-        view = self._view(backend, landmarks, step)
-        landmarks = self._count(landmarks, view, step)
+        view = self._view(backend, step.landmarks, step)
+        landmarks = self._count(step.landmarks, view, step)
         bad = bad_landmarks(landmarks, self.config) | isin(landmarks.ids, step.labels.landmarks)
         bad |= doubled_landmarks(view, landmarks, self.config)
         bad |= crowded_landmarks(landmarks, view.positions, self.config)
@@ -118,31 +101,31 @@ class Mapper:
         erased, landmarks = np.concatenate([erased, landmarks.ids[surplus]]), landmarks.select(~surplus)
         if len(erased):  # once a frame: it costs a filter a copy of its covariance
             backend.remove(erased)
-        return MapChange(landmarks, added, erased)
+        return replace(step, landmarks=landmarks, added=added, erased=erased)
 
-    def restore(self, backend: Backend, change: MapChange, step: Step, returned: Returned) -> MapChange:
+    def restore(self, backend: Backend, step: Step, returned: Returned) -> Step:
         """Let landmarks of a revisited place rejoin the map, if the back end can place them.
 
         They keep the ids that they had. If the back end still holds such a landmark, at its old, drifted position, that
         one is erased first. Features that are landmarks of the map already, or that move, are left out.
         """
         if not isinstance(backend, MapBackend):
-            return change
-        taken = np.concatenate([step.matches.rows, change.added.rows, step.withheld_rows, step.labels.moving])
+            return step
+        taken = np.concatenate([step.matches.rows, step.added.rows, step.withheld.rows, step.labels.moving])
         free = np.flatnonzero(~np.isin(returned.rows, taken) & in_front(returned.local))
         if not len(free):
-            return change
+            return step
         ids = returned.ids[free]
         ids[ids < 0] = self._new_ids(int((ids < 0).sum()))
-        stale = np.isin(change.landmarks.ids, ids)
+        stale = np.isin(step.landmarks.ids, ids)
         if stale.any():
-            backend.remove(change.landmarks.ids[stale])
-        landmarks = change.landmarks.select(~stale)
+            backend.remove(step.landmarks.ids[stale])
+        landmarks = step.landmarks.select(~stale)
         backend.place(ids, returned.local[free], returned.covariances[free])
         rows = returned.rows[free]
         landmarks = landmarks.with_new(step.index, ids, step.features, rows, step.estimate.T_world_left[:3, 3])
-        erased = change.erased[~isin(change.erased, ids)]
-        return replace(change, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
+        erased = step.erased[~isin(step.erased, ids)]
+        return replace(step, landmarks=landmarks, erased=erased, returned=LandmarkMatches(ids, rows))
 
     def insert(self, backend: Backend, landmarks: LandmarkTable, place: KnownPlace) -> LandmarkTable:
         """Add landmarks of a known place to the map, as from a saved map; those already in it are left unchanged."""
@@ -191,7 +174,7 @@ class Mapper:
         m, matches = self.config, step.matches
         measured = isin(matches.ids, np.concatenate([step.report.used, step.left_out]))
         expected = landmarks.ids[:0]
-        if not step.state.unmatched:
+        if not step.tracking.unmatched:
             size = (self.rig.width, self.rig.height)
             shown = expected_landmarks(view, step.features, size, m.view_margin, m.occlusion_radius)
             shown &= self._localizer.similar_view(view.T_world_left, landmarks, view.positions)
@@ -199,7 +182,7 @@ class Mapper:
         ids, rows = matches.ids[measured], matches.rows[measured]
         place = view.T_world_left[:3, 3], view.in_image, self._localizer.config.rematch_after
         return landmarks.after_frame(
-            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.withheld
+            step.index, expected, ids, step.features, rows, m.descriptor_update, *place, step.suspects
         )
 
     def _add(
@@ -209,7 +192,7 @@ class Mapper:
 
         Features that move, or whose motion label is undecided, are left out.
         """
-        if len(landmarks) >= MINIMAL_POINTS and not step.state.may_add(self.config.restart_after):
+        if len(landmarks) >= MINIMAL_POINTS and not step.tracking.may_add(self.config.restart_after):
             return landmarks, LandmarkMatches.nothing()
         features, matches = step.features, step.matches
         free = ~known
@@ -249,8 +232,7 @@ class Mapper:
         ids = self._new_ids(len(best))
         backend.place(ids, new.local[best], new.covariances[best])  # type: ignore[attr-defined]
         landmarks = landmarks.with_new(step.index, ids, features, new.rows[best], step.estimate.T_world_left[:3, 3])
-        both = LandmarkMatches(np.concatenate([added.ids, ids]), np.concatenate([added.rows, new.rows[best]]))
-        return landmarks, both
+        return landmarks, added.joined(LandmarkMatches(ids, new.rows[best]))
 
     def _new_ids(self, count: int) -> IdArray:
         """Ids that were never used."""

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from slam.data import BoolArray, Estimate, IdArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose
-from slam.landmarks import LandmarkTable
-from slam.tracking.association import match_in_boxes, pairs_in_boxes
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.visibility import MapView
+from slam.tracks.follow import match_in_boxes, pairs_in_boxes
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import MapView
 
 _PARALLAX = np.deg2rad(1.0)  # least angle between the two rays
 _RADIUS = 20.0  # most that a feature moves between two frames, besides the camera's rotation [px]

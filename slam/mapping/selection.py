@@ -9,7 +9,7 @@ from slam.data import StereoFeatures
 from slam.geometry.arrays import Array, BoolArray
 from slam.geometry.rig import StereoRig
 from slam.mapping.config import MapConfig
-from slam.tracking.association import crowded, pairs_in_boxes
+from slam.tracks.follow import crowded, pairs_in_boxes
 
 
 def new_landmarks(

@@ -1,131 +1,78 @@
-"""Data of a step: a frame's result before the map changes, and the state carried to the next step."""
+"""A frame in work: what the stages of a step have found out about it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport
+from slam.data import Estimate, IdArray, Prediction, StereoFeatures, UpdateReport, UpdateStatus
 from slam.geometry.se3 import Array
-from slam.landmarks import LandmarkTable
-from slam.object_data import MotionLabels
+from slam.mapping.atlas.atlas import Atlas
+from slam.object_data import MotionLabels, MovingObject
 from slam.rig_error import CommonError, Correction
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligned, PatchAnchors
-from slam.tracking.standing import Standing
-from slam.tracking.state import TrackingState
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.standing import Standing
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
+
+_NONE = np.zeros(0, np.int64)
+_NOWHERE = Estimate(-np.inf, np.eye(4), np.eye(6), _NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
-class AssociatedFrame:
-    """A frame whose features are matched with landmarks.
+class Step:
+    """A frame in work. Each stage returns a copy that says more; nothing refers to a frame whose step did not end.
 
     Attributes:
-        aligned: the features as measured, and the patches that they were aligned to.
-        features: the same features, corrected by the calibration.
-        landmarks: the map.
+        index: of the frame.
+        measured: the features as measured; those of landmarks aligned with earlier images.
+        features: the same, corrected by the calibration.
         prediction: of the back end.
-        matches: matched landmarks, without the withheld ones.
-        withheld: ids of landmarks withheld from the back end's update, because they may move.
-        withheld_rows: features matched with withheld landmarks.
+        landmarks: the map.
+        matches: landmarks and the features that show them, without the withheld ones.
         standing: whether the camera stands.
+        tracking: whether the pose is known.
+        atlas: keyframes and loops.
+        suspects: ids of landmarks that may move.
+        withheld: those of them that were matched; they are withheld from the back end's update.
+        left_out: ids of matched landmarks left out of the update, because others are more informative.
+        report: of the update.
+        estimate: the camera's pose after the update.
+        labels: which features move.
+        objects: the moving bodies.
+        added: landmarks that joined the map.
+        returned: landmarks of a revisited place that rejoined the map, and the features that show them now.
+        erased: ids of the landmarks that left the map.
+        common: the part of the pose's error that other frames share; included in the covariance of `estimate`.
+        correction: of the calibration, with which the features were corrected.
+        repeated: the images are those of the frame before, so that its features were left out.
     """
 
-    aligned: Aligned
+    index: int
+    measured: StereoFeatures
     features: StereoFeatures
-    landmarks: LandmarkTable
     prediction: Prediction
+    landmarks: LandmarkTable
     matches: LandmarkMatches
-    withheld: IdArray
-    withheld_rows: NDArray[np.intp]
     standing: Standing
-
-    @classmethod
-    def of_nothing_known(
-        cls, features: StereoFeatures, corrected: StereoFeatures, prediction: Prediction
-    ) -> AssociatedFrame:
-        """A frame in an empty map, with its features as measured and corrected."""
-        none, aligned = np.zeros(0, np.int64), Aligned(features, PatchAnchors.none())
-        empty = LandmarkTable.empty(features.descriptors.shape[1])
-        nothing = LandmarkMatches.nothing()
-        return cls(aligned, corrected, empty, prediction, nothing, none, nothing.rows, Standing())
+    tracking: TrackingState
+    atlas: Atlas
+    suspects: IdArray = field(default_factory=_NONE.copy)
+    withheld: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    left_out: IdArray = field(default_factory=_NONE.copy)
+    report: UpdateReport = field(default_factory=lambda: UpdateReport.nothing(UpdateStatus.EMPTY, ""))
+    estimate: Estimate = _NOWHERE
+    labels: MotionLabels = field(default_factory=lambda: MotionLabels(_NONE, _NONE, _NONE))
+    objects: tuple[MovingObject, ...] = ()
+    added: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    returned: LandmarkMatches = field(default_factory=LandmarkMatches.nothing)
+    erased: IdArray = field(default_factory=_NONE.copy)
+    common: CommonError = field(default_factory=CommonError)
+    correction: Correction | None = None
+    repeated: bool = False
 
     @property
     def pose(self) -> Array:
         """The pose T_world_left (4, 4) on which the matches agree, or the predicted one."""
         return self.prediction.T_world_left if self.matches.T_world_left is None else self.matches.T_world_left
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A frame's result before the map is changed.
-
-    Attributes:
-        index: of the frame.
-        features: all of them, corrected by the calibration.
-        prediction: of the back end.
-        matches: matched landmarks, without the withheld ones.
-        withheld: ids of landmarks withheld from the back end's update, because they may move.
-        withheld_rows: features matched with withheld landmarks.
-        left_out: ids of matched landmarks left out of the update, because others are more informative.
-        report: of the update.
-        state: whether the pose is known.
-        estimate: the camera's pose after the update.
-        labels: which features move.
-        common: the part of the pose's error that other frames share; included in the covariance of `estimate`.
-        correction: of the calibration, with which the features were corrected.
-        checksum: of the images; None without images, or of images that show nothing.
-        repeated: the images are those of the frame before, so that its features were left out.
-    """
-
-    index: int
-    features: StereoFeatures
-    prediction: Prediction
-    matches: LandmarkMatches
-    withheld: IdArray
-    withheld_rows: NDArray[np.intp]
-    left_out: IdArray
-    report: UpdateReport
-    state: TrackingState
-    estimate: Estimate
-    labels: MotionLabels
-    common: CommonError = field(default_factory=CommonError)
-    correction: Correction | None = None
-    checksum: tuple[int, int] | None = None
-    repeated: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Completed:
-    """State carried from completed steps to the next one, besides the map.
-
-    Attributes:
-        index: of the last frame.
-        state: how localization has gone.
-        dimensions: length of the descriptors; None before the first feature.
-        mapped: whether there ever was a landmark.
-        anchors: image patches of landmarks at first sight.
-        measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
-        checksum: of the images; None without images, or of images that show nothing.
-        standing: whether the camera stands.
-    """
-
-    index: int = -1
-    state: TrackingState = field(default_factory=TrackingState)
-    dimensions: int | None = None
-    mapped: bool = False
-    anchors: PatchAnchors = field(default_factory=PatchAnchors.none)
-    measured_at: float = -np.inf
-    checksum: tuple[int, int] | None = None
-    standing: Standing = field(default_factory=Standing)
-
-    def after(self, step: Step, added: int, anchors: PatchAnchors, standing: Standing, new_map: bool) -> Completed:
-        """The state after one more step, in which `added` landmarks joined the map, or a new map was started."""
-        standing = replace(standing, T_world_left=step.estimate.T_world_left)
-        dimensions = step.features.descriptors.shape[1] if len(step.features) else self.dimensions
-        known = not step.state.unmatched or not self.mapped or new_map
-        measured_at = step.features.stamp if known else self.measured_at
-        mapped = self.mapped or added > 0
-        return Completed(step.index, step.state, dimensions, mapped, anchors, measured_at, step.checksum, standing)

@@ -10,10 +10,10 @@ import numpy as np
 from slam.data import StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import inverse, log
+from slam.input.warnings import REPEATED, baseline_doubt
 from slam.models import MotionModel
 from slam.run.summary import RunRecord
-from slam.tracking.input_warnings import REPEATED, baseline_doubt
-from slam.tracking.state import ENOUGH_FEATURES
+from slam.tracks.state import ENOUGH_FEATURES
 
 _TRACKED = "tracked"
 

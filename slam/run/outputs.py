@@ -21,10 +21,10 @@ from slam.files import RowFile, lock_folder, reason, remove_file, write_text
 from slam.geometry.euler import angles
 from slam.geometry.se3 import Array, transform
 from slam.geometry.trajectory import Trajectory, tum_line
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.atlas import Atlas
 from slam.object_data import MovingObject
 from slam.run.schema import FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE, OLD_LANDMARKS, OLD_TABLE, STAGES, header
+from slam.tracks.table import LandmarkTable
 
 FRAME_COLUMNS, LANDMARK_COLUMNS, OBJECT_COLUMNS = map(header, (FRAME_TABLE, LANDMARK_TABLE, OBJECT_TABLE))
 

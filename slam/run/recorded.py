@@ -17,8 +17,8 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array
 from slam.geometry.trajectory import Trajectory
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
+from slam.tracks.table import LandmarkTable
 
 
 @dataclass(frozen=True, eq=False)

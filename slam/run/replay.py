@@ -15,9 +15,8 @@ from slam.geometry.pnp import MINIMAL_POINTS, find_consensus, measurement_rows
 from slam.geometry.se3 import Array
 from slam.interfaces import Backend, RevisingBackend
 from slam.run.recorded import RecordedFrame, Recording
-from slam.third_party import named_failures
-from slam.tracking.association import AssociationConfig
-from slam.tracking.protocol_check import require_estimate, require_prediction, require_report
+from slam.third_party import checked, named_failures
+from slam.tracks.config import AssociationConfig
 
 _STAGES = ("predict", "associate", "update", "manage", "estimate")
 
@@ -56,16 +55,16 @@ def _step(
     if frame.revision is not None and isinstance(backend, RevisingBackend):
         backend.revise(frame.revision.rows)
     prediction = backend.predict(frame.stamp)
-    require_prediction(prediction, backend)
+    checked(backend, "predict", prediction)
     times.append(time.perf_counter())
     guess = None if config is None else _agreement(recording, backend, prediction, frame.observed, config, seed=k)
     times.append(time.perf_counter())
     report = backend.update(frame.observed, guess)
-    require_report(report, backend)
+    checked(backend, "update", report)
     times.append(time.perf_counter())
     _keep_map(backend, frame)
     times.append(time.perf_counter())
-    estimate = require_estimate(backend.estimate(landmarks=False), backend)
+    estimate = checked(backend, "estimate", backend.estimate(landmarks=False))
     times.append(time.perf_counter())
     status, reason = _status(report, k == recording.first)
     seen, new = len(frame.observed), len(frame.added)

@@ -11,8 +11,8 @@ from slam.data import Estimate, FrameResult
 from slam.evaluation.summary import consistency, evaluate
 from slam.geometry.se3 import Array, inverse
 from slam.geometry.trajectory import Trajectory
+from slam.input.warnings import REPEATED
 from slam.interfaces import Backend
-from slam.landmarks import LandmarkTable
 from slam.objects.metrics import ObjectScore
 from slam.rig_error import CommonError
 from slam.run.recorded import Recording
@@ -21,9 +21,8 @@ from slam.runtime.compile_clock import compile_clock, working_time
 from slam.sequences import Sequence
 from slam.sequences.live import LiveFrames
 from slam.system import StereoSlam
-from slam.third_party import named_failures
-from slam.tracking.input_warnings import REPEATED
-from slam.tracking.protocol_check import require_estimate
+from slam.third_party import checked, named_failures
+from slam.tracks.table import LandmarkTable
 
 
 @dataclass(eq=False)
@@ -100,7 +99,8 @@ class Replayed:
     def estimate(self) -> Estimate:
         """Pose and map with covariances."""
         with named_failures("the estimate", self.backend):
-            return require_estimate(self.backend.estimate(), self.backend)
+            estimate: Estimate = checked(self.backend, "estimate", self.backend.estimate())
+            return estimate
 
     @property
     def landmarks(self) -> LandmarkTable:

@@ -22,7 +22,7 @@ from slam.models import EstimatorModels, MotionModel
 from slam.object_models import ObjectModels
 from slam.objects.config import ObjectsConfig
 from slam.system import StereoSlam
-from slam.tracking.association import AssociationConfig
+from slam.tracks.config import AssociationConfig
 from tests.fuzz.harness import Subject
 from tests.fuzz.hostile import NUMBERS, VALUES, choose
 

@@ -136,6 +136,24 @@ def test_the_first_step_may_be_interrupted(backend):
     assert hits > 5
 
 
+def test_the_step_that_finds_the_camera_in_a_map_may_be_interrupted():
+    cloud, first = Cloud(150), StereoSlam(RIG, None, "ekf", config=CONFIG)
+    for k, T in enumerate(path(8)):
+        first.process_features(cloud.features(T, k / 30, 0.3)[0])
+    known, hits = first.snapshot(), 0
+    counter, features = Lines(), [cloud.features(T, k / 30, 0.3)[0] for k, T in enumerate(path(3))]
+    with counter.watched():
+        StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=known).process_features(features[0])
+    for line in range(1, counter.count, max(1, counter.count // 8)):
+        system = StereoSlam(RIG, None, "ekf", config=CONFIG, prior_map=known)
+        hits += interrupted(system, features[0], line)
+        assert len(system.estimate().ids) >= len(known)
+        results = [system.process_features(f) for f in features[1:]]
+        assert [r.status for r in results] == [FrameStatus.TRACKED] * 2, line
+        assert_agree(system)
+    assert hits > 4
+
+
 class Failing:
     """A back end whose `add` does its work and then fails, once."""
 

@@ -11,8 +11,8 @@ import pytest
 import slam
 from slam.config import SystemConfig
 from slam.data import FrameStatus, StereoFrame
+from slam.input.warnings import REPEATED
 from slam.run.runner import RunOptions, run
-from slam.tracking.input_warnings import REPEATED
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=20")
 FRAMES = list(SEQUENCE)

@@ -17,7 +17,7 @@ from slam.system import StereoSlam
 from slam.third_party import named_failures
 from tests.frontends.scenes import stereo_pair
 from tests.fuzz.commands import elsewhere
-from tests.slam.tracking.test_protocol_check import RIG
+from tests.slam.test_answers import RIG
 
 LEFT, RIGHT = stereo_pair(12.25)
 

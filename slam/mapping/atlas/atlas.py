@@ -7,21 +7,21 @@ poses that the system reports are in the map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from slam.data import Estimate
-from slam.geometry.se3 import Array, adjoint, inverse, log, points_by_pose, transform
+from slam.geometry.se3 import Array, adjoint, inverse, points_by_pose, transform
 from slam.geometry.trajectory import Trajectory
-from slam.mapping.atlas.chain import Chain, spread_over
+from slam.mapping.atlas.chain import Chain, between_keyframes
 from slam.mapping.atlas.keyframes import Keyframe, Loop, covariance_growth
 from slam.mapping.atlas.places import PlaceIndex, Vectors
-from slam.mapping.atlas.rows import KeyframeRows
 from slam.models import ANYWHERE, EstimatorModels
 from slam.rig_error import CommonError
 
@@ -102,7 +102,6 @@ class Atlas:
 
     Attributes:
         keyframes: in order of time.
-        rows: their poses and whatever else the pose graph needs of them.
         index: of their appearance, for place recognition.
         loops: those in the pose graph.
         inactive_loops: the latest verified loops outside the pose graph: refused, unconfirmed, or not
@@ -121,7 +120,6 @@ class Atlas:
     """
 
     keyframes: tuple[Keyframe, ...] = ()
-    rows: KeyframeRows = field(default_factory=KeyframeRows)
     index: PlaceIndex = field(default_factory=PlaceIndex)
     loops: tuple[Loop, ...] = ()
     inactive_loops: tuple[Loop, ...] = ()
@@ -156,12 +154,31 @@ class Atlas:
 
     def with_new(self, keyframe: Keyframe, descriptors: Vectors) -> Atlas:
         """A copy with one more keyframe, which has descriptors (F, D)."""
-        rows, index = self.rows.with_new(keyframe), self.index.with_new(descriptors)
-        return replace(self, keyframes=(*self.keyframes, keyframe), rows=rows, index=index)
+        return replace(self, keyframes=(*self.keyframes, keyframe), index=self.index.with_new(descriptors))
+
+    @cached_property
+    def stamps(self) -> Array:
+        """Times of the keyframes (K,) [s]."""
+        return np.array([k.stamp for k in self.keyframes], float)
+
+    @cached_property
+    def poses(self) -> Array:
+        """Poses T_odom_left of the keyframes (K, 4, 4)."""
+        return np.array([k.T_odom_left for k in self.keyframes], float).reshape(-1, 4, 4)
+
+    @cached_property
+    def travelled(self) -> Array:
+        """Length of the path up to each keyframe (K,) [m]."""
+        return np.array([k.travelled for k in self.keyframes], float)
+
+    def inflated(self, first: int, last: int, factor: float) -> Atlas:
+        """A copy in which the motions after keyframe `first` up to `last` have covariances larger by a factor."""
+        grown = (replace(k, step_covariance=factor * k.step_covariance) for k in self.keyframes[first + 1 : last + 1])
+        return replace(self, keyframes=(*self.keyframes[: first + 1], *grown, *self.keyframes[last + 1 :]))
 
     def poses_in_map(self) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes."""
-        return self._in_map(self.rows.poses)
+        return self._in_map(self.poses)
 
     def summary(self) -> dict[str, int]:
         """Numbers of keyframes, of loops closed in this run, and of loops refused because they contradict the path.
@@ -265,15 +282,15 @@ class Atlas:
             rig: what the common errors stand for now.
             path: the present estimate of the whole path; None for the poses as they were estimated at the time.
         """
-        poses, count, m = self.rows.poses.copy(), len(self), len(rig.root)
+        poses, count, m = self.poses.copy(), len(self), len(rig.root)
         if path is not None:
-            poses[self.prior_count :] = path.poses[np.searchsorted(path.stamps, self.rows.stamps[self.prior_count :])]
-        shares = self.rows.jacobian
-        if shares.shape[2] != m:  # all keyframes are from a prior map that was made without common errors
-            shares = np.zeros((count, 6, m))
+            poses[self.prior_count :] = path.poses[np.searchsorted(path.stamps, self.stamps[self.prior_count :])]
+        none = np.zeros((6, m))  # of keyframes of a prior map that was made without common errors
+        shares = np.array([k.jacobian if k.jacobian.shape[1] == m else none for k in self.keyframes])
+        steps = np.array([k.step_covariance for k in self.keyframes])
         common = (shares.reshape(6 * count, m) @ rig.root).reshape(count, 6, rig.root.shape[1])
         common[1:] -= adjoint(inverse(poses[1:]) @ poses[:-1]) @ common[:-1]
-        return Chain(poses, self.rows.steps, common)
+        return Chain(poses, steps, common)
 
     def in_map(self, chain: Chain) -> Array:
         """Poses T_map_left (K, 4, 4) of all keyframes; those since the last loop are computed by `T_map_odom`."""
@@ -322,8 +339,8 @@ class Atlas:
         moved = self.in_map(chain)
         with suppress(np.linalg.LinAlgError):  # then the keyframes stay as the last loop left them
             moved = solve(chain, self.loops, moved).poses
-        stamps = self.rows.stamps[self.prior_count :]
-        return Trajectory(path.stamps, _between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
+        stamps = self.stamps[self.prior_count :]
+        return Trajectory(path.stamps, between_keyframes(path, stamps, moved[self.prior_count :], self._unseen_time))
 
     def _unseen_time(self, stamps: Array) -> Array:
         """Total duration (N,) [s] of gaps before each of `stamps` (N,) [s]."""
@@ -365,24 +382,3 @@ def landmarks_by_pose(estimate: Estimate, covariance: Array, may_grow: bool = Fa
     moved = covariance_growth(P, before) + after
     surer = np.trace(moved, axis1=1, axis2=2) < np.trace(P, axis1=1, axis2=2)
     return np.where((surer | may_grow)[:, None, None], moved, P)
-
-
-def _between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_time: Callable[[Array], Array]) -> Array:
-    """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,) [s], are moved to other poses (K, 4, 4).
-
-    Between two keyframes the change is interpolated in time; if there was a gap between them, see `TrackingGap`, all
-    of it is put into the gap, of which `unseen_time` gives the duration.
-    """
-    rows = np.searchsorted(path.stamps, stamps)
-    odom = path.poses[rows]
-    at = np.clip(np.searchsorted(stamps, path.stamps, side="right") - 1, 0, len(stamps) - 1)
-    to = np.minimum(at + 1, len(stamps) - 1)
-    step = inverse(odom[at]) @ odom[to]
-    change = log(inverse(step) @ inverse(moved[at]) @ moved[to])
-    since, span = (unseen_time(x) - unseen_time(stamps[at]) for x in (path.stamps, stamps[to]))
-    seen = span <= 0
-    since, span = np.where(seen, path.stamps - stamps[at], since), np.where(seen, stamps[to] - stamps[at], span)
-    share = np.clip(since / np.where(to > at, span, 1.0), 0.0, 1.0)
-    return spread_over(
-        moved[at], inverse(odom[at]) @ path.poses, inverse(path.poses) @ odom[to], share[:, None] * change
-    )

@@ -10,6 +10,7 @@ where c are common errors of unit variance, the same for all steps (a consider s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry.se3 import LEAST_VARIANCE, Array, adjoint, exp, inverse, log
+from slam.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,3 +122,24 @@ def spread_over(begin: Array, motion: Array, rest: Array, change: Array) -> Arra
         change: of the motions (N, 6), perturbing the poses at the stretches' ends on the right.
     """
     return np.asarray(begin @ motion @ exp((adjoint(rest) @ change[:, :, None])[:, :, 0]))
+
+
+def between_keyframes(path: Trajectory, stamps: Array, moved: Array, unseen_time: Callable[[Array], Array]) -> Array:
+    """Poses (N, 4, 4) of a path whose keyframes, at `stamps` (K,) [s], are moved to other poses (K, 4, 4).
+
+    Between two keyframes the change is interpolated in time; if there was a gap between them, all
+    of it is put into the gap, of which `unseen_time` gives the duration.
+    """
+    rows = np.searchsorted(path.stamps, stamps)
+    odom = path.poses[rows]
+    at = np.clip(np.searchsorted(stamps, path.stamps, side="right") - 1, 0, len(stamps) - 1)
+    to = np.minimum(at + 1, len(stamps) - 1)
+    step = inverse(odom[at]) @ odom[to]
+    change = log(inverse(step) @ inverse(moved[at]) @ moved[to])
+    since, span = (unseen_time(x) - unseen_time(stamps[at]) for x in (path.stamps, stamps[to]))
+    seen = span <= 0
+    since, span = np.where(seen, path.stamps - stamps[at], since), np.where(seen, stamps[to] - stamps[at], span)
+    share = np.clip(since / np.where(to > at, span, 1.0), 0.0, 1.0)
+    return spread_over(
+        moved[at], inverse(odom[at]) @ path.poses, inverse(path.poses) @ odom[to], share[:, None] * change
+    )

@@ -35,8 +35,8 @@ from slam.mapping.step import Step
 from slam.models import EstimatorModels
 from slam.rig_error import CommonError, Correction
 from slam.runtime.blas import one_blas_thread
-from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import LandmarkMatches, Localizer
+from slam.tracks.config import AssociationConfig
+from slam.tracks.localizer import Localizer
 
 if TYPE_CHECKING:
     from slam.mapping.atlas.pose_graph import PoseGraph
@@ -95,23 +95,20 @@ class LoopCloser:
         self._localizer = Localizer(self._rig, association, models)
 
     @one_blas_thread
-    def update(
-        self, atlas: Atlas, step: Step, added: LandmarkMatches, path: Callable[[], Trajectory]
-    ) -> tuple[Atlas, Returned | None]:
+    def update(self, atlas: Atlas, step: Step, path: Callable[[], Trajectory]) -> tuple[Atlas, Returned | None]:
         """The atlas after a frame, and the old features that the frame shows again if it closed a loop.
 
         Args:
             atlas: before the frame.
             step: the frame's result.
-            added: landmarks that joined the map in it.
             path: returns the path in odom so far.
         """
         begins = not len(atlas) or len(atlas.gaps) > atlas.restarts
-        wanted = begins or (not step.state.unmatched and self._is_keyframe(atlas, step))
+        wanted = begins or (not step.tracking.unmatched and self._is_keyframe(atlas, step))
         if not (self._config.enabled and wanted):
             return atlas, None
         landmark_of = step.matches.landmark_of(len(step.features))
-        landmark_of[added.rows] = added.ids
+        landmark_of[step.added.rows] = step.added.ids
         step = replace(step, features=self._rectify(step.features))
         new = self._keyframe(atlas, step, landmark_of)
         if new is None:
@@ -241,7 +238,7 @@ class LoopCloser:
 
     def _anywhere(self, atlas: Atlas, new: Keyframe, known: IdArray) -> NDArray[np.intp]:
         """Number of the keyframe that looks most like a new one, unless the path says that it shows the same view."""
-        moved = inverse(atlas.rows.poses[:-1]) @ new.T_odom_left
+        moved = inverse(atlas.poses[:-1]) @ new.T_odom_left
         apart = np.linalg.norm(moved[:, :3, 3], axis=1) > self._config.keyframe_distance * new.depth
         likely = self._most_alike(atlas, new.descriptors.astype(np.float32), np.append(apart, False))
         return self._not_measured(atlas, likely, known)[:1]
@@ -272,7 +269,7 @@ class LoopCloser:
 
     def _within_reach(self, atlas: Atlas, new: Keyframe, poses: Array, here: Array, covariance: Array) -> BoolArray:
         """Which keyframes (K,), at poses (K, 4, 4), the camera has left but may, given its uncertainty, see again."""
-        c, length = self._config, new.travelled - atlas.rows.travelled
+        c, length = self._config, new.travelled - atlas.travelled
         far = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         reach = c.view_depths * new.depth + c.gate_sigmas * sigma + c.drift * length
@@ -345,7 +342,7 @@ class LoopCloser:
             return atlas.with_inactive_loop(loop, self._config.most_loops), None
         atlas = replace(atlas, confirmed=True)
         if off > limit:
-            atlas = replace(atlas, rows=atlas.rows.inflated(loop.first, loop.second, off / _DIMENSIONS))
+            atlas = atlas.inflated(loop.first, loop.second, off / _DIMENSIONS)
             chain = atlas.chain(rig, path())
             graph = PoseGraph.solved(chain, atlas.loops, atlas.in_map(chain), (loop.first, loop.second), common)
         elif atlas.loops and not is_informative(graph, atlas.loops[-1], loop):
@@ -369,7 +366,7 @@ class LoopCloser:
         every, start = (*atlas.loops, *atlas.inactive_loops), atlas.in_map(chain)
 
         def places(loops: Sequence[Loop]) -> list[Loop]:
-            return spaced(loops, atlas.rows.travelled, left)
+            return spaced(loops, atlas.travelled, left)
 
         if not atlas.loops or len(places([x for x in atlas.inactive_loops if x.pair in refused])) < 2:
             return atlas, None

@@ -10,12 +10,12 @@ from slam.data import StereoFeatures
 from slam.geometry.pnp import measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, exp, inverse, points_by_pose, transform
-from slam.landmarks import LandmarkTable
 from slam.mapping.atlas.config import AtlasConfig
 from slam.mapping.atlas.keyframes import Keyframe
-from slam.mapping.relocalizer import nowhere
-from slam.tracking.association import AssociationConfig, Matches, match_everywhere
-from slam.tracking.localizer import Localizer
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import Matches, match_everywhere
+from slam.tracks.localizer import Localizer, nowhere
+from slam.tracks.table import LandmarkTable
 
 _ROUNDS = 5  # numerics: most iterations of least squares
 _CONVERGED = 1e-6  # numerics: step [rad], [m]

@@ -57,7 +57,7 @@ def test_the_pose_moves_as_its_sensitivity_says(backend, name, size):
     system, T_true = run(backend, delta)
     T = system.backend.estimate(landmarks=False).T_world_left
     actual = log(inverse(T) @ T_true)
-    predicted = system._rig_error.uncertainty.pose[:, : len(delta)] @ delta
+    predicted = system._session.rig_error.uncertainty.pose[:, : len(delta)] @ delta
     assert np.linalg.norm(actual[3:]) > 1e-3  # the rig's error does something: millimetres at least
     assert np.linalg.norm(predicted - actual) < 0.15 * np.linalg.norm(actual)
 
@@ -72,7 +72,7 @@ def test_landmarks_move_as_their_sensitivities_say(backend):
         features, ids = cloud.features(T, k / 30)
         result = system.process_features(with_error(features, delta))
         points.update({i: ids[row] for i, row in zip(result.added.tolist(), result.added_features)})
-    ids, by_rig = system._rig_error.uncertainty.landmarks()
+    ids, by_rig = system._session.rig_error.uncertainty.landmarks()
     estimated = system.backend.positions(ids)
     actual = cloud.points[[points[i] for i in ids.tolist()]] - estimated
     predicted = by_rig[:, :, : len(delta)] @ delta
@@ -124,7 +124,7 @@ def test_poses_as_given_keep_the_error_that_a_back_end_takes_out_of_its_path(bac
         result = system.process_features(cloud.features(T, k / 30)[0])
     assert result.revision is not None
     np.testing.assert_array_equal(result.common.root[:-2, -1], mean)
-    in_path = system._rig_error.common(as_given=False).root[:-2, -1]
+    in_path = system._session.rig_error.common(as_reported=False).root[:-2, -1]
     np.testing.assert_array_equal(in_path, 0 * mean if revises else mean)
 
 

@@ -5,12 +5,12 @@ import pytest
 
 from slam.data import StereoFeatures
 from slam.errors import ConfigurationError
-from slam.landmarks import LandmarkTable
 from slam.mapping.config import MapConfig
 from slam.mapping.culling import bad_landmarks, crowded_landmarks, surplus_landmarks
 from slam.mapping.duplicates import doubled_landmarks, known_features
 from slam.mapping.selection import new_landmarks
-from slam.tracking.visibility import MapView, expected_landmarks, similar_view
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import MapView, expected_landmarks, similar_view
 from tests.slam.scene import RIG
 
 CONFIG = MapConfig(target_in_view=20, separation=5.0)

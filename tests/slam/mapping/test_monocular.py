@@ -13,11 +13,10 @@ from slam.data import FrameStatus
 from slam.geometry import se3
 from slam.mapping.map_io import SavedMap
 from slam.mapping.monocular import frame_covariance, two_view_depth
-from slam.mapping.relocalizer import nowhere
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
 from slam.testing import GENERAL_RIG
-from slam.tracking.localizer import Localizer
+from slam.tracks.localizer import Localizer, nowhere
 from tests.slam.scene import RIG, Cloud
 
 BACKENDS = ("ekf", "smoother", "window")

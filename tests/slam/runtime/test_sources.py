@@ -32,7 +32,7 @@ def times(x):
     return scaled(x) + NUMBER
 """
 ASK = """
-from slam.tracking.probe_kernels import times
+from slam.tracks.probe_kernels import times
 print(times(10.0), sum(times.stats.cache_hits.values()))
 """
 
@@ -40,12 +40,12 @@ print(times(10.0), sum(times.stats.cache_hits.values()))
 @pytest.fixture
 def package(tmp_path):
     """A copy of what kernels need, with a kernel in one room that calls a helper in another."""
-    for room in ("runtime", "kernels", "tracking"):
+    for room in ("runtime", "kernels", "tracks"):
         shutil.copytree(ROOT / "slam" / room, tmp_path / "slam" / room, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "slam/__init__.py").touch()
     shutil.copy(ROOT / "slam/errors.py", tmp_path / "slam/errors.py")
-    (tmp_path / "slam/tracking/__init__.py").write_text("")
-    (tmp_path / "slam/tracking/probe_kernels.py").write_text(CALLER)
+    (tmp_path / "slam/tracks/__init__.py").write_text("")
+    (tmp_path / "slam/tracks/probe_kernels.py").write_text(CALLER)
     return tmp_path
 
 

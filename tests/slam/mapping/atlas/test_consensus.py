@@ -87,7 +87,7 @@ def closed(loops: list[Loop]) -> Atlas:
     kept = Atlas()
     for each in loops:
         whole = atlas_of(each.second + 1)
-        parts = {name: getattr(whole, name) for name in ("keyframes", "rows", "index")}
+        parts = {name: getattr(whole, name) for name in ("keyframes", "index")}
         path = Trajectory(0.1 * np.arange(each.second + 1), ODOM[: each.second + 1])
         kept, _ = closer._close(replace(kept, **parts), each, seen, CommonError(), lambda path=path: path)  # type: ignore[arg-type]
     return kept

@@ -24,8 +24,8 @@ from slam.mapping.atlas.keyframes import (
 )
 from slam.mapping.atlas.verification import refined_pose, verify
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import Localizer
+from slam.tracks.config import AssociationConfig
+from slam.tracks.localizer import Localizer
 
 SIGMA = 0.5
 CAMERA = PinholeCamera(300.0, 300.0, 320.0, 180.0, 640, 360)

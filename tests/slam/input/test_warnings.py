@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,12 +10,11 @@ import numpy as np
 import pytest
 
 import slam
-from slam import worlds
 from slam.data import StereoFeatures, StereoFrame
 from slam.geometry.camera import PinholeCamera
+from slam.input.pair import pair_geometry
+from slam.input.warnings import InputWarnings, farthest_apart
 from slam.models import models_for
-from slam.tracking.input_warnings import InputWarnings, farthest_apart
-from slam.tracking.pair_check import pair_geometry
 
 SEQUENCE = slam.open_sequence("synthetic:desk?frames=1")
 FRAME = next(iter(SEQUENCE))
@@ -41,20 +39,6 @@ def lines(frames, features=200, rig=RIG, kind="handheld", stereo=200):
 
 def stamped(stamps):
     return [replace(FRAME, index=k, stamp=stamp) for k, stamp in enumerate(stamps)]
-
-
-LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("field", "people", "town")]  # seconds to draw
-SMALL = sorted(set(worlds.names()) - {"drive", "field", "people", "town"})  # a drive needs a file
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("world", [*SMALL, *LARGE])
-def test_worlds_are_right(world):
-    sequence = slam.open_sequence(f"synthetic:{world}?frames=2")
-    found = pair_geometry(sequence.rig, *images(next(iter(sequence))), 1.5)
-    assert found.conclusive
-    assert not found.swapped
-    assert not found.rows_differ
 
 
 def images(frame):
@@ -94,12 +78,6 @@ def test_rows_that_do_not_agree_are_told_with_how_much(shift):
     (line,) = lines(shifted)
     assert "rows of left and right image do not agree" in line
     assert f"off by {abs(shift)}.0 px" in line
-
-
-def test_a_turned_camera_is_found_by_its_rows():
-    turn = cv2.getRotationMatrix2D((160, 120), 8.0, 1.0)
-    turned = [replace(f, right=cv2.warpAffine(f.right, turn, (320, 240))) for f in stamped([0.0, 0.1])]
-    assert "rows of left and right" in lines(turned)[0]
 
 
 def test_images_of_different_things_say_nothing():
@@ -175,30 +153,6 @@ def test_frames_without_texture_are_named_once_and_single_ones_are_not():
     (line,) = lines(frames, features=3)
     assert "hardly anything to follow (3 features in frame 4, grey values from " in line
     assert lines(frames[:4], features=3) == []
-
-
-def test_a_run_says_it_on_the_terminal_and_in_its_summary(slam_command, tmp_path):
-    for side, image in (("left", FRAME.right), ("right", FRAME.left)):
-        (tmp_path / "mine" / side).mkdir(parents=True)
-        cv2.imwrite(str(tmp_path / "mine" / side / "000000.png"), image)
-        cv2.imwrite(str(tmp_path / "mine" / side / "000001.png"), image ^ 1)  # as if by noise
-    storage = cv2.FileStorage(str(tmp_path / "mine" / "calibration.yaml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"K1": RIG.left.K, "K2": RIG.right.K, "R": RIG.R, "T": RIG.R @ RIG.b}.items():
-        storage.write(name, value)
-    storage.release()
-    done = slam_command("run", f"{tmp_path / 'mine'}?fps=20", "--out", tmp_path / "out", "--quiet", "--no-picture")
-    assert done.returncode == 1
-    said, kept = done.stderr, json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert said.count("WARNING: left and right look swapped") == 1
-    assert said.splitlines()[-1].startswith("slam: no frame was tracked; likely cause: left and right look swapped")
-    assert [line for line in kept["warnings"] if "look swapped" in line] == [
-        said.splitlines()[-1].partition("cause: ")[2]
-    ]
-    assert kept["tracking"].startswith("no frame was tracked")
-    done = slam_command(
-        "run", f"{tmp_path / 'mine'}?fps=20&left=right&right=left", "--out", tmp_path / "o2", "--quiet", "--no-picture"
-    )
-    assert "swapped" not in done.stderr
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])

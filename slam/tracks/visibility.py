@@ -11,7 +11,7 @@ from slam.chi_square import SIGMAS
 from slam.data import BoolArray, StereoFeatures
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, transform
-from slam.tracking.association import pairs_in_boxes
+from slam.tracks.follow import pairs_in_boxes
 
 _NEARER = 0.9  # a surface nearer than this share of a landmark's depth may hide it
 

@@ -12,20 +12,20 @@ from slam.config import SystemConfig
 from slam.data import IdArray, ImagePair, Patches
 from slam.geometry import se3
 from slam.geometry.rig import StereoRig
-from slam.landmarks import LandmarkTable
-from slam.tracking.localizer import LandmarkMatches
-from slam.tracking.patch_alignment import Aligner, PatchAnchors, warps_of
+from slam.tracks.alignment import Aligner, warps_of
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.table import LandmarkTable, Patch
 
 RIG = StereoRig.rectified_pair(260.0, 160.0, 120.0, 0.12, 320, 240)
 
 
-def patches(count: int, value: float = 0.0) -> Patches:
-    return Patches(np.full((count, 5, 5), value, np.float32), np.full((count, 2), 2.0), np.full(count, 15.0))
-
-
-def rows(ids: IdArray, unseen: IdArray) -> LandmarkTable:
-    empty = LandmarkTable.empty(4).with_new(0, ids, _features(len(ids)), np.arange(len(ids)))
-    return replace(empty, unseen=unseen)
+def rows(ids: IdArray, T: np.ndarray | None = None, size: float = 15.0) -> LandmarkTable:
+    """Landmarks, with patches taken from a pose."""
+    landmarks = LandmarkTable.empty(4).with_new(0, ids, _features(len(ids)), np.arange(len(ids)))
+    if T is None:
+        return landmarks
+    patch = Patch(np.zeros((5, 5), np.float32), np.full(2, 2.0), size, T)
+    return landmarks.with_patches(np.arange(len(ids)), len(ids) * [patch])
 
 
 def _features(count: int) -> slam.StereoFeatures:
@@ -47,16 +47,6 @@ def test_warps_are_the_derivative_of_a_surface_that_faces_the_camera():
         moved = se3.transform(now, local + side * local[:, 2:] / RIG.left.fu)  # so many pixels beside it, at its depth
         places = [RIG.left.project(se3.transform(se3.inverse(then), p)) for p in (points, moved)]
         assert warps[:, :, k] == pytest.approx((places[1] - places[0]) / 1e-4, abs=1e-4)
-
-
-def test_anchors_are_replaced_and_given_up():
-    anchors = PatchAnchors.none().with_new(np.array([3, 7]), patches(2), np.eye(4))
-    anchors = anchors.with_new(np.array([5, 7]), patches(2, 1.0), np.eye(4))
-    assert anchors.ids.tolist() == [3, 5, 7]
-    assert anchors.patches.images[:, 0, 0].tolist() == [0, 1, 1]
-    known = anchors.known(rows(np.array([3, 4, 7]), np.array([0, 0, 50])))
-    assert known.ids.tolist() == [3]  # 5 is not in the map, 7 was not measured for long
-    assert not len(anchors.known(LandmarkTable.empty(4)))
 
 
 SHIFT = np.array([1.0, 0.0])  # [px]
@@ -91,67 +81,62 @@ def frame(right: bool = True) -> slam.StereoFeatures:
     return replace(_features(4), uv_left=uv, uv_right=uv_right, scale=np.full(4, 15.0), images=pair)
 
 
-def align(features: slam.StereoFeatures, anchors: PatchAnchors, seen: LandmarkMatches = SEEN, enabled: bool = True):
-    landmarks = rows(IDS, np.zeros(4, np.int64))
+def align(features: slam.StereoFeatures, landmarks: LandmarkTable, seen: LandmarkMatches = SEEN, enabled: bool = True):
     places = dict(zip(IDS.tolist(), POINTS))
     aligner = Aligner(RIG, enabled)
-    return aligner.align(
-        Shifting(), anchors, features, seen, landmarks, lambda ids: np.array([places[i] for i in ids.tolist()])
-    )
-
-
-def anchors_at(T: np.ndarray, size: float = 15.0) -> PatchAnchors:
-    return PatchAnchors.none().with_new(IDS, replace(patches(4), size=np.full(4, size)), T)
+    return aligner.align(Shifting(), features, seen, landmarks, lambda ids: np.array([places[i] for i in ids.tolist()]))
 
 
 @pytest.mark.parametrize("right", [True, False])
 def test_features_move_to_their_patches_also_without_a_right_image(right):
     features = frame(right)
-    aligned = align(features, anchors_at(np.eye(4)))
-    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
-    np.testing.assert_allclose(aligned.features.uv_right, features.uv_right + SHIFT)
-    assert aligned.anchors.ids.tolist() == IDS.tolist()
+    aligned, landmarks = align(features, rows(IDS, np.eye(4)))
+    np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
+    np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
+    assert landmarks.has_patch.all()
 
 
 def test_a_feature_that_has_no_right_pixel_is_aligned_in_the_left_image():
     features = frame()
     features.uv_right[2] = np.nan
-    aligned = align(features, anchors_at(np.eye(4)))
-    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
-    np.testing.assert_allclose(aligned.features.uv_right, features.uv_right + SHIFT)
-    assert aligned.anchors.ids.tolist() == IDS.tolist()
+    aligned, landmarks = align(features, rows(IDS, np.eye(4)))
+    np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
+    np.testing.assert_allclose(aligned.uv_right, features.uv_right + SHIFT)
+    assert landmarks.has_patch.all()
 
 
 @pytest.mark.parametrize("nearer,size", [(0.0, 0.0), (2.5, 15.0)])
 def test_a_patch_that_is_not_found_or_of_another_scale_is_taken_anew(nearer, size):
     then, features = np.eye(4), frame()
     then[2, 3] = nearer
-    aligned = align(features, anchors_at(then, size))
-    np.testing.assert_array_equal(aligned.features.uv_left, features.uv_left)
-    assert not len(aligned.anchors)
-    new = Aligner(RIG, True).anchored(Shifting(), aligned, SEEN, LandmarkMatches.nothing(), np.eye(4))
-    assert new.ids.tolist() == IDS.tolist() and (new.patches.size == 15.0).all()
-    np.testing.assert_array_equal(new.poses, np.tile(np.eye(4), (4, 1, 1)))
+    aligned, landmarks = align(features, rows(IDS, then, size))
+    np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
+    assert not landmarks.has_patch.any()
+    landmarks = Aligner(RIG, True).with_patches(Shifting(), aligned, SEEN, landmarks, np.eye(4))
+    assert [(p.size, p.T_world_left.tolist()) for p in landmarks.patches] == 4 * [(15.0, np.eye(4).tolist())]
 
 
 def test_a_patch_that_is_seen_larger_is_taken_anew_where_it_is_found_before_it_is_too_large():
     then, features = np.eye(4), frame()
     then[2, 3] = -1.6  # all are seen 1.23 to 1.4 times as large
-    aligned = align(features, anchors_at(then))
-    np.testing.assert_allclose(aligned.features.uv_left, features.uv_left + SHIFT)
-    assert not len(aligned.anchors)
+    aligned, landmarks = align(features, rows(IDS, then))
+    np.testing.assert_allclose(aligned.uv_left, features.uv_left + SHIFT)
+    assert not landmarks.has_patch.any()
 
 
-def test_without_a_pose_or_images_nothing_moves_and_switched_off_nothing_is_kept():
-    features, anchors = frame(), anchors_at(np.eye(4))
-    for aligned in (
-        align(features, anchors, replace(SEEN, T_world_left=None)),
-        align(replace(features, images=None), anchors),
+def test_without_a_pose_or_images_nothing_moves_and_what_was_not_seen_for_long_is_given_up():
+    features, landmarks = frame(), rows(IDS, np.eye(4))
+    for aligned, after in (
+        align(features, landmarks, replace(SEEN, T_world_left=None)),
+        align(replace(features, images=None), landmarks),
+        align(features, landmarks, enabled=False),
     ):
-        np.testing.assert_array_equal(aligned.features.uv_left, features.uv_left)
-        assert len(aligned.anchors) == 4
-    aligned = align(features, anchors, enabled=False)
-    assert aligned.features is features and not len(aligned.anchors)
+        np.testing.assert_array_equal(aligned.uv_left, features.uv_left)
+        assert after.has_patch.all()
+    aligned, after = align(features, replace(landmarks, unseen=np.array([0, 11, 0, 10])))
+    assert after.has_patch.tolist() == [True, False, True, True]
+    moved = np.abs(aligned.uv_left - features.uv_left).max(axis=1) > 0
+    assert moved[SEEN.rows].tolist() == [True, False, True, True]
 
 
 @pytest.mark.parametrize("backend", ["ekf", "smoother"])

@@ -16,13 +16,14 @@ from slam.geometry.arrays import isin, median
 from slam.geometry.pnp import CLEAR_MAJORITY, MINIMAL_POINTS, PoseConsensus, find_consensus, measurement_rows
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import LEAST_VARIANCE, Array, inverse, log, transform
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig, Matches, match_everywhere, match_in_windows
-from slam.tracking.hypotheses import PoseHypotheses
-from slam.tracking.informative import most_informative
-from slam.tracking.state import TrackingState
-from slam.tracking.visibility import similar_view
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import Matches, follow, match_everywhere
+from slam.tracks.informative import most_informative
+from slam.tracks.standing import Standing
+from slam.tracks.state import NO_POSE, TrackingState
+from slam.tracks.table import LandmarkTable
+from slam.tracks.visibility import similar_view
 
 _MOST = 0.5  # fixed: share of what is in view that makes a majority
 
@@ -51,8 +52,21 @@ class LandmarkMatches:
 
     def without(self, ids: IdArray) -> LandmarkMatches:
         """A copy without some landmarks."""
-        keep = ~isin(self.ids, ids)
-        return LandmarkMatches(self.ids[keep], self.rows[keep], self.T_world_left, doubted=self.doubted)
+        return self.select(~isin(self.ids, ids))
+
+    def joined(self, other: LandmarkMatches) -> LandmarkMatches:
+        """These and others, of other landmarks."""
+        ids, rows = np.concatenate([self.ids, other.ids]), np.concatenate([self.rows, other.rows])
+        return replace(self, ids=ids, rows=rows)
+
+    def select(self, rows: NDArray) -> LandmarkMatches:
+        """Some of the landmarks (a mask or indices)."""
+        return LandmarkMatches(self.ids[rows], self.rows[rows], self.T_world_left, doubted=self.doubted)
+
+    def rows_of(self, ids: IdArray) -> NDArray[np.intp]:
+        """Rows of the features that show landmarks, by their ids, all of which were found."""
+        order = np.argsort(self.ids, kind="stable")
+        return self.rows[order[np.searchsorted(self.ids, ids, sorter=order)]]
 
     def landmark_of(self, features: int) -> IdArray:
         """Id of the landmark matched with each of N = `features` features (N,), −1 for none."""
@@ -86,12 +100,34 @@ class Localizer:
         self.pixel_sigma = models.pixel_sigma
         self._models = models
         self._lost_after = lost_after
-        self._hypotheses = PoseHypotheses()
-        self._measured = PoseHypotheses()  # the last pose that was believed
 
-    def forget(self) -> None:
-        """Forget poses that await more frames: another map or another pose is believed now."""
-        self._hypotheses = PoseHypotheses()
+    def follow(
+        self,
+        prediction: Prediction,
+        landmarks: LandmarkTable,
+        positions: Array,
+        features: StereoFeatures,
+        tracking: TrackingState,
+        standing: Standing,
+        seed: int,
+        elsewhere: Callable[[], Array | None],
+    ) -> tuple[LandmarkMatches, TrackingState, Standing]:
+        """Landmarks found in a frame, with which poses are doubted and believed then, and whether the camera stands.
+
+        `localize`, unless the camera stands in spite of the pose on which landmarks agree: then what stays is matched.
+        """
+        if standing.stands:
+            found = self.match(prediction, landmarks, positions, features, seed)
+            if found.T_world_left is not None:
+                standing = standing.contested(self.rig, self.pixel_sigma, features, found.rows, found.T_world_left)
+            if standing.stands:
+                if 2 * isin(found.rows, standing.witnesses).sum() <= len(found):
+                    at, witnessed = standing.T_world_left, standing.witnessed(features)
+                    found = self.match_around(at, prediction, landmarks, positions, witnessed, seed)
+                    found = replace(found, rows=standing.witnesses[found.rows])
+                return found, tracking, standing
+        found, tracking = self.localize(prediction, landmarks, positions, features, tracking, seed, elsewhere)
+        return found, tracking, standing
 
     def localize(
         self,
@@ -99,10 +135,10 @@ class Localizer:
         landmarks: LandmarkTable,
         positions: Array,
         features: StereoFeatures,
-        state: TrackingState,
+        tracking: TrackingState,
         seed: int,
         elsewhere: Callable[[], Array | None] = lambda: None,
-    ) -> LandmarkMatches:
+    ) -> tuple[LandmarkMatches, TrackingState]:
         """`match`, but a pose farther from the prediction than its uncertainty allows needs proof.
 
         Either most of what is in view from there agrees on it, and a camera may have moved so far since its last
@@ -111,30 +147,28 @@ class Localizer:
         is asked for a pose, which is treated likewise, but is accepted at once if the prediction allows it and enough
         landmarks match around it.
         """
-        doubtful = state.unmatched > 0
+        doubtful = tracking.unmatched > 0
         matches = self.match(prediction, landmarks, positions, features, seed, doubtful)
         T, farthest = matches.T_world_left, self.config.lost_jump if doubtful else self.config.max_jump
         here = prediction, landmarks, positions, features, seed
         if T is None:
             T = elsewhere()
             if T is None:
-                self._hypotheses = PoseHypotheses()
-                return matches
+                return matches, replace(tracking, doubted=NO_POSE)
             if jump(prediction, T) <= farthest:
                 matches = self.match_around(T, *here)
         allowed = jump(prediction, T) <= farthest
-        if not allowed and self._measured.after(T, features.stamp, self._models).count > 1:
+        if not allowed and tracking.believed.after(T, features.stamp, self._models).count > 1:
             around = self.match_around(T, *here)
             allowed = self._most_agree(around, landmarks, positions, features)
             matches = around if allowed else matches
         if allowed and len(matches):
-            self._hypotheses, self._measured = PoseHypotheses(), PoseHypotheses(1, features.stamp, T)
-            return matches
-        self._hypotheses = self._hypotheses.after(T, features.stamp, self._models)
-        if self._hypotheses.count < self.config.kidnapped_after:
-            return replace(LandmarkMatches.nothing(), doubted=len(matches))
-        self._hypotheses, self._measured = PoseHypotheses(), PoseHypotheses(1, features.stamp, T)
-        return replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+            return matches, tracking.believing(T, features.stamp)
+        doubted = tracking.doubted.after(T, features.stamp, self._models)
+        if doubted.count < self.config.kidnapped_after:
+            return replace(LandmarkMatches.nothing(), doubted=len(matches)), replace(tracking, doubted=doubted)
+        nothing = replace(LandmarkMatches.nothing(), T_world_left=T, kidnapped=True)
+        return nothing, tracking.believing(T, features.stamp)
 
     def _most_agree(
         self, matches: LandmarkMatches, landmarks: LandmarkTable, positions: Array, features: StereoFeatures
@@ -160,7 +194,7 @@ class Localizer:
 
     def state_after(
         self,
-        state: TrackingState,
+        tracking: TrackingState,
         prediction: Prediction,
         features: StereoFeatures,
         matches: LandmarkMatches,
@@ -172,11 +206,11 @@ class Localizer:
         camera must match more landmarks than a tracked one. A frame whose pose agrees with the last frame's, but
         awaits a third one, does not count as showing an unknown place.
         """
-        least = self.config.minimum_consistent if state.lost else MINIMAL_POINTS
+        least = self.config.minimum_consistent if tracking.lost else MINIMAL_POINTS
         measured = len(report.used) >= least and 2 * len(report.used) >= len(matches)
         uncertain = median_deviation(prediction) > self.config.tight_window
-        enough = 0 if self._hypotheses.count > 1 else int(features.has_stereo.sum())
-        return state.after(measured, uncertain, enough, self._lost_after)
+        enough = 0 if tracking.doubted.count > 1 else int(features.has_stereo.sum())
+        return tracking.after(measured, uncertain, enough, self._lost_after)
 
     def match(
         self,
@@ -256,9 +290,8 @@ class Localizer:
         self, prediction: Prediction, landmarks: LandmarkTable, rows: NDArray[np.intp], features: StereoFeatures
     ) -> Matches:
         """Matches by rows of the whole map."""
-        descriptors = (landmarks.descriptors, landmarks.laplacian)
-        found = match_in_windows(prediction, *descriptors, features, self.config, among=rows)
-        return Matches(rows[found.landmarks], found.features)
+        looks = landmarks.descriptors, landmarks.laplacian
+        return follow(prediction.uv_left, prediction.innovation, *looks, features, self.config, rows)
 
     def _consensus(
         self, matches: Matches, positions: Array, features: StereoFeatures, guess: Array, seed: int, wide: bool = False
@@ -334,3 +367,9 @@ def _matches_of(landmarks: LandmarkTable, matches: Matches, T_world_left: Array)
         return LandmarkMatches.nothing()
     order = np.argsort(matches.landmarks, kind="stable")
     return LandmarkMatches(landmarks.ids[matches.landmarks[order]], matches.features[order], T_world_left)
+
+
+def nowhere(stamp: float, T_world_left: Array) -> Prediction:
+    """An uninformative prediction: an unknown pose, and no landmark expected anywhere."""
+    none, P = np.zeros((0, 2)), np.diag(np.repeat([np.pi**2, 1e6], 3))
+    return Prediction(stamp, T_world_left, P, np.zeros(0, np.int64), none, none, np.zeros((0, 2, 2)))

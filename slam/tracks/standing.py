@@ -154,7 +154,11 @@ class Standing:
         """
         motion = inverse(T_world_left) @ self.T_world_left
         landmarks, witnesses = (_moved(rig, sigma, features, rows, motion) for rows in (matched, self.witnesses))
-        return replace(self, frames=0) if landmarks > _SOME and witnesses < 0.5 else self
+        return self.moving() if landmarks > _SOME and witnesses < 0.5 else self
+
+    def moving(self) -> Standing:
+        """The same features, of a camera that does not stand."""
+        return replace(self, frames=0)
 
     def witnessed(self, features: StereoFeatures) -> StereoFeatures:
         """Those of the features that stay."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -11,6 +12,23 @@ from slam.data import BoolArray, IdArray, StereoFeatures
 from slam.geometry.arrays import ascending, isin
 from slam.geometry.se3 import Array, transform
 from slam.showing import count
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The image around a landmark, seen from a pose.
+
+    Attributes:
+        image: (S, S) float32.
+        centre: coordinates of the landmark within it (2,).
+        size: of the feature [px].
+        T_world_left: pose of the left camera (4, 4).
+    """
+
+    image: NDArray[np.float32]
+    centre: Array
+    size: float
+    T_world_left: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +47,7 @@ class LandmarkTable:
         out_of_view: number of frames in which it was outside of the image since it was last measured (N,).
         unseen: number of frames since it was last measured (N,); only frames count in which some landmark was measured
             and this one was not withheld as possibly moving.
+        patches: `Patch` of each at first sight (N,), or None; for alignment.
     """
 
     ids: IdArray
@@ -41,6 +60,7 @@ class LandmarkTable:
     seen_from: Array = field(default=None)  # type: ignore[arg-type]
     out_of_view: IdArray = field(default=None)  # type: ignore[arg-type]
     unseen: IdArray = field(default=None)  # type: ignore[arg-type]
+    patches: NDArray[np.object_] = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         for name in ("out_of_view", "unseen"):
@@ -48,6 +68,8 @@ class LandmarkTable:
                 object.__setattr__(self, name, np.zeros(len(self.ids), np.int64))
         if self.seen_from is None:
             object.__setattr__(self, "seen_from", np.full((len(self.ids), 3), np.nan))
+        if self.patches is None:
+            object.__setattr__(self, "patches", np.full(len(self.ids), None))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -108,9 +130,23 @@ class LandmarkTable:
         out_of_view = self.out_of_view + (0 if in_image is None else ~in_image)
         unseen = self.unseen + (~back if len(hit) else 0)
         out_of_view[hit] = unseen[hit] = 0
-        return LandmarkTable(
-            self.ids, descriptors, self.laplacian, seen, views, missed, last_seen, seen_from, out_of_view, unseen
-        )
+        return replace(
+            self, descriptors=descriptors, seen=seen, in_view=views, missed=missed, last_seen=last_seen,
+            seen_from=seen_from, out_of_view=out_of_view, unseen=unseen,
+        )  # fmt: skip
+
+    @property
+    def has_patch(self) -> BoolArray:
+        """Which landmarks have a patch (N,)."""
+        return np.array([patch is not None for patch in self.patches], bool)
+
+    def with_patches(self, rows: NDArray[np.intp], patches: Sequence[Patch] | None) -> LandmarkTable:
+        """A copy in which the landmarks at some rows (M,) have other patches; None for none."""
+        if not len(rows):
+            return self
+        column = self.patches.copy()
+        column[rows] = patches
+        return replace(self, patches=column)
 
     def long_out_of_view(self, after: int) -> BoolArray:
         """Which landmarks (N,) were outside of the image for `after` frames, or are of an earlier run."""

@@ -8,14 +8,8 @@ import pytest
 from slam.data import Prediction, StereoFeatures
 from slam.errors import ConfigurationError
 from slam.geometry import se3
-from slam.tracking.association import (
-    AssociationConfig,
-    crowded,
-    match_everywhere,
-    match_in_windows,
-    pairs_in_boxes,
-    search_windows,
-)
+from slam.tracks.config import AssociationConfig
+from slam.tracks.follow import crowded, follow, match_everywhere, match_in_boxes
 from tests.slam.scene import RIG, Cloud
 
 CONFIG = AssociationConfig()
@@ -31,7 +25,8 @@ def predicted(cloud, T, offset=(0.0, 0.0), sigma=2.0):
 
 def found(cloud, prediction, features, config=CONFIG):
     ids = prediction.ids
-    return match_in_windows(prediction, cloud.descriptors[ids], cloud.laplacian[ids], features, config)
+    expected = prediction.uv_left, prediction.innovation
+    return follow(*expected, cloud.descriptors[ids], cloud.laplacian[ids], features, config)
 
 
 def test_every_landmark_finds_its_own_feature():
@@ -63,23 +58,33 @@ def test_fixed_windows_do_not_care_for_the_covariance():
 
 @pytest.mark.parametrize("sigma", [0.5, 4.0, 30.0, 300.0])
 def test_windows_are_the_innovations_ellipses(sigma):
-    """The same candidates as by looking at every pair, whatever the size and shape of the windows."""
+    """A feature is found if it lies in the ellipse, whatever the size and shape of that."""
     rng = np.random.default_rng(int(sigma))
-    uv = rng.uniform((0, 0), (320, 240), (150, 2))
-    centres = rng.uniform((-20, -20), (340, 260), (200, 2))
-    A = sigma * rng.normal(size=(200, 2, 2))
+    A = sigma * rng.normal(size=(300, 2, 2))
     S = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(2)
-    none = np.zeros(200, np.int64)
-    config = AssociationConfig(window_min=1e-3, window_max=1e4)
-    windows = search_windows(Prediction(0.0, np.eye(4), np.eye(6), none, centres, centres, S), config)
-    rows, columns = pairs_in_boxes(centres, windows.reach, uv)
-    level = windows.level(rows, (uv[columns] - centres[rows]).astype(np.float32))
-    offset = uv[None] - centres[:, None]
-    squared = np.einsum("mni,mij,mnj->mn", offset, np.linalg.inv(S), offset)
+    offset = np.einsum("nij,nj->ni", np.linalg.cholesky(S), rng.normal(size=(300, 2))) * rng.uniform(0, 5, (300, 1))
+    squared = np.einsum("ni,nij,nj->n", offset, np.linalg.inv(S), offset)
+    look, sign, config = (
+        np.eye(1, 8, dtype=np.float32),
+        np.ones(1, np.int8),
+        AssociationConfig(window_min=1e-3, window_max=1e4),
+    )
+    one, none = np.ones(1), np.full((1, 2), np.nan)
+    features = [StereoFeatures(0.0, uv[None], none, one, one, one, sign, look) for uv in offset]
+    inside = np.array([len(follow(np.zeros((1, 2)), P[None], look, sign, f, config)) for P, f in zip(S, features)])
     clear = np.abs(np.sqrt(squared) - 5.0) > 1e-3  # float32 at the very edge
-    inside = np.zeros_like(squared, bool)
-    inside[rows[level < 2], columns[level < 2]] = True
+    assert 30 < inside.sum() < 270
     np.testing.assert_array_equal(inside[clear], (squared <= 25.0)[clear])
+
+
+def test_boxes_take_some_features_and_tracks_that_are_expected_somewhere():
+    cloud = Cloud()
+    features, ids = cloud.features(np.eye(4), 0.0)
+    pixels, looks = features.uv_left + 2.0, (cloud.descriptors[ids], cloud.laplacian[ids], features)
+    pixels[0] = np.nan
+    matches = match_in_boxes(pixels, 3.0, *looks, np.arange(10), 0.4, 0.8)
+    assert matches.landmarks.tolist() == matches.features.tolist() == list(range(1, 10))
+    assert not len(match_in_boxes(pixels, 1.0, *looks, np.arange(10), 0.4, 0.8))
 
 
 def test_larger_window_asks_for_a_better_descriptor():
@@ -109,6 +114,15 @@ def test_no_greedy_theft():
     only_second = _select(features, np.flatnonzero(ids == 1))
     matches = found(cloud, predicted(cloud, np.eye(4)), only_second)
     assert matches.landmarks.tolist() == [1]
+
+
+def test_tracks_that_look_alike_to_the_bit_share_a_feature():
+    look, sign = np.eye(1, 8, dtype=np.float32), np.ones(1, np.int8)
+    one = np.ones(1)
+    feature = StereoFeatures(0.0, np.zeros((1, 2)), np.full((1, 2), np.nan), one, one, one, sign, look)
+    many = np.zeros((500, 2)), np.tile(np.eye(2), (500, 1, 1)), look.repeat(500, axis=0), sign.repeat(500)
+    matches = follow(*many, feature, CONFIG)
+    assert matches.landmarks.tolist() == list(range(500)) and not matches.features.any()
 
 
 def test_ambiguous_features_are_left_alone():

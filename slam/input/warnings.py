@@ -7,14 +7,13 @@ import logging
 import numpy as np
 
 from slam.data import StereoFeatures, StereoFrame
-from slam.errors import CalibrationError, MeasurementError
+from slam.errors import CalibrationError
 from slam.geometry.camera import size_doubt
 from slam.geometry.rig import StereoRig
 from slam.grey_range import eight_bits, grey_range
+from slam.input.pair import NO_DISPARITY, PairGeometry, most, pair_geometry
 from slam.models import EstimatorModels
-from slam.tracking.feature_check import usable
-from slam.tracking.pair_check import NO_DISPARITY, PairGeometry, most, pair_geometry
-from slam.tracking.state import ENOUGH_FEATURES
+from slam.tracks.state import ENOUGH_FEATURES
 
 logger = logging.getLogger("slam.input")
 
@@ -61,13 +60,7 @@ class InputWarnings:
             self._warn(unlikely)
 
     def look(self, frame: StereoFrame, features: StereoFeatures) -> None:
-        """Check a frame and the features found in it; invalid frames are refused elsewhere."""
-        try:
-            features = usable(features, self._rig, None, -np.inf)
-        except MeasurementError:
-            return
-        if not isinstance(frame, StereoFrame):
-            return
+        """Check a frame and the features found in it, which are as documented."""
         if len(self._stamps) <= _INTERVALS:
             self._stamps.append(features.stamp)
             if len(self._stamps) > _INTERVALS:

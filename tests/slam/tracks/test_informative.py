@@ -10,7 +10,7 @@ from slam.config import SystemConfig
 from slam.data import Prediction
 from slam.errors import ConfigurationError
 from slam.models import EstimatorModels
-from slam.tracking.informative import most_informative
+from slam.tracks.informative import most_informative
 
 RIG = slam.open_sequence("synthetic:desk?frames=2").rig
 MODELS = EstimatorModels()

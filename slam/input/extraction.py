@@ -10,13 +10,14 @@ import numpy as np
 from slam.data import StereoFeatures, StereoFrame
 from slam.errors import ConfigurationError, MeasurementError
 from slam.geometry.rig import StereoRig
+from slam.input.features import documented
+from slam.input.warnings import InputWarnings
 from slam.interfaces import Frontend
 from slam.models import EstimatorModels
 from slam.runtime.blas import one_blas_thread
 from slam.runtime.one_thread import OneThread
 from slam.runtime.stages import Stages
 from slam.third_party import named_failures
-from slam.tracking.input_warnings import InputWarnings
 
 #: Largest row difference of left and right features that is assumed of a front end that does not give its own [px].
 _ROWS = 1.5
@@ -76,12 +77,12 @@ class Extractor:
 
     def __init__(self, frontend: Frontend | None, rig: StereoRig, models: EstimatorModels) -> None:
         rows = getattr(getattr(frontend, "config", None), "epipolar", _ROWS)
-        self._warnings = InputWarnings(rig, models, rows)
+        self._rig, self._warnings = rig, InputWarnings(rig, models, rows)
         self._extracting = OneThread("this system's front end")
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about the images so far, one line each (see `slam.tracking.input_warnings`)."""
+        """Warnings about the images so far, one line each (see `slam.input.warnings`)."""
         return [*self._warnings.lines, *filter(None, [self._warnings.repeated])]
 
     def warn_of_repeated(self, number: int) -> None:
@@ -94,7 +95,7 @@ class Extractor:
 
         Raises:
             ConfigurationError: there is no front end.
-            MeasurementError: this is no frame.
+            MeasurementError: this is no frame, or the features are not as documented.
             SlamError: another thread is extracting; or the front end failed (`PartError`).
         """
         if frontend is None:
@@ -103,7 +104,7 @@ class Extractor:
             raise MeasurementError(f"a frame must be a StereoFrame, got {type(frame).__name__}")
         stages = Stages()
         with self._extracting, stages.stage("extract"), named_failures(f"frame {frame.index}", frontend):
-            features = frontend.extract(frame)
+            features = documented(frontend.extract(frame), self._rig)
             if not (frame.left_mask is None and frame.right_mask is None):
                 features = features.outside(frame.left_mask, frame.right_mask)
         self._warnings.look(frame, features)

@@ -10,7 +10,7 @@ import pytest
 import slam
 from slam.data import StereoFeatures
 from slam.geometry.se3 import exp, inverse, transform
-from slam.tracking.standing import Standing
+from slam.tracks.standing import Standing
 from tests.slam.scene import RIG
 
 SIGMA = 0.3

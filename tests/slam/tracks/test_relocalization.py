@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -14,8 +13,7 @@ from slam.geometry import se3
 from slam.mapping.config import MapConfig
 from slam.models import EstimatorModels
 from slam.system import StereoSlam
-from slam.tracking.hypotheses import PoseHypotheses
-from slam.tracking.state import TrackingState
+from slam.tracks.state import PoseHypotheses, TrackingState
 from tests.slam.scene import RIG, Cloud, path
 
 BACKENDS = ("ekf", "smoother", "window")
@@ -74,33 +72,6 @@ def test_a_third_of_the_frames_dropped(backend):
     assert right_share(results, points) == 1
     last = next(T for T in reversed(poses) if T is not None)
     assert np.linalg.norm(system.trajectory().positions[-1] - last[:3, 3]) < 0.012
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_third_of_the_right_images_dropped(backend):
-    rng = np.random.default_rng(2)
-    no_right = lambda k, f: replace(f, uv_right=f.uv_right * np.nan) if k and rng.random() < 0.3 else f  # noqa: E731
-    poses = path(50)
-    system, results, points = run(backend, poses, no_right)
-    assert states(results) == [("started", 1), ("tracked", 49)]
-    assert right_share(results, points) == 1
-    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.012
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_carried_off_to_a_known_place(backend):
-    """The camera jumps by half a metre and a turn within the map; it is found again, and the map does not double."""
-    jump = se3.exp(np.array([0, 0.3, 0, 0.4, 0, 0.2]))
-    poses = [*path(25), *(T @ jump for T in path(80)[25:])]
-    system, results, points = run(backend, poses)
-    tracked = [k for k, r in enumerate(results) if k > 25 and r.status is FrameStatus.TRACKED]
-    assert tracked[0] < 60
-    assert all(r.status is FrameStatus.TRACKED for r in results[tracked[0] :])
-    assert right_share(results, points) == 1
-    assert np.linalg.norm(system.trajectory().positions[-1] - poses[-1][:3, 3]) < 0.02
-    assert not any(len(r.added) for r in results[25 : tracked[0]])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -162,4 +133,4 @@ def test_what_counts_as_lost():
         steps.append(steps[-1].after(False, vague, features, lost_after=3))
     assert [s.lost for s in steps] == [False, False, False, False, True, True]
     assert [s.may_add(4) for s in steps] == [True, False, False, False, False, True]
-    assert steps[-1].after(True, True, 50, 3) == TrackingState()
+    assert vars(steps[-1].after(True, True, 50, 3)) == vars(TrackingState())

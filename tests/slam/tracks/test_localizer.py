@@ -7,11 +7,11 @@ import pytest
 
 from slam.data import Prediction, StereoFeatures
 from slam.geometry import se3
-from slam.landmarks import LandmarkTable
 from slam.models import EstimatorModels
-from slam.tracking.association import AssociationConfig
-from slam.tracking.localizer import Localizer, jump
-from slam.tracking.state import TrackingState
+from slam.tracks.config import AssociationConfig
+from slam.tracks.localizer import Localizer, jump
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
 from tests.slam.scene import RIG, Cloud
 
 T_TRUE = se3.exp(np.array([0.02, 0.3, -0.01, 0.2, 0.05, 0.4]))
@@ -43,9 +43,9 @@ def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_i
     landmarks, positions, features = scene()
     expected = prediction(positions, 0.2, 400.0)
     assert jump(expected, T_TRUE) < AssociationConfig().max_jump
-    alone = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0)
+    alone, _ = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0)
     assert not len(alone)
-    found = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE)
+    found, _ = localizer().localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE)
     assert len(found) > 30
     assert not found.kidnapped
     assert np.abs(se3.log(se3.inverse(T_TRUE) @ found.T_world_left)).max() < 0.01
@@ -55,12 +55,13 @@ def test_an_allowed_place_is_believed_at_once_where_landmarks_are_found_around_i
 def test_other_places_wait_for_several_frames(far):
     """Far beyond what the prediction allows; or allowed, where no landmark is found."""
     shift = se3.exp(np.array([0, 0, 0, 1.0, 0.8, 0])) if not far else np.eye(4)
-    own = localizer()
+    own, tracking = localizer(), TrackingState()
     for frame in range(AssociationConfig().kidnapped_after):
         landmarks, positions, features = scene(frame)
         expected = prediction(positions, 0.2 if not far else 0.005, 400.0)
         assert (jump(expected, T_TRUE @ shift) > AssociationConfig().max_jump) == far
-        found = own.localize(expected, landmarks, positions, features, TrackingState(), 0, lambda: T_TRUE @ shift)
+        seen = expected, landmarks, positions, features
+        found, tracking = own.localize(*seen, tracking, 0, lambda: T_TRUE @ shift)
         assert not len(found)
         assert found.kidnapped == (frame == AssociationConfig().kidnapped_after - 1)
 
@@ -74,5 +75,5 @@ def test_places_are_not_asked_for_where_landmarks_are_found():
         raise AssertionError
 
     expected = prediction(cloud.points[ids], 0.01, 5.0)
-    found = localizer().localize(expected, landmarks, cloud.points[ids], features, TrackingState(), 0, never)
+    found, _ = localizer().localize(expected, landmarks, cloud.points[ids], features, TrackingState(), 0, never)
     assert len(found) > 50

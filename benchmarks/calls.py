@@ -1,0 +1,83 @@
+"""Way of one frame through the code: files entered, calls from one file to another, and Python calls in all.
+
+    python benchmarks/calls.py KITTI_FOLDER [--frame 20] [--backends ekf window]
+
+Calls inside the back end and the window solver are left out; the front end has done its work before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import slam
+from slam.system import StereoSlam
+
+ROOT = Path(__file__).resolve().parents[1]
+_LEFT_OUT = tuple(str(ROOT / folder) for folder in ("backends", "slam/window", "slam/kernels"))
+_CORE = str(ROOT / "slam")
+
+
+class Way:
+    """Counts calls of Python functions while it watches, as a profiler."""
+
+    def __init__(self) -> None:
+        self.calls: Counter[tuple[str, str]] = Counter()  # by calling and called file
+
+    def __call__(self, frame: FrameType, event: str, argument: Any) -> None:
+        """Note a call, unless a file that is left out is among its callers."""
+        if event != "call":
+            return
+        at: FrameType | None = frame.f_back
+        while at is not None:
+            if at.f_code.co_filename.startswith(_LEFT_OUT):
+                return
+            at = at.f_back
+        caller = "" if frame.f_back is None else frame.f_back.f_code.co_filename
+        self.calls[caller, frame.f_code.co_filename] += 1
+
+    def summary(self) -> tuple[int, int, int]:
+        """Files of the core that were entered, calls from one of them to another, calls in all."""
+        ours = {pair: n for pair, n in self.calls.items() if pair[1].startswith(_CORE)}
+        ours = {pair: n for pair, n in ours.items() if not pair[1].startswith(_LEFT_OUT)}
+        across = sum(n for (caller, called), n in ours.items() if caller != called and caller.startswith(_CORE))
+        return len({called for _, called in ours}), across, sum(self.calls.values())
+
+
+def way_of(folder: str, backend: str, number: int) -> Way:
+    """The way of a frame by its number in a recording."""
+    sequence = slam.open_sequence(folder)
+    system, way = StereoSlam(sequence.rig, "surf", backend, kind=sequence.kind), Way()
+    for frame in sequence.frames(0, number + 1):
+        features = system.frontend.extract(frame)  # type: ignore[union-attr]
+        sys.setprofile(way if frame.index == number else None)
+        system.process_features(features)
+        sys.setprofile(None)
+    return way
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder")
+    parser.add_argument("--frame", type=int, default=20)
+    parser.add_argument("--backends", nargs="+", default=["ekf", "smoother", "window"])
+    parser.add_argument("--files", action="store_true", help="list calls by file entered")
+    arguments = parser.parse_args()
+    for backend in arguments.backends:
+        way = way_of(arguments.folder, backend, arguments.frame)
+        print(f"{backend}: {way.summary()[0]} files, {way.summary()[1]} calls between files, {way.summary()[2]} calls")
+        if arguments.files:
+            entered: Counter[str] = Counter()
+            for (_, called), n in way.calls.items():
+                entered[called.removeprefix(str(ROOT))] += n
+            print("\n".join(f"{n:6d} {name}" for name, n in entered.most_common(60)))
+
+
+if __name__ == "__main__":
+    main()

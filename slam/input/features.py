@@ -1,0 +1,115 @@
+"""Checks of features before a step changes anything: once what they are, then whether they follow the last frame's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from slam.checks import LATEST_STAMP
+from slam.data import ImagePair, StereoFeatures
+from slam.errors import MeasurementError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import Array
+
+#: Columns of `StereoFeatures`: numbers in a row (−1 for any), kinds of dtype that are taken, the dtype that comes out,
+#: and what a value must be.
+_COLUMNS: dict[str, tuple[tuple[int, ...], str, type, Any]] = {
+    "uv_left": ((2,), "f", np.float64, np.isfinite),
+    "uv_right": ((2,), "f", np.float64, lambda uv: ~np.isinf(uv)),
+    "scale": ((), "f", np.float64, np.isfinite),
+    "angle": ((), "f", np.float64, np.isfinite),
+    "response": ((), "f", np.float64, np.isfinite),
+    "laplacian": ((), "i", np.int8, np.isfinite),
+    "descriptors": ((-1,), "f", np.float32, np.isfinite),
+}
+
+
+def documented(features: Any, rig: StereoRig) -> StereoFeatures:
+    """The features with the documented dtypes.
+
+    Raises:
+        MeasurementError: they are not as `StereoFeatures` says: a wrong type, shape or number of dimensions, a value
+            that is not finite (except NaN in `uv_right`), a pixel farther outside the image than its width or height,
+            a stamp that is no number, or images of another type or size.
+    """
+    if not isinstance(features, StereoFeatures):
+        raise MeasurementError(f"features must be StereoFeatures, got {type(features).__name__}")
+    stamp, threshold = _number("stamp", features.stamp), _number("threshold", features.threshold)
+    if not np.isfinite(stamp) or abs(stamp) > LATEST_STAMP:
+        raise MeasurementError(f"features: the stamp must be finite and within {LATEST_STAMP:g} s, got {stamp}")
+    columns: dict[str, Any] = {name: _column(name, getattr(features, name), len(features)) for name in _COLUMNS}
+    size = np.array([rig.width, rig.height])
+    for name in ("uv_left", "uv_right"):
+        if ((columns[name] < -size) | (columns[name] > 2 * size)).any():  # NaN compares false
+            raise MeasurementError(f"features: a pixel of {name} lies far outside of the image")
+    _require_images(features.images, rig)
+    return replace(features, stamp=stamp, threshold=threshold, **columns)
+
+
+def following(features: StereoFeatures, dimensions: int | None, after: float) -> StereoFeatures:
+    """The features; a frame without any gets descriptors (0, `dimensions`).
+
+    Args:
+        features: as documented.
+        dimensions: length of the descriptors so far; None if there were none.
+        after: stamp of the frame before [s].
+
+    Raises:
+        MeasurementError: the stamp is not later, or the descriptors are of another length.
+    """
+    if features.stamp <= after:
+        raise MeasurementError(
+            f"features: the stamp {features.stamp} s is not later than {after} s, the last frame's (a frame whose step "
+            "was interrupted counts too): go on with a later one"
+        )
+    length = features.descriptors.shape[1]
+    if dimensions is None or length == dimensions:
+        return features
+    if len(features):
+        raise MeasurementError(f"features: descriptors have {length} numbers, those of earlier frames {dimensions}")
+    return replace(features, descriptors=np.zeros((0, dimensions), np.float32))
+
+
+def _number(name: str, value: Any) -> float:
+    """A real number as a float."""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    raise MeasurementError(f"features: {name} must be a number, got {str(value)[:40]!r}")
+
+
+def _column(name: str, array: Any, rows: int) -> Array:
+    """One column with its documented dtype."""
+    shape, kinds, dtype, good = _COLUMNS[name]
+    if not isinstance(array, np.ndarray) or array.ndim != 1 + len(shape) or array.dtype.kind not in kinds:
+        got = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        dimensions = f"{1 + len(shape)} dimensions of {dtype.__name__}"
+        raise MeasurementError(f"features: {name} must be an array of {dimensions}, got {got}")
+    if len(array) != rows or (shape == (2,) and array.shape[1] != 2) or (rows and not array.size):
+        raise MeasurementError(f"features: {name} is of shape {array.shape}, with {rows} rows in uv_left")
+    if array.dtype != dtype:
+        with np.errstate(over="ignore"):  # reported as not finite
+            array = (np.sign(array) if "i" in kinds else array).astype(dtype)
+    if not good(array).all():
+        raise MeasurementError(f"features: a value of {name} is not finite")
+    return np.asarray(array)
+
+
+def _require_images(images: Any, rig: StereoRig) -> None:
+    """Check that images, if there are any, are a pair of the rectified rig, of the rig's own size."""
+    if images is None:
+        return
+    if not isinstance(images, ImagePair):
+        raise MeasurementError(f"features: images must be an ImagePair, got {type(images).__name__}")
+    for side, image in (("left", images.left), ("right", images.right)):
+        if image is None and side == "right":
+            continue
+        shape = (rig.height, rig.width)
+        if not isinstance(image, np.ndarray) or image.dtype != np.float32 or image.shape != shape:
+            got = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise MeasurementError(f"features: the {side} image must be float32 of shape {shape}, got {got}")

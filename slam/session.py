@@ -1,0 +1,316 @@
+"""Around the step: a prior map, a kidnapped camera and a new map replace the back end, between frames.
+
+`State` is all that a step starts from and leaves behind. A step builds a new one beside it, which takes its place at
+the end, so that a step has happened or has not. If a step finds that the camera is elsewhere, it ends without a state;
+`Session` then gives one with another back end, and the step is made again as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from slam import registry
+from slam.calibration import RemainingRigError, SavedCalibration, SelfCalibration
+from slam.config import SystemConfig
+from slam.data import (
+    Estimate,
+    FrameResult,
+    FrameStatus,
+    IdArray,
+    Prediction,
+    StereoFeatures,
+    UpdateReport,
+    UpdateStatus,
+)
+from slam.errors import ConfigurationError, SlamError
+from slam.geometry.rig import StereoRig
+from slam.geometry.se3 import LEAST_VARIANCE, Array
+from slam.geometry.trajectory import Trajectory
+from slam.interfaces import Backend, MapBackend
+from slam.mapping.atlas.atlas import Atlas, TrackingGap
+from slam.mapping.atlas.loop_closer import Found, LoopCloser
+from slam.mapping.map_io import SavedMap
+from slam.mapping.mapper import Mapper
+from slam.mapping.step import Step
+from slam.tracks.localizer import Localizer, nowhere
+from slam.tracks.standing import Standing
+from slam.tracks.state import TrackingState
+from slam.tracks.table import LandmarkTable
+
+#: Standard deviations of the initial pose [m], [rad] of a back end that starts in a map. They are wide, because the
+#: back end measures the landmarks that gave that pose once more: a narrow prior would count them twice.
+POSITION_SIGMA, ROTATION_SIGMA = 1.0, 0.2
+
+NOT_FOUND = "the camera has not been found in the map yet"
+NEW_MAP = "the place is not in the map: a new map begins"
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What a step starts from and leaves behind; a step replaces it as a whole, in one assignment at its end.
+
+    Attributes:
+        backend: holds the estimate. What an interrupted step did in it is undone by `Mapper.reconcile`.
+        landmarks: the map's bookkeeping; None before the first frame.
+        atlas: keyframes and loops.
+        index: of the last frame.
+        stamp: its time [s].
+        tracking: how localization has gone.
+        standing: whether the camera stands.
+        dimensions: length of the descriptors; None before the first feature.
+        mapped: whether there ever was a landmark.
+        measured_at: time of the last frame whose pose was measured, or in which a new map began [s].
+        checksum: of the images; None without images, or of images that show nothing.
+        prior_map: in which the camera has not been found yet; None without one, or once it is found.
+        past: the paths of all back ends before the present one.
+        restarted: indices of the frames in which another back end took over.
+    """
+
+    backend: Backend
+    landmarks: LandmarkTable | None = None
+    atlas: Atlas = field(default_factory=Atlas)
+    index: int = -1
+    stamp: float = -np.inf
+    tracking: TrackingState = field(default_factory=TrackingState)
+    standing: Standing = field(default_factory=Standing)
+    dimensions: int | None = None
+    mapped: bool = False
+    measured_at: float = -np.inf
+    checksum: tuple[int, int] | None = None
+    prior_map: SavedMap | None = None
+    past: tuple[Trajectory, ...] = ()
+    restarted: tuple[int, ...] = ()
+
+    @classmethod
+    def in_map(cls, backend: Backend, known: SavedMap) -> State:
+        """Before the first frame of a run that starts in a map."""
+        atlas = Atlas.of_earlier_run(known.keyframes, known.keyframe_poses, known.loops)
+        dimensions, mapped = known.dimensions if len(known) else None, len(known) > 0
+        return cls(backend, known.rows, atlas, dimensions=dimensions, mapped=mapped, prior_map=known)
+
+    def begins_at(self, index: int) -> bool:
+        """Whether the back end takes over in this frame."""
+        return index in self.restarted[-1:]
+
+    def after(self, step: Step, checksum: tuple[int, int] | None) -> State:
+        """The state after one more frame."""
+        known = not step.tracking.unmatched or not self.mapped or self.begins_at(step.index)
+        return replace(
+            self, landmarks=step.landmarks, atlas=step.atlas, index=step.index, stamp=step.features.stamp,
+            tracking=step.tracking, standing=replace(step.standing, T_world_left=step.estimate.T_world_left),
+            checksum=checksum, mapped=self.mapped or len(step.added) > 0,
+            dimensions=step.features.descriptors.shape[1] if len(step.features) else self.dimensions,
+            measured_at=step.features.stamp if known else self.measured_at,
+        )  # fmt: skip
+
+    def path(self) -> Trajectory:
+        """The path by all back ends so far, in their frame."""
+        return Trajectory.joined([*self.past, self.backend.trajectory()])
+
+
+@dataclass(frozen=True, eq=False)
+class Elsewhere:
+    """Why a step ended early: the camera is not where the back end has it, so that another one must take over.
+
+    Attributes:
+        T_world_left: the pose (4, 4) at which the camera was found; None in an unknown place, where a new map begins.
+        found: the place of the atlas by which it was found; None if it was found by the map's landmarks.
+    """
+
+    T_world_left: Array | None
+    found: Found | None = None
+
+
+class Session:
+    """Makes the parts of a system, and replaces its back end between frames.
+
+    Args:
+        rig: the cameras.
+        config: settings.
+        backend: name of the back ends; None if the first one was given as an object, so that no other can be made.
+        first: the first back end.
+        rig_prior: errors of the rig from earlier recordings.
+
+    Attributes:
+        rig, config: as given.
+        calibration: of the rig's error; rig_error: what it adds to the estimate.
+        localizer: finds landmarks; mapper: adds and erases them; loop_closer: finds places.
+    """
+
+    def __init__(
+        self, rig: StereoRig, config: SystemConfig, backend: str | None, first: Backend,
+        rig_prior: SavedCalibration | None,
+    ) -> None:  # fmt: skip
+        c = config
+        self.rig, self.config, self._models = rig, c, c.models
+        self._backend: str | None = backend
+        self._options: Mapping[str, Any] = c.backend
+        self.calibration = SelfCalibration(rig, c.self_calibration, rig_prior)
+        self.rig_error = RemainingRigError(self.calibration, c.models)
+        self.localizer = Localizer(rig, c.association, c.models, c.map.lost_after)
+        self.mapper = Mapper(rig, c.map, self.localizer, first)
+        self.loop_closer = LoopCloser(rig, c.atlas, c.association, c.models, c.map.max_depth_error)
+
+    def begin(self, first: Backend, prior_map: SavedMap | None) -> State:
+        """The state before the first frame.
+
+        Raises:
+            ConfigurationError: there is a prior map, but the back end was not given by name, or cannot start in one.
+            SlamError: the map is empty, or too large for the back end.
+        """
+        if prior_map is None:
+            return State(first)
+        if self._backend is None:
+            raise ConfigurationError("a system that starts in a prior map needs its back end by name")
+        if not len(prior_map) and not prior_map.keyframes:
+            raise SlamError(f"{prior_map.source}: the map holds no landmarks, so the camera cannot be found in it")
+        _fill(first, prior_map)
+        return State.in_map(first, prior_map)
+
+    def can_restart(self, state: State) -> bool:
+        """Whether another back end can take over."""
+        return self._backend is not None and isinstance(state.backend, MapBackend)
+
+    def may_begin_new_map(self, state: State, tracking: TrackingState) -> bool:
+        """Whether the camera is in an unknown place, and a new back end can begin a map there."""
+        unknown = tracking.in_unknown_place(self.config.map.restart_after)
+        return unknown and self.config.atlas.enabled and len(state.atlas) > 0 and self.can_restart(state)
+
+    def find(self, state: State, features: StereoFeatures) -> Found | None:
+        """The camera's pose by the keyframes of the atlas."""
+        return self.loop_closer.find(state.atlas, features, self.calibration.applied, state.index + 1)
+
+    def found_in_prior_map(self, state: State, features: StereoFeatures) -> State | None:
+        """The state with a back end at the pose at which the camera is found in the prior map; None if it is not.
+
+        Raises:
+            SlamError: the descriptors have another length than the map's.
+        """
+        known = state.prior_map
+        assert known is not None
+        known.require_fits("", features.descriptors.shape[1])
+        prediction, found = nowhere(features.stamp, self._models.initial_pose), None
+        matches = self.localizer.match(prediction, known.rows, known.positions, features, state.index + 1)
+        T = matches.T_world_left if len(matches) >= self.localizer.config.minimum_consistent else None
+        if T is None:
+            found = self.find(state, features)
+            if found is None:
+                return None
+            T = found.T_odom_left
+        new, landmarks = self._start(T), state.landmarks
+        _fill(new, known)
+        self.mapper.next_id = known.next_id
+        if found is not None:
+            landmarks = self.mapper.insert(new, known.rows, found.place)
+        return replace(state, backend=new, landmarks=landmarks, prior_map=None)
+
+    def not_found(self, state: State, features: StereoFeatures) -> tuple[State, FrameResult]:
+        """State and result after a frame in which the camera was not found in the prior map."""
+        none, rows = np.zeros(0, np.int64), np.zeros(0, np.intp)
+        whole = self.map_estimate(state, features.stamp)
+        estimate = replace(whole, ids=none, positions=whole.positions[:0], covariances=whole.covariances[:0])
+        result = FrameResult(
+            index=state.index + 1, status=FrameStatus.LOST, reason=NOT_FOUND, estimate=estimate,
+            report=UpdateReport.nothing(UpdateStatus.EMPTY, NOT_FOUND), features=replace(features, images=None),
+            predicted=0, matched=none, matched_features=rows, added=none, added_features=rows, erased=none,
+            map_size=len(whole.ids), located=False,
+        )  # fmt: skip
+        return replace(state, index=state.index + 1, stamp=features.stamp, checksum=None), result
+
+    def map_estimate(self, state: State, stamp: float) -> Estimate:
+        """The prior map, with a guess as the pose; its covariance is so large that the pose means nothing."""
+        k, none = state.prior_map, nowhere(stamp, self._models.initial_pose)
+        assert k is not None
+        return Estimate(stamp, none.T_world_left, none.covariance, k.ids, k.positions, k.covariances)
+
+    def taken_over(self, state: State, elsewhere: Elsewhere, features: StereoFeatures) -> tuple[State, Prediction]:
+        """The state with another back end, and what that predicts for the frame in which it takes over.
+
+        The old back end's path stays without its newest pose. At a pose in the map, the new one gets all landmarks, and
+        those of the place if that is no longer in the map; correlations between landmarks are lost, as with a map from
+        a file. The old one would take the displacement for motion.
+
+        In an unknown place, a new map begins at the old one's pose, which is exact for it: it defines its coordinates.
+        A single estimator cannot hold a pose that is uncertain by many metres and degrees together with landmarks seen
+        from there: linearisation fails over such angles and makes it overconfident in a wrong pose. The new map's pose
+        relative to the earlier one is as uncertain as the predicted pose, until a place of the atlas is seen again. The
+        earlier landmarks remain in the atlas only.
+        """
+        old, T, stamp = state.backend, elsewhere.T_world_left, features.stamp
+        landmarks: LandmarkTable | None = None
+        if T is None:
+            before = self.rig_error.added_to(old.estimate(landmarks=False))
+            T, standing = before.T_world_left, Standing()
+            new = self._new(T_world_left=T.tolist())
+            prediction = new.predict(stamp)
+            after, common = new.estimate(landmarks=False), self.rig_error.common(as_reported=False)
+            atlas = state.atlas.with_new_map(state.measured_at, before, after, common, self._models)
+        else:
+            new, place, landmarks = self._start(T), None, state.landmarks
+            _give_landmarks(old, new)
+            if elsewhere.found is not None:
+                assert landmarks is not None
+                landmarks, place = self.mapper.insert(new, landmarks, elsewhere.found.place), elsewhere.found.stamp
+            prediction = new.predict(stamp)
+            standing = state.standing.after(self.rig, self._models.pixel_sigma, features).moving()
+            atlas = state.atlas.relocalized(TrackingGap(state.measured_at, stamp), place)
+        path = old.trajectory().select(slice(None, -1))
+        state = replace(
+            state, backend=new, landmarks=landmarks, atlas=atlas, standing=standing,
+            tracking=state.tracking.believing(T, stamp), past=(*state.past, path),
+            restarted=(*state.restarted, state.index + 1),
+        )  # fmt: skip
+        return state, prediction
+
+    def left_behind(self, before: State, step: Step) -> IdArray:
+        """Ids of the landmarks that left the map in a step: the erased ones; all others too where a new map began."""
+        if before.landmarks is None or step.report.reason != NEW_MAP:
+            return step.erased
+        return np.concatenate([np.setdiff1d(before.landmarks.ids, step.landmarks.ids), step.erased])
+
+    def _start(self, T_world_left: Array) -> Backend:
+        """A back end without landmarks at a pose (4, 4) that is only roughly known."""
+        return self._new(
+            T_world_left=T_world_left.tolist(),
+            initial_position_sigma=POSITION_SIGMA,
+            initial_rotation_sigma=ROTATION_SIGMA,
+        )
+
+    def _new(self, **models: Any) -> Backend:
+        """Another back end of the same kind."""
+        assert self._backend is not None
+        changed = replace(self._models, **models)
+        backend: Backend = registry.create("backends", self._backend, self.rig, models=changed, **self._options)
+        return backend
+
+
+def _give_landmarks(old: Backend, new: Backend) -> None:
+    """Give all landmarks of a back end to another one."""
+    assert isinstance(new, MapBackend)
+    whole = old.estimate()
+    covariances = 0.5 * (whole.covariances + np.swapaxes(whole.covariances, 1, 2))
+    short = np.maximum(LEAST_VARIANCE - np.linalg.eigvalsh(covariances)[:, 0], 0)
+    new.insert(whole.ids, whole.positions, covariances + short[:, None, None] * np.eye(3))
+
+
+def _fill(backend: Backend, known: SavedMap) -> None:
+    """Give a back end a saved map.
+
+    Raises:
+        ConfigurationError: it cannot start in a prior map.
+        SlamError: it cannot hold a map of this size.
+    """
+    name = type(backend).__name__
+    if not isinstance(backend, MapBackend):
+        raise ConfigurationError(f"{name} cannot start in a prior map: it has no insert")
+    most = getattr(backend, "most_landmarks", None)
+    if most is not None and len(known) > most:
+        raise SlamError(
+            f"{known.source}: {len(known)} landmarks, but {name} takes a map of at most {most}: "
+            "start in a smaller map, or with another back end"
+        )
+    backend.insert(known.ids, known.positions, known.covariances)

@@ -1,0 +1,151 @@
+"""Corrects drifting features: aligns the image patch of a landmark's first sight with this frame, to sub-pixels.
+
+As the view changes, a detector finds a feature at another point of the surface. So the patch seen at first, warped as a
+small surface that faces the camera, is aligned with the present image, and the feature moved there. The patch is taken
+again, at the aligned position, once its size has changed by a fifth or it no longer fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from slam.data import IdArray, Patches, StereoFeatures
+from slam.errors import SlamError
+from slam.geometry.arrays import Array, isin
+from slam.geometry.rig import RectifiedRig, StereoRig
+from slam.interfaces import AligningFrontend, Frontend
+from slam.third_party import checked
+from slam.tracks.localizer import LandmarkMatches
+from slam.tracks.table import LandmarkTable, Patch
+
+_LARGEST = 1.5  # largest factor by which a patch may have grown or shrunk: `Patches` hold no more
+_RENEWED = np.sqrt(_LARGEST)  # factor from which it is taken again, so that another such change stays below the largest
+_FORGOTTEN = 10  # frames without a measurement after which a patch is dropped
+
+
+class Aligner:
+    """Moves landmarks' features to the surface points first seen, if the front end can align patches.
+
+    Args:
+        rig: the cameras.
+        enabled: see `slam.tracks.config.AssociationConfig.align`; if False, features are left unchanged.
+    """
+
+    def __init__(self, rig: StereoRig, enabled: bool) -> None:
+        self._rig = rig
+        self._enabled = enabled
+
+    def align(
+        self,
+        frontend: Frontend | None,
+        features: StereoFeatures,
+        matches: LandmarkMatches,
+        landmarks: LandmarkTable,
+        positions: Callable[[IdArray], Array],
+    ) -> tuple[StereoFeatures, LandmarkTable]:
+        """Move landmarks' features to where the landmarks' patches are found; those without a patch are unchanged.
+
+        Args:
+            frontend: which made the features.
+            features: of the frame, as measured.
+            matches: landmarks that were found, and the pose on which they agree; without a pose nothing is aligned.
+            landmarks: the map.
+            positions: returns landmarks' positions (M, 3) [m] in the world by their ids (M,).
+
+        Returns:
+            the features, and the map without the patches that are to be taken anew.
+
+        Raises:
+            SlamError: the front end does not return pixels.
+        """
+        if not self._enabled or not isinstance(frontend, AligningFrontend):
+            return features, landmarks
+        has_patch = landmarks.has_patch
+        landmarks = landmarks.with_patches(np.flatnonzero(has_patch & (landmarks.unseen > _FORGOTTEN)), None)
+        at = landmarks.rows(matches.ids)
+        known = (has_patch & (landmarks.unseen <= _FORGOTTEN))[at]
+        if matches.T_world_left is None or features.images is None or not known.any():
+            return features, landmarks
+        rows, at = matches.rows[known], at[known]
+        patches, poses = _stacked(landmarks.patches[at].tolist())
+        rectified = self._rig.rectified
+        warps = warps_of(rectified, poses, matches.T_world_left, positions(landmarks.ids[at]))
+        growth = np.sqrt(np.abs(np.linalg.det(warps)))
+        similar = (growth <= _LARGEST) & (growth * _LARGEST >= 1)
+        outgrown = (growth > _RENEWED) | (growth * _RENEWED < 1)
+        left, right = rectified.rectify_left(features.uv_left[rows]), rectified.rectify_right(features.uv_right[rows])
+        left, right = _pixels(frontend, frontend.align(features.images, patches, warps, left, right), len(rows))
+        stereo = features.has_stereo[rows]
+        found = similar & rectified.rig.left.in_image(left) & (rectified.rig.right.in_image(right) | ~stereo)
+        right[~stereo] = np.nan
+        uv_left, uv_right = features.uv_left.copy(), features.uv_right.copy()
+        uv_left[rows[found]] = rectified.unrectify_left(left[found])
+        uv_right[rows[found]] = rectified.unrectify_right(right[found])
+        return replace(features, uv_left=uv_left, uv_right=uv_right), landmarks.with_patches(
+            at[~found | outgrown], None
+        )
+
+    def with_patches(
+        self, frontend: Frontend | None, features: StereoFeatures, seen: LandmarkMatches, landmarks: LandmarkTable,
+        T_world_left: Array,
+    ) -> LandmarkTable:  # fmt: skip
+        """The map, in which landmarks that were seen and have no patch get one.
+
+        Args:
+            frontend: which made the features.
+            features: of the frame, as measured and aligned.
+            seen: landmarks and their features.
+            landmarks: the map.
+            T_world_left: the frame's pose (4, 4).
+
+        Raises:
+            SlamError: the front end returns no patches, or not one for each landmark.
+        """
+        if not self._enabled or not isinstance(frontend, AligningFrontend) or features.images is None:
+            return landmarks
+        at = np.flatnonzero(isin(landmarks.ids, seen.ids) & ~landmarks.has_patch)
+        if not len(at):
+            return landmarks
+        rows = seen.rows_of(landmarks.ids[at])
+        uv, sizes = self._rig.rectified.rectify_left(features.uv_left[rows]), {"n": len(at)}
+        one = next((patch for patch in landmarks.patches.tolist() if patch is not None), None)
+        if one is not None:
+            sizes["s"] = len(one.image)
+        answer = frontend.patches(features.images, uv, features.scale[rows])
+        taken: Patches = checked(frontend, "patches", answer, **sizes)
+        new = [Patch(*of_one, T_world_left) for of_one in zip(taken.images, taken.centres, taken.size)]
+        return landmarks.with_patches(at, new)
+
+
+def _stacked(patches: list[Patch]) -> tuple[Patches, Array]:
+    """Patches as the front end wants them, and the poses (N, 4, 4) from which they were taken."""
+    columns = ([getattr(patch, name) for patch in patches] for name in ("image", "centre", "size", "T_world_left"))
+    images, centres, size, poses = map(np.array, columns)
+    return Patches(images, centres, size), poses
+
+
+def _pixels(frontend: AligningFrontend, answer: Any, count: int) -> tuple[Array, Array]:
+    """Left and right pixels (N, 2) that a front end has found; raises SlamError where it answered something else."""
+    both = [np.shape(uv) for uv in checked(frontend, "align", answer)]
+    if both != 2 * [(count, 2)]:
+        raise SlamError(f"{type(frontend).__name__}.align: must give left and right pixels ({count}, 2), got {both}")
+    return answer[0], answer[1]
+
+
+def warps_of(rectified: RectifiedRig, poses: Array, T_world_left: Array, positions: Array) -> Array:
+    """Matrices (N, 2, 2) from present pixel offsets to those seen from earlier poses (N, 4, 4), at points (N, 3) [m].
+
+    The surface around a point is taken to face the camera.
+    """
+    turn, f = rectified.R_left.T, np.array([rectified.rig.left.fu, rectified.rig.left.fv])
+    R_now, R_then = T_world_left[:3, :3] @ turn, poses[:, :3, :3] @ turn
+    depth = (positions - T_world_left[:3, 3]) @ R_now[:, 2]
+    then = np.einsum("nij,ni->nj", R_then, positions - poses[:, :3, 3])
+    R = np.einsum("nij,ik->njk", R_then, R_now)
+    on_surface = R[:, :, :2] * (depth[:, None, None] / f)
+    x = then[:, :2, None] / then[:, 2, None, None]
+    return f[:, None] * (on_surface[:, :2] - x * on_surface[:, 2:]) / then[:, 2, None, None]

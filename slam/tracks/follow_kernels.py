@@ -1,0 +1,163 @@
+"""Compiled loops of `slam.tracks.follow`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.runtime.compilation import helper, kernel, vector_helper
+
+
+@kernel
+def pairs_in_boxes(centres, reach, x, y, rows, places):
+    """Pairs of boxes and of points inside them, by ascending box; returns how many there are.
+
+    Boxes have centres and half sizes `reach` (M, 2); the points x, y (N,) ascend in x. Pairs are written into `rows` of
+    boxes and `places` of points as far as there is room.
+    """
+    count = 0
+    for row in range(len(centres)):
+        low, high = centres[row, 0] - reach[row, 0], centres[row, 0] + reach[row, 0]
+        place, last = 0, len(x)
+        while place < last:
+            middle = (place + last) // 2
+            if x[middle] < low:
+                place = middle + 1
+            else:
+                last = middle
+        while place < len(x) and x[place] <= high:
+            if abs(y[place] - centres[row, 1]) <= reach[row, 1]:
+                if count < len(rows):
+                    rows[count], places[count] = row, place
+                count += 1
+            place += 1
+    return count
+
+
+@helper
+def best_pairs(rows, columns, distance, allowed, size, d_match, ratio):
+    """`mutual_best`, for kernels."""
+    nearest, second = np.full(size[0], np.float32(np.inf)), np.full(size[0], np.float32(np.inf))
+    of_column, good = np.full(size[1], np.float32(np.inf)), np.zeros(len(rows), np.bool_)
+    for p in range(len(rows)):
+        if allowed[p]:
+            row, column, d = rows[p], columns[p], distance[p]
+            if d < nearest[row]:
+                second[row], nearest[row] = nearest[row], d
+            elif d < second[row]:  # also one that is as near as the first
+                second[row] = d
+            if d < of_column[column]:
+                of_column[column] = d
+    for p in range(len(rows)):
+        row, d = rows[p], distance[p]
+        mutual = allowed[p] and d == nearest[row] and d <= of_column[columns[p]]
+        good[p] = mutual and d < d_match and d < ratio * second[row]
+    return good
+
+
+@kernel
+def mutual_best(rows, columns, distance, allowed, size, d_match, ratio):
+    """Which pairs (P,) are each other's nearest, nearer than `d_match`, and clearly nearer than the row's second.
+
+    Pairs are of rows and columns, of which there are `size`, and have a distance; those that are not allowed do not
+    count.
+    """
+    return best_pairs(rows, columns, distance, allowed, size, d_match, ratio)
+
+
+@helper
+def ellipse(S, low, high):
+    """Shape (uu, uv, vv) of the ellipse of a covariance (2, 2), and its half sizes; squared half axes are bounded."""
+    mean, half, cross = 0.5 * (S[0, 0] + S[1, 1]), 0.5 * (S[0, 0] - S[1, 1]), S[0, 1]
+    radius = np.hypot(half, cross)
+    safe = max(radius, 2.2250738585072014e-308)
+    c2, cs = 0.5 + 0.5 * half / safe, 0.5 * cross / safe  # cos², cos · sin of the long axis' angle
+    s2 = 1.0 - c2
+    long, short = min(max(mean + radius, low), high), min(max(mean - radius, low), high)
+    u, v = np.sqrt(c2 * long + s2 * short), np.sqrt(s2 * long + c2 * short)
+    return c2 / long + s2 / short, cs / long - cs / short, s2 / long + c2 / short, u, v
+
+
+@vector_helper
+def product(a, b):
+    """Inner product of two descriptors (D,)."""
+    total = np.float32(0.0)
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@kernel
+def follow(pixels, innovation, bounds, sizes, limits, ratio, looks, signs, rows, uv, others, other_signs, order):
+    """Pairs (2, K) of tracks and of the features that continue them: those in the smallest window, then in larger ones.
+
+    Tracks are expected at `pixels` (M, 2) with the `innovation` (M, 2, 2), which shapes the windows; their half axes
+    are `sizes` (L,) times standard deviations within `bounds`, or [px] of squares if these are zero. In each window,
+    descriptors must be nearer than its limit (L,). Tracks have `looks` and `signs` at `rows` (M,); the features are
+    at `uv`, those that count in the `order` of their columns.
+    """
+    levels, last = len(sizes), sizes[len(sizes) - 1]
+    count, room = 0, 4 * len(pixels) + 64
+    a, b, level = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room, np.intp)
+    distance = np.empty(room, np.float32)
+    for row in range(len(pixels)):
+        x, y = pixels[row, 0], pixels[row, 1]
+        if not (np.isfinite(x) and np.isfinite(y)):
+            continue
+        if bounds[1] > 0:
+            shape = ellipse(innovation[row], bounds[0] ** 2, bounds[1] ** 2)
+            uu, cross, vv = np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2])
+            reach_u, reach_v = last * shape[3], last * shape[4]
+        else:
+            uu = cross = vv = np.float32(0.0)
+            reach_u = reach_v = last
+        place, end = 0, len(order)
+        while place < end:
+            middle = (place + end) // 2
+            if uv[order[middle], 0] < x - reach_u:
+                place = middle + 1
+            else:
+                end = middle
+        while place < len(order) and uv[order[place], 0] <= x + reach_u:
+            feature = order[place]
+            place += 1
+            if abs(uv[feature, 1] - y) > reach_v or other_signs[feature] != signs[rows[row]]:
+                continue
+            du, dv = np.float32(uv[feature, 0] - x), np.float32(uv[feature, 1] - y)
+            if bounds[1] > 0:
+                off, power = np.float64(uu * du * du + np.float32(2.0) * cross * du * dv + vv * dv * dv), 2
+            else:
+                off, power = np.float64(max(abs(du), abs(dv))), 1
+            smallest = 0
+            while smallest < levels and off > sizes[smallest] ** power:
+                smallest += 1
+            if smallest == levels:
+                continue
+            if count == room:
+                room *= 2
+                a, b, level = grown(a, room), grown(b, room), grown(level, room)
+                distance = grown(distance, room)
+            likeness = product(looks[rows[row]], others[feature])
+            a[count], b[count], level[count] = row, feature, smallest
+            distance[count] = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * likeness, np.float32(0.0)))
+            count += 1
+    a, b, level, distance = a[:count], b[:count], level[:count], distance[:count]
+    pairs, found = np.empty((2, len(pixels)), np.intp), 0  # tracks that look alike to the bit may share a feature
+    done, taken, allowed = np.zeros(len(pixels), np.bool_), np.zeros(len(uv), np.bool_), np.empty(count, np.bool_)
+    for number in range(levels):
+        for p in range(count):
+            allowed[p] = level[p] <= number and not done[a[p]] and not taken[b[p]]
+        good = best_pairs(a, b, distance, allowed, (len(pixels), len(uv)), limits[number], ratio)
+        for p in range(count):
+            if good[p]:
+                done[a[p]] = taken[b[p]] = True
+                pairs[0, found], pairs[1, found] = a[p], b[p]
+                found += 1
+    return pairs[:, :found]
+
+
+@helper
+def grown(array, room):
+    """A copy with more room."""
+    new = np.empty(room, array.dtype)
+    new[: len(array)] = array
+    return new

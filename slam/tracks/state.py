@@ -1,0 +1,91 @@
+"""Whether the camera is tracked, predicted, lost, in a place that is not in the map, or was moved unseen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.chi_square import SIGMAS
+from slam.geometry.se3 import Array, inverse, log
+from slam.models import EstimatorModels
+
+#: Number of stereo features with which the camera would be localised in a mapped place.
+ENOUGH_FEATURES = 20
+
+_SLACK = 0.05  # error of two poses found independently [m], [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHypotheses:
+    """Poses on which landmarks agreed in successive frames.
+
+    Attributes:
+        count: number of successive poses that agree with each other.
+        stamp: of the last one [s].
+        T_world_left: the last one (4, 4).
+    """
+
+    count: int = 0
+    stamp: float = float("nan")
+    T_world_left: Array | None = None
+
+    def after(self, T_world_left: Array, stamp: float, models: EstimatorModels) -> PoseHypotheses:
+        """A copy with one more pose, which agrees with the last one if the camera may have moved that far meanwhile."""
+        if self.T_world_left is None:
+            return PoseHypotheses(1, stamp, T_world_left)
+        step, dt = log(inverse(self.T_world_left) @ T_world_left), stamp - self.stamp
+        turn = np.linalg.norm(step[:3]) < _SLACK + SIGMAS * models.initial_angular_velocity_sigma * dt
+        way = np.linalg.norm(step[3:]) < _SLACK + SIGMAS * models.initial_velocity_sigma * dt
+        return PoseHypotheses(self.count + 1 if turn and way else 1, stamp, T_world_left)
+
+
+NO_POSE = PoseHypotheses()
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingState:
+    """How localization has gone recently.
+
+    Attributes:
+        unmatched: frames since the pose was last measured.
+        unknown: how many of these had enough features to be localised in a mapped place.
+        lost: the pose has not been measured for so long, and the prediction is so uncertain, that it is not known.
+        showed_enough: the last frame had enough features to be localised in a mapped place.
+        doubted: poses too far from the predictions to be believed at once.
+        believed: the last pose that was believed.
+    """
+
+    unmatched: int = 0
+    unknown: int = 0
+    lost: bool = False
+    showed_enough: bool = False
+    doubted: PoseHypotheses = NO_POSE
+    believed: PoseHypotheses = NO_POSE
+
+    def after(self, measured: bool, uncertain: bool, stereo_features: int, lost_after: int) -> TrackingState:
+        """The state after a frame.
+
+        Args:
+            measured: the pose was measured.
+            uncertain: the prediction is too uncertain to say where in the image landmarks are.
+            stereo_features: number of features with depth in the frame.
+            lost_after: frames without a measured pose after which a camera with an uncertain prediction is lost.
+        """
+        if measured:
+            return TrackingState(doubted=self.doubted, believed=self.believed)
+        unmatched, enough = self.unmatched + 1, stereo_features >= ENOUGH_FEATURES
+        lost = self.lost or (uncertain and unmatched >= lost_after)
+        return replace(self, unmatched=unmatched, unknown=self.unknown + enough, lost=lost, showed_enough=enough)
+
+    def believing(self, T_world_left: Array, stamp: float) -> TrackingState:
+        """A copy in which a pose (4, 4) at a time [s] is believed, and none is doubted."""
+        return replace(self, doubted=NO_POSE, believed=PoseHypotheses(1, stamp, T_world_left))
+
+    def in_unknown_place(self, restart_after: int) -> bool:
+        """Whether the camera has just seen `restart_after` frames of a place that is not in the map."""
+        return self.showed_enough and self.unknown % restart_after == 0
+
+    def may_add(self, restart_after: int) -> bool:
+        """Whether new landmarks may join the map: not while the pose is unknown, unless the place is not in the map."""
+        return not self.unmatched or self.in_unknown_place(restart_after)
