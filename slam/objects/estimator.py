@@ -169,7 +169,7 @@ class BodyEstimator:
         b, joined = self._joined(b, seen, ~isin(seen.given.points, np.concatenate([used, rejected])))
         good = np.sort(np.concatenate([used, seen.given.points[joined]]))
         after = self._reported(b, id, cameras, True, good, np.sort(rejected))
-        if len(used) >= MIN_POINTS and not after.moved:
+        if len(used) >= MINIMAL_POINTS and not after.moved:
             after = replace(after, moved=_has_moved(after))
         e, last, dt = after.estimate, before.estimate, float(b.stamps[-1] - b.stamps[-2])
         possible = self.models.possible(
