@@ -66,6 +66,8 @@ class BodyBelief:
 
     Attributes:
         since: when the estimate began [s].
+        T_begun: pose T_world_object (4, 4) then.
+        moved: whether it has moved for certain since.
         velocity, sigmas: what was known of the velocity [ω, v] (6,) in the first interval: mean, in world axes, and
             standard deviations.
         stamps: times of the frames (K,) [s].
@@ -80,6 +82,8 @@ class BodyBelief:
     """
 
     since: float
+    T_begun: Array
+    moved: bool
     velocity: Array
     sigmas: Array
     stamps: Array
@@ -112,8 +116,8 @@ def begun(stamp: float, T_body_left: Array, velocity: Array, sigmas: Array, esti
     none = np.zeros((0, 3))
     points = Points.new(np.zeros(0, np.int64), none, np.zeros((0, 3, 3)), np.zeros(3))
     return BodyBelief(
-        stamp, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1), points, Rows.none(), Places.none(),
-        RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
+        stamp, estimate.T_world_object, False, velocity, sigmas, np.array([stamp]), T_body_left[None], np.ones(1),
+        points, Rows.none(), Places.none(), RelativePrior.of_pose(T_body_left, _EXACT), _EXACT, estimate,
     )  # fmt: skip
 
 

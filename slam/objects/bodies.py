@@ -48,7 +48,8 @@ class Body:
         measured: whether it was in this frame.
         moving: whether it moves now.
         evidence: that it has moved, given all that is uncertain; see `slam.objects.proof`.
-        proven: whether it has moved for certain.
+        proven: whether it has moved for certain by its tracks, and
+        moved: by its estimate, see `slam.objects.estimator`: only then it is reported.
         alike: number of frames in which it moved as an older body did, as a part of that would.
         age: number of frames since it was found.
         existence: probability that it exists, see `slam.objects.existence`.
@@ -82,6 +83,7 @@ class Body:
     moving: bool = True
     evidence: float = 0.0
     proven: bool = False
+    moved: bool = False
     alike: int = 0
     age: int = 0
     existence: float = EVEN
@@ -182,6 +184,7 @@ def from_estimate(body: Body, belief: BodyBelief, min_speed: float) -> Body:
         covariance=change @ estimate.covariance @ change.T,
         moving=not converged or (certain and speed > min_speed),
         belief=belief,
+        moved=body.moved or belief.moved,
         measured_at=estimate.stamp if estimate.measured else body.measured_at,
         refused=body.refused + 1 if body.measured and not estimate.measured else 0,
         T_found=estimate.T_world_object if new else body.T_found,
@@ -200,7 +203,7 @@ def continued(body: Body, known: Body) -> Body:
     T_body_estimate = inverse(body.T) @ shift @ known.T @ known.T_body_estimate
     return replace(
         body, id=known.id, T_body_estimate=T_body_estimate, evidence=known.evidence,
-        proven=known.proven, existence=known.existence, age=known.age,
+        proven=known.proven, moved=known.moved, existence=known.existence, age=known.age,
         reported=known.reported, reported_unmeasured=known.reported_unmeasured,
         measured_at=known.measured_at, belief=None, refused=0,
     )  # fmt: skip

@@ -46,7 +46,7 @@ def estimated(
             bodies[id] = replace(body, belief=None, refused=0)
             continue
         membership.count_rejections(tracks, estimate.rejected)
-        if body.proven and _worth_reporting(body, estimate, config):
+        if body.proven and body.moved and _worth_reporting(body, estimate, config):
             body = counted(body, estimate.measured)
             reported.append(_report(body, belief, tracks))
         bodies[id] = body

@@ -40,6 +40,7 @@ from slam.window.stereo import RectifiedStereo
 
 FRAMES = 4  #: cost: frames of a window; older ones are marginalised
 _SOLVED_AGAIN = 4  # numerics: how often it is solved again without observations that disagree with the others
+_CHANCE = 1e-6  # that a body at rest seems to have moved; from 1e-4 to 1e-12 next to nothing changes
 _LEAST = 2  # points that must agree with a body that has more: one agrees with some pose always
 
 
@@ -168,6 +169,8 @@ class BodyEstimator:
         b, joined = self._joined(b, seen, ~isin(seen.given.points, np.concatenate([used, rejected])))
         good = np.sort(np.concatenate([used, seen.given.points[joined]]))
         after = self._reported(b, id, cameras, True, good, np.sort(rejected))
+        if len(used) >= MINIMAL_POINTS and not after.moved:
+            after = replace(after, moved=_has_moved(after))
         e, last, dt = after.estimate, before.estimate, float(b.stamps[-1] - b.stamps[-2])
         possible = self.models.possible(
             e.velocity, e.velocity_covariance, last.velocity, last.velocity_covariance, dt
@@ -329,6 +332,12 @@ class BodyEstimator:
         if not all(np.isfinite(a).all() for a in (estimate.T_world_object, estimate.covariance, velocity, spread)):
             raise np.linalg.LinAlgError("a body's estimate is not finite")
         return replace(b, estimate=estimate)
+
+
+def _has_moved(b: BodyBelief) -> bool:
+    """Whether the motion since the estimate began is more than the uncertainty of body and camera makes it seem."""
+    change = log(inverse(b.T_begun) @ b.estimate.T_world_object)
+    return bool(change @ np.linalg.solve(b.estimate.covariance, change) > chi_square_limit(6, 1 - _CHANCE))
 
 
 def _of(cameras: RecentPoses, stamps: Array) -> RecentPoses:

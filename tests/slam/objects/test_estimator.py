@@ -316,3 +316,11 @@ def test_what_a_body_can_do():
     assert models.known(known, known)
     assert not models.known(np.diag([1, 1, 1, 4, 4, 4.0]), known)
     assert not models.known(known, np.full((6, 6), np.nan))
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_a_body_has_moved_if_its_motion_is_more_than_all_that_is_uncertain(still):
+    """A box at rest before a moving camera never has; one that moves has within a few frames."""
+    for seed in range(5):
+        beliefs = [b for _, b, _ in follow("window", box_scene(seed=seed, frames=15, still=still), seed)]
+        assert any(b.moved for b in beliefs) != still
