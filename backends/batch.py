@@ -19,7 +19,8 @@ from backends.smoother.config import SmootherConfig
 from backends.smoother.rebuild import add_landmark, add_poses, optimise
 from backends.smoother.solver import FAILURES, Change
 from backends.smoother.variables import landmark_key, pose_key
-from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, UpdateReport
+from slam.checks import require_recent
+from slam.data import Estimate, IdArray, IndexArray, Observations, Prediction, RecentPoses, UpdateReport
 from slam.errors import ConfigurationError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, transform
@@ -133,6 +134,18 @@ class BatchBackend:
         P = solution.covariance(pose_key(path.count - 1), rough.covariance)
         return Estimate(rough.stamp, solution.poses[-1].copy(), P, rough.ids, positions, covariances)
 
+    @one_blas_thread
+    def recent(self, n: int) -> RecentPoses:
+        """The last n poses with their joint covariance; one that has no measurements yet is known by itself alone."""
+        n, newest = require_recent("batch", n), self.estimate()
+        solution, path = self._solved(), self._smoother.measurement_log.path
+        count, first = path.count, self._smoother.measurement_log.history.first
+        keys = [pose_key(i) for i in range(max(count - n, first), count)]
+        P = solution.joint(keys) if count and path.stamps[count - 1] == newest.stamp else None
+        if P is None:
+            return RecentPoses(np.array([newest.stamp]), newest.T_world_left[None], newest.covariance)
+        return RecentPoses(path.stamps[count - len(keys) : count].copy(), solution.poses[-len(keys) :].copy(), P)
+
     def positions(self, ids: IdArray) -> Array:
         """See `slam.interfaces.Backend.positions`: the smoother's."""
         return self._smoother.positions(ids)
@@ -204,6 +217,16 @@ class _Solution:
             return np.asarray(self._marginals.marginalCovariance(key))
         except FAILURES:
             return otherwise
+
+    def joint(self, keys: list[int]) -> Array | None:
+        """Joint covariance of poses (6 K, 6 K), perturbed on the right; None where the problem leaves one open."""
+        if self._marginals is None:
+            return None
+        try:
+            found = self._marginals.jointMarginalCovariance(keys)
+        except FAILURES:
+            return None
+        return np.block([[found.at(i, j) for j in keys] for i in keys])
 
 
 def _by_landmark(landmark: NDArray[np.int32], known: Container[int]) -> Iterator[tuple[int, IndexArray]]:

@@ -308,6 +308,26 @@ class UpdateReport:
 
 
 @dataclass(frozen=True, eq=False)
+class RecentPoses:
+    """The camera's last poses together, the newest last.
+
+    Attributes:
+        stamps: their times (K,) [s], ascending.
+        poses: T_world_left (K, 4, 4).
+        covariance: joint (6 K, 6 K), of perturbations on the right, each in the order of a pose's covariance.
+    """
+
+    stamps: Array
+    poses: Array
+    covariance: Array
+
+    __repr__ = of_shapes
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The back end's estimate of pose and landmarks at one time.
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backends.window.motion import LONGEST, is_first, velocity_sigmas
 from backends.window.state import State
 from slam.data import IndexArray
 from slam.models import EstimatorModels
+from slam.window.motion import LONGEST, is_first, velocity_sigmas
 from slam.window.problem import Motion, Places, Rows, Window
 from slam.window.stereo import RectifiedStereo
 

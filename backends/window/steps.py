@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from backends.window import motion
 from backends.window.config import WindowConfig
 from backends.window.past import Past
 from backends.window.problem import problem
@@ -19,7 +18,7 @@ from slam.errors import MeasurementError
 from slam.geometry.rig import StereoRig
 from slam.geometry.se3 import Array, inverse, points_by_pose
 from slam.models import EstimatorModels
-from slam.window import kernels, pose_only
+from slam.window import kernels, motion, pose_only
 from slam.window.agreement import MIN_CONSENSUS, landmarks_pose
 from slam.window.gating import with_noise
 from slam.window.problem import Places, RelativePrior, Rows
