@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "window": {"data", "geometry", "kernels", "runtime"},
     "tracking": {"data", "geometry", "kernels", "runtime"},
     "calibration": {"data", "geometry", "kernels", "runtime"},
-    "mapping": {"tracking", "data", "geometry", "runtime"},
+    "mapping": {"tracking", "window", "data", "geometry", "runtime"},
     "objects": {"tracking", "data", "geometry", "kernels", "runtime"},
     "worlds": {"data", "geometry"},
     "sequences": {"worlds", "data", "geometry"},

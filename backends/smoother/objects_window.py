@@ -19,10 +19,10 @@ from backends.smoother import objects_kernels as kernels
 from backends.smoother.objects_factors import System, VelocityPrior, add_measurements, add_motion, velocities
 from backends.smoother.objects_kernels import FRAME
 from slam.data import BoolArray, IdArray, IndexArray
+from slam.geometry.pose_kernels import moved
 from slam.geometry.se3 import Array, hat, inverse, transform
 from slam.object_models import ObjectModels
 from slam.objects.points import Shape, drift
-from slam.window.pose_kernels import moved
 from slam.window.stereo import RectifiedStereo
 
 _EXACT = 1e-12 * np.eye(6)  # [rad², m²]
