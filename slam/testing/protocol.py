@@ -152,13 +152,15 @@ def recent_poses_fit_the_estimate(factory: Factory) -> None:
     """If it has `recent`: the last of the poses is the estimate's, and how they moved is as sure as it says."""
     if not hasattr(factory(RIG, models=MODELS), "recent"):
         return
-    raises(MeasurementError, factory(RIG, models=MODELS).recent, 1, what="recent before predict")
+    backend: Any = factory(RIG, models=MODELS)
+    raises(MeasurementError, backend.recent, 1, what="recent before predict")
     scene = make_scene()
-    backend: Any = tracked(factory, scene)[0].backend
+    backend = tracked(factory, scene)[0].backend
     raises(MeasurementError, backend.recent, 0, what="recent(0)")
     pose, stamps = backend.estimate(), DT * np.arange(len(scene.frames))
     for n in (1, 4, 100):
-        found, k = backend.recent(n), len(backend.recent(n).stamps)
+        found = backend.recent(n)
+        k = len(found.stamps)
         require(0 < k <= n, f"recent({n}) returned {k} poses")
         require_same(found.stamps, stamps[-k:], f"stamps of recent({n})", 1e-9)
         require_same(found.poses[-1], pose.T_world_left, f"last pose of recent({n}) and the estimate's", 1e-9)
@@ -170,7 +172,7 @@ def recent_poses_fit_the_estimate(factory: Factory) -> None:
         A[:, :6], A[:, -6:] = -se3.adjoint(se3.inverse(step)), A[:, -6:] + np.eye(6)
         truth = se3.inverse(scene.poses[-k]) @ scene.poses[-1]
         error = se3.log(se3.inverse(step) @ truth)
-        distance = error @ np.linalg.solve(A @ found.covariance @ A.T, error) if k > 1 else 0.0
+        distance = float(error @ np.linalg.solve(A @ found.covariance @ A.T, error)) if k > 1 else 0.0
         require(distance < 40, f"over the poses of recent({n}) the motion is off by {distance:.3g} (χ² of six)")
 
 

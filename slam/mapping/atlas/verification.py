@@ -101,7 +101,8 @@ def refined_pose(
     Raises:
         LinAlgError: these points do not determine the pose.
     """
-    stereo, T, P = RectifiedStereo.of(rig), T_world_left, np.eye(6)
+    stereo, T = RectifiedStereo.of(rig), T_world_left
+    P: Array = np.eye(6)
     z, own = measured - [0.0, 0.0, stereo.doffs], rig.triangulation_covariance(points, pixel_sigma)
     for _ in range(_ROUNDS):
         H = rig.project_stereo(transform(inverse(T), points))[1] @ T[:3, :3].T
