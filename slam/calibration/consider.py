@@ -32,6 +32,7 @@ from slam.models import EstimatorModels
 #: tenths of a percent. It scales the whole world, so images never show it.
 BASELINE = 0.002
 
+_LEAST = 1e-9  # numerics: of a motion's standard deviations [rad], [m]; with none there is no information matrix
 _LONGEST = 1.0  # guard: time [s] after which a motion counts as unknown
 
 
@@ -258,8 +259,9 @@ class SchmidtFilter:
 
     def _motion_sigmas(self, dt: float) -> tuple[float, float]:
         """Prior standard deviations of a motion [rad], [m]: twice the velocity's change."""
-        v, w = np.sqrt(self._motion.velocity_variance(min(abs(dt), _LONGEST)))
-        return 2 * float(w) * min(abs(dt), _LONGEST), 2 * float(v) * min(abs(dt), _LONGEST)
+        dt = min(abs(dt), _LONGEST)
+        v, w = 2 * dt * np.sqrt(self._motion.velocity_variance(dt))
+        return max(float(w), _LEAST), max(float(v), _LEAST)
 
     def _sight(self, local: Array) -> tuple[Array, Array, Array]:
         """Of z = (x, y, d) [px] of points (M, 3) [m]: ∂z/∂h (M, 3, 3), ∂z/∂δ (M, 3, m), and the noise (3, 3).
