@@ -284,12 +284,14 @@ def _after(s: State, solution: Solution, points: IndexArray, local: Array, world
     """The state at a solution; landmarks that take no part become less certain with the motion since the last one."""
     marks, w = s.landmarks, solution.window
     there = replace(s, poses=w.poses, covariance=solution.pose_covariance)
-    h, own = seen_from_newest(there, np.arange(len(marks)))
-    by_pose = points_by_pose(h)
-    own += by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
-    position, whole, last = marks.position.copy(), marks.world.copy(), marks.last.copy()
-    position[points], last[seen] = w.points, s.frames[-1]
     definite = (np.einsum("nii->ni", local) > 0).all(axis=1) & (np.einsum("nii->ni", world) > 0).all(axis=1)
-    own[points[definite]], whole[points[definite]] = local[definite], world[definite]
+    known = points[definite]
+    others = np.delete(np.arange(len(marks)), known)
+    h, rest = seen_from_newest(there, others)
+    by_pose = points_by_pose(h)
+    position, whole, last, own = marks.position.copy(), marks.world.copy(), marks.last.copy(), marks.local.copy()
+    position[points], last[seen] = w.points, s.frames[-1]
+    own[others] = rest + by_pose @ between(there, s.solved) @ np.swapaxes(by_pose, 1, 2)
+    own[known], whole[known] = local[definite], world[definite]
     marks = replace(marks, position=position, local=own, world=whole, last=last)
     return replace(there, cost=solution.cost, solved=len(s.frames) - 1, landmarks=marks)
