@@ -20,9 +20,10 @@ RATIO = 1e4  #: numerics: of an interval to the one before it, from which on the
 
 def velocity_sigmas(models: EstimatorModels, dt: float | Array, first: bool | BoolArray) -> Array:
     """Standard deviations (…, 6) of the change of [ω, v] over `dt` [s]; in the first interval, of the velocity."""
-    linear, angular = models.motion.velocity_variance(np.asarray(dt)[..., None])
+    linear, angular = models.motion.velocity_variance(1.0)  # they grow as time does
+    jump = np.asarray(dt)[..., None] * np.array([angular, linear])
     start = np.asarray(first)[..., None] * [models.initial_angular_velocity_sigma, models.initial_velocity_sigma]
-    return np.sqrt(np.repeat(np.concatenate([angular, linear], axis=-1) + start**2, 3, axis=-1))
+    return np.asarray(np.sqrt(np.repeat(jump + start**2, 3, axis=-1)))
 
 
 def is_first(before: float | None, dt: float) -> bool:
